@@ -1,0 +1,36 @@
+"""Checks of configuration values; each message names the field, what it must be and what it was."""
+
+import math
+from collections.abc import Iterable
+
+
+def check_at_least(name: str, value: int, least: int) -> None:
+    """Raise ``ValueError`` unless ``value`` is at least ``least``."""
+    if not value >= least:
+        raise ValueError(f"{name} must be at least {least}, got {value}.")
+
+
+def check_positive(name: str, value: float, *, finite: bool = False) -> None:
+    """Raise ``ValueError`` unless ``value`` is above 0, and finite if asked for."""
+    if not value > 0 or (finite and not math.isfinite(value)):
+        raise ValueError(f"{name} must be {'finite and ' if finite else ''}positive, got {value}.")
+
+
+def check_range(name: str, value: float, low: float, high: float) -> None:
+    """Raise ``ValueError`` unless ``value`` is in [low, high]."""
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value}.")
+
+
+def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
+    """Raise ``ValueError`` unless ``value`` is one of ``choices``."""
+    choices = list(choices)
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got '{value}'.")
+
+
+def check_hidden(name: str, sizes: Iterable[int]) -> None:
+    """Raise ``ValueError`` unless there is a hidden layer and each has at least one unit."""
+    sizes = tuple(sizes)
+    if not sizes or min(sizes) < 1:
+        raise ValueError(f"{name} must be one or more positive layer sizes, got {sizes}.")

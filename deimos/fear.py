@@ -1,0 +1,195 @@
+"""The fear network: how likely is this policy to crash within T steps of getting this goal?"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from deimos.checks import check_at_least, check_choice, check_hidden, check_positive
+from deimos.interactions import Resolved
+from deimos.networks import Activation, flatten_parameters, mlp
+from deimos.ranks import mean_over_ranks
+
+
+@dataclass(frozen=True, kw_only=True)
+class FearConfig:
+    """The fear network and how it learns (thesis, 4.2)."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the hidden layers."""
+    activation: Activation = "relu"
+    """Between the layers."""
+    learning_rate: float = 1e-3
+    """Step size of Adam, positive."""
+    epochs: int = 1
+    """Passes over the window of interactions in every fit, at least 1."""
+    minibatches: int = 4
+    """Parts that the window is split into, at least 1."""
+    min_per_class: int = 32
+    """Crashes and survivals that the window must hold before a fit, at least 1."""
+    workspace: int = 64
+    """Memory for the scores of candidates [MiB], at least 1; more are scored in several parts."""
+
+    def __post_init__(self) -> None:
+        check_hidden("hidden", self.hidden)
+        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_positive("learning_rate", self.learning_rate, finite=True)
+        for name in ("epochs", "minibatches", "min_per_class", "workspace"):
+            check_at_least(name, getattr(self, name), 1)
+
+
+class FearNetwork(nn.Module):
+    """A logit of (state, goal, next goal).
+
+    The first layer is linear, so it is the sum of one layer of (state, goal) and one of the next
+    goal. For N candidates of one decision the first part is computed once, not N times.
+    """
+
+    def __init__(self, state_dim: int, goal_dim: int, hidden: Sequence[int], activation: Activation) -> None:
+        super().__init__()
+        whole = mlp(state_dim + 2 * goal_dim, hidden, 1, activation)
+        first = whole[0]
+        assert isinstance(first, nn.Linear)
+        self.context = nn.Linear(state_dim + goal_dim, hidden[0])
+        self.next_goal = nn.Linear(goal_dim, hidden[0], bias=False)
+        self.rest = whole[1:]
+        with torch.no_grad():  # the two parts start as the one layer that they are
+            self.context.weight.copy_(first.weight[:, : state_dim + goal_dim])
+            self.context.bias.copy_(first.bias)
+            self.next_goal.weight.copy_(first.weight[:, state_dim + goal_dim :])
+
+    def forward(self, state: Tensor, goal: Tensor, next_goal: Tensor) -> Tensor:
+        """Logits of crashing, shape (n,), for states (n, state_dim) and goals (n, goal_dim)."""
+        first = self.context(torch.cat([state, goal], dim=1)) + self.next_goal(next_goal)
+        return self.rest(first).squeeze(1)
+
+    @torch.no_grad()
+    def score(self, state: Tensor, goal: Tensor, candidates: Tensor, workspace: int) -> Tensor:
+        """Logits of crashing for many candidates per decision.
+
+        Args:
+            state: States, shape (B, state_dim).
+            goal: Goals in force, shape (B, goal_dim).
+            candidates: Possible next goals, shape (B, N, goal_dim).
+            workspace: Memory that the activations may take [bytes].
+
+        Returns:
+            Logits, shape (B, N); the same for any workspace.
+        """
+        count = candidates.shape[1]
+        context = self.context(torch.cat([state, goal], dim=1)).unsqueeze(1)
+        widths = [layer.out_features for layer in self.rest if isinstance(layer, nn.Linear)]
+        bytes_per_row = 4 * count * (2 * self.context.out_features + sum(widths))
+        rows = max(1, workspace // bytes_per_row)
+        logits = torch.empty(candidates.shape[:2], device=candidates.device)
+        for start in range(0, len(candidates), rows):
+            part = slice(start, start + rows)
+            first = self.next_goal(candidates[part]).add_(context[part])
+            logits[part] = self.rest(first).squeeze(2)
+        return logits
+
+
+class Fear:
+    """A fear network and how it learns online.
+
+    Args:
+        config: Its sizes and how it learns.
+        state_dim: Components of a state.
+        goal_dim: Components of a goal.
+        device: Where it lives.
+        seed: Seed of its weights and of the order that it learns in.
+    """
+
+    def __init__(self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int) -> None:
+        self.config = config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.network = FearNetwork(state_dim, goal_dim, config.hidden, config.activation).to(device)
+        parameters, _ = flatten_parameters(self.network)
+        self._parameters = parameters[0]
+        self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, fused=True)
+        self.generator = torch.Generator(device)
+        self.generator.manual_seed(seed)
+        self.fitted = False
+        """Whether it has learnt anything yet; before, its ranking of goals would be an arbitrary bias."""
+
+    def fit(self, data: Resolved, epochs: int | None = None) -> float:
+        """Learn from interactions by class-balanced binary cross-entropy on logits.
+
+        The weights n / (2 n_class) use the class shares of all of ``data``, not of a minibatch, so
+        that the shift they cause is known exactly.
+
+        Args:
+            data: Resolved interactions.
+            epochs: Passes over the data; ``None`` for the configured number.
+
+        Returns:
+            Mean loss of the last pass; NaN, and nothing is learnt, where a class has too few rows.
+        """
+        share = mean_over_ranks(data.crashed.float().mean()).item() if len(data) else 0.0
+        if min(share, 1.0 - share) * len(data) < self.config.min_per_class:
+            return float("nan")
+        target = data.crashed.float()
+        weight = torch.where(data.crashed, 0.5 / share, 0.5 / (1.0 - share))
+        size = -(-len(data) // self.config.minibatches)
+        losses = torch.zeros((), device=target.device)
+        for _ in range(self.config.epochs if epochs is None else epochs):
+            losses.zero_()
+            order = torch.randperm(len(data), generator=self.generator, device=target.device)
+            for rows in order.split(size):
+                logit = self.network(data.state[rows], data.goal[rows], data.next_goal[rows])
+                loss = nn.functional.binary_cross_entropy_with_logits(logit, target[rows], weight[rows])
+                assert self._parameters.grad is not None
+                self._parameters.grad.zero_()
+                loss.backward()
+                mean_over_ranks(self._parameters.grad)
+                self.optimizer.step()
+                losses += loss.detach() * (len(rows) / len(data))
+        self.fitted = True
+        return losses.item()
+
+    def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
+        """Logits of crashing, shape (B, N); see ``FearNetwork.score``."""
+        return self.network.score(state, goal, candidates, self.config.workspace * 2**20)
+
+    def check(self) -> None:
+        """Raise ``RuntimeError`` if a weight is not finite; reads the device once."""
+        if not bool(self._parameters.isfinite().all()):
+            raise RuntimeError("A weight of the fear network is not finite after a fit.")
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs."""
+        return {
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "fitted": self.fitted,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from ``state_dict()``."""
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        self.fitted = state["fitted"]
+
+
+def auroc(score: Tensor, positive: Tensor) -> float:
+    """Area under the ROC curve: how often a positive outranks a negative, ties counting half.
+
+    Args:
+        score: Scores, higher for positives, shape (n,).
+        positive: The true classes, bool, shape (n,).
+
+    Returns:
+        A number in [0, 1]; NaN where a class is empty.
+    """
+    positives = int(positive.sum())
+    negatives = len(positive) - positives
+    if positives == 0 or negatives == 0:
+        return float("nan")
+    _, inverse, counts = torch.unique(score, return_inverse=True, return_counts=True)
+    last = counts.cumsum(0).double()
+    rank = (last - (counts - 1) / 2)[inverse]  # mean rank of each group of equals
+    return ((rank[positive].sum() - positives * (positives + 1) / 2) / (positives * negatives)).item()

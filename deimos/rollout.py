@@ -1,0 +1,46 @@
+"""What happened in every world over a few steps, in memory allocated once."""
+
+import torch
+from torch import Tensor
+
+from deimos.env import Env, Step
+
+
+class Rollout:
+    """The transitions of ``num_steps`` steps of every world.
+
+    Shapes are (num_steps, num_envs, ...) but for ``obs``, which has one more step: the observation
+    that the next rollout starts from. Where an episode ended, ``obs[t + 1]`` is the one after the reset.
+    """
+
+    def __init__(self, env: Env, num_steps: int) -> None:
+        n, device = env.num_envs, env.device
+        self.num_steps = num_steps
+        self.obs = torch.zeros(num_steps + 1, n, env.obs_dim, device=device)
+        self.action = torch.zeros(num_steps, n, env.action_dim, device=device)
+        self.mean = torch.zeros(num_steps, n, env.action_dim, device=device)
+        """Mean of the policy's distribution at the time."""
+        self.noise = torch.zeros(num_steps, n, env.action_dim, device=device)
+        """Standard normal draws, made for the whole rollout at once."""
+        self.reward = torch.zeros(num_steps, n, device=device)
+        self.terminated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
+        self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
+        self.final_obs = torch.zeros(num_steps if env.time_limit else 0, n, env.obs_dim, device=device)
+        """Observations that the steps ended in, before any reset; kept only where episodes can be truncated."""
+        self.weight = torch.ones(num_steps, n, device=device)
+        """Weight of the transition in everything learnt: 0 leaves it out."""
+
+    def record(self, t: int, step: Step, weight: Tensor) -> None:
+        """Copy what step ``t`` gave back.
+
+        Args:
+            t: Index of the step, in [0, num_steps).
+            step: Views, not yet reset.
+            weight: Weight of every world's transition, shape (num_envs,).
+        """
+        self.reward[t] = step.reward
+        self.terminated[t] = step.terminated
+        self.weight[t] = weight
+        if len(self.final_obs):
+            self.truncated[t] = step.truncated
+            self.final_obs[t] = step.obs

@@ -1,0 +1,91 @@
+"""What every goal selector promises. A selector sees tensors only, never an environment or a learner."""
+
+import abc
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from deimos.interactions import Interactions
+from deimos.rollout import Rollout
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """What a selector needs to know about the worlds that it serves."""
+
+    num_envs: int
+    """Number of worlds."""
+    state_dim: int
+    """Components of a state (the observation without its goal)."""
+    goal_dim: int
+    """Components of a goal."""
+    goal_period: int
+    """T: steps that a goal is in force."""
+    device: torch.device
+    """Where the tensors lie."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The goals that a selector chose."""
+
+    goal: Tensor
+    """Shape (B, goal_dim)."""
+    score: Tensor
+    """What the selector thinks of each, NaN where it has no opinion, shape (B,)."""
+    learn: Tensor
+    """Whether the learner may use what follows, bool, shape (B,)."""
+
+
+class SelectorConfig(abc.ABC):
+    """What the ``Config`` of a selector promises: a frozen dataclass in a file of ``deimos.selectors``."""
+
+    @abc.abstractmethod
+    def build(self, spaces: Spaces, seed: int) -> "GoalSelector":
+        """Make the selector.
+
+        Args:
+            spaces: The worlds that it serves.
+            seed: Seed of its networks and of its own draws.
+        """
+
+
+class GoalSelector(abc.ABC):
+    """Chooses the goals of a training run."""
+
+    num_candidates: int = 1
+    """Candidates that it wants to choose from at every decision."""
+    first_goals_scaled: bool = False
+    """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
+
+    def goal_range(self) -> Tensor | None:
+        """Share of the goal range to draw candidates from, shape (goal_dim,), in (0, 1]; ``None`` for all of it."""
+        return None
+
+    @abc.abstractmethod
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """Choose the next goal of each listed world.
+
+        Args:
+            rows: Worlds, int64, shape (B,).
+            state: Their states, shape (B, state_dim).
+            goal: Their goals in force, shape (B, goal_dim).
+            candidates: Independent uniform goals for each, shape (B, num_candidates, goal_dim).
+            draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All chance
+                in the choice comes from here, so that it is the same in any batch.
+        """
+
+    def learn(self, interactions: Interactions, rollout: Rollout) -> dict[str, float]:
+        """Learn from what happened, once per rollout; returns numbers for the log, the same keys every time."""
+        return {}
+
+    def check(self) -> None:  # noqa: B027 (a selector without weights has nothing to check)
+        """Raise ``RuntimeError`` if a weight is not finite."""
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs."""
+        return {}
+
+    def load_state_dict(self, state: dict) -> None:  # noqa: B027 (nor anything to load)
+        """Go on from ``state_dict()``."""

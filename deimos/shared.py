@@ -1,0 +1,36 @@
+"""One block of memory, seen by Warp and by torch."""
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A Warp array and a torch tensor over the same memory.
+
+    The pair is frozen because a captured graph and a recorded launch keep the address that they
+    were made with: write into the memory (``shared.tensor.copy_(x)``, ``shared.tensor[:] = x``),
+    never put another tensor in its place.
+    """
+
+    array: wp.array
+    tensor: torch.Tensor
+
+    @classmethod
+    def zeros(cls, shape: int | tuple[int, ...], dtype: type, device: torch.device) -> "Shared":
+        """Allocate zeros.
+
+        Args:
+            shape: Shape of the Warp array; the tensor of a vector dtype has one more axis.
+            dtype: A Warp dtype.
+            device: Where the memory lies.
+        """
+        array = wp.zeros(shape, dtype=dtype, device=warp_device(device))
+        return cls(array, wp.to_torch(array))
+
+
+def warp_device(device: torch.device) -> str:
+    """Warp's name of a torch device."""
+    return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"

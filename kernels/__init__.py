@@ -1,0 +1,1 @@
+"""Warp kernels behind documented launchers; imports Warp and NumPy only, and starts no device."""

@@ -1,0 +1,1 @@
+"""Terrain for the legged robots; imports NumPy, trimesh and Warp only."""
