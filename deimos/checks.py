@@ -4,6 +4,10 @@ import math
 from collections.abc import Iterable
 
 
+class SimulationError(RuntimeError):
+    """The simulation or the learner has left the realm of finite numbers; the run must stop."""
+
+
 def check_at_least(name: str, value: int, least: int) -> None:
     """Raise ``ValueError`` unless ``value`` is at least ``least``."""
     if not value >= least:

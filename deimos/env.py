@@ -136,7 +136,7 @@ class Env(abc.ABC):
 
     @abc.abstractmethod
     def check(self) -> None:
-        """Raise ``RuntimeError`` if a world has become invalid; reads the device once."""
+        """Raise ``SimulationError`` if a world has become invalid; reads the device once."""
 
     @abc.abstractmethod
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:

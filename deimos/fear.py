@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import check_at_least, check_choice, check_hidden, check_positive
+from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Resolved
-from deimos.networks import Activation, flatten_parameters, mlp
+from deimos.networks import Activation, activate_, fast_linear, flatten_parameters, mlp, rows_in_cache
 from deimos.ranks import mean_over_ranks
 
 
@@ -77,16 +77,21 @@ class FearNetwork(nn.Module):
         Returns:
             Logits, shape (B, N); the same for any workspace.
         """
-        count = candidates.shape[1]
+        count, hidden = candidates.shape[1], self.context.out_features
         context = self.context(torch.cat([state, goal], dim=1)).unsqueeze(1)
-        widths = [layer.out_features for layer in self.rest if isinstance(layer, nn.Linear)]
-        bytes_per_row = 4 * count * (2 * self.context.out_features + sum(widths))
-        rows = max(1, workspace // bytes_per_row)
+        linears = [layer for layer in self.rest if isinstance(layer, nn.Linear)]
+        rows = workspace // (8 * max(hidden, *(layer.out_features for layer in linears)))  # one layer in, one out
+        if candidates.device.type == "cpu":
+            rows = min(rows, rows_in_cache(hidden))
+        size = max(1, rows // count)
         logits = torch.empty(candidates.shape[:2], device=candidates.device)
-        for start in range(0, len(candidates), rows):
-            part = slice(start, start + rows)
-            first = self.next_goal(candidates[part]).add_(context[part])
-            logits[part] = self.rest(first).squeeze(2)
+        for start in range(0, len(candidates), size):
+            part = slice(start, start + size)
+            x = fast_linear(candidates[part].reshape(-1, candidates.shape[2]), self.next_goal.weight, None)
+            x.view(-1, count, hidden).add_(context[part])
+            for layer in linears:
+                x = fast_linear(activate_(x, self.rest[0]), layer.weight, layer.bias)
+            logits[part] = x.view(-1, count)
         return logits
 
 
@@ -154,9 +159,9 @@ class Fear:
         return self.network.score(state, goal, candidates, self.config.workspace * 2**20)
 
     def check(self) -> None:
-        """Raise ``RuntimeError`` if a weight is not finite; reads the device once."""
+        """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
         if not bool(self._parameters.isfinite().all()):
-            raise RuntimeError("A weight of the fear network is not finite after a fit.")
+            raise SimulationError("A weight of the fear network is not finite after a fit.")
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""

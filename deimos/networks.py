@@ -1,6 +1,5 @@
 """Multilayer perceptrons, their gradient without allocations, and the actor-critic."""
 
-import sys
 from collections.abc import Sequence
 from typing import Literal
 
@@ -58,39 +57,51 @@ def _aligned(count: int) -> int:
     return -(-count // 16) * 16
 
 
+def fast_linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """``x @ weight.t() + bias``, by the faster of PyTorch's two libraries on a CPU.
+
+    PyTorch hands float32 products to MKL, which takes twice as long as oneDNN where the processor
+    is not Intel's (64 x 64 units, 12 000 rows, Zen 5, two cores: 0.57 against 0.30 ms). The
+    operator is the one that ``torch.compile`` emits for a linear layer.
+    """
+    if x.device.type == "cpu" and torch.backends.mkldnn.is_available():
+        return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+    return nn.functional.linear(x, weight, bias)
+
+
+def activate_(x: Tensor, activation: nn.Module) -> Tensor:
+    """Apply an activation that ``mlp`` knows, in place."""
+    if isinstance(activation, nn.ReLU):
+        return torch.relu_(x)
+    if isinstance(activation, nn.ELU):
+        return nn.functional.elu_(x)
+    return torch.tanh_(x)
+
+
+def rows_in_cache(widest: int) -> int:
+    """Rows whose activations take 1.5 MiB in a layer of ``widest`` units.
+
+    A CPU works through larger batches in such pieces. They stay in its caches; and above about
+    2 MiB the C library gives freed memory back to the system, so that every layer would touch
+    fresh pages, at the price of half an update.
+    """
+    return max(256, 3 * 2**19 // (4 * widest))
+
+
 class Backprop:
     """Forward and backward pass of an MLP, written out.
 
-    It does the arithmetic of autograd and nothing else: activations overwrite their inputs, no
-    graph is recorded, and gradients are added where the optimiser reads them. Parameters need a
-    ``grad`` (see ``flatten_parameters``), which the caller sets to zero.
-
-    On a CPU the hidden layers run as 1x1 convolutions, which are the same products: PyTorch hands
-    float32 convolutions to oneDNN, and float32 matrix products to MKL, which takes twice as long
-    where the processor is not Intel's (64 x 64 units, 12 000 rows, Zen 5, two cores: 0.32 against
-    0.56 ms forward, 0.69 against 1.22 ms backward). Batches above ``best_rows`` lose that again.
+    It does the arithmetic of autograd and nothing else: no graph is recorded, activations overwrite
+    their inputs, and gradients are added where the optimiser reads them.
 
     Args:
-        net: Made by ``mlp``.
+        net: Made by ``mlp``. For ``backward`` its parameters need a ``grad`` (see ``flatten_parameters``).
     """
 
     def __init__(self, net: nn.Sequential) -> None:
         self._linears = [layer for layer in net if isinstance(layer, nn.Linear)]
         self._activation = net[1]
-        self._convolve = self._linears[0].weight.device.type == "cpu" and torch.backends.mkldnn.is_available()
         self._inputs: list[Tensor] = []
-
-    @property
-    def best_rows(self) -> int:
-        """Rows per call above which a CPU slows down.
-
-        The limit keeps each layer's activations within 1.5 MiB: above about 2 MiB the C library
-        returns freed memory to the system, and touching fresh pages costs more than the products.
-        """
-        if self._linears[0].weight.device.type != "cpu":
-            return sys.maxsize
-        widest = max(layer.out_features for layer in self._linears)
-        return max(256, 3 * 2**19 // (4 * widest))
 
     @torch.no_grad()
     def forward(self, x: Tensor) -> Tensor:
@@ -99,13 +110,13 @@ class Backprop:
         Args:
             x: Inputs, shape (n, inputs). Kept, with every activation, for ``backward``.
         """
-        self._inputs = [x]
-        for layer in self._linears[:-1]:
-            x = _convolution(x, layer) if self._convolve else nn.functional.linear(x, layer.weight, layer.bias)
-            self._activate(x)
+        self._inputs = []
+        for layer in self._linears:
             self._inputs.append(x)
-        head = self._linears[-1]
-        return nn.functional.linear(x, head.weight, head.bias)
+            x = fast_linear(x, layer.weight, layer.bias)
+            if layer is not self._linears[-1]:
+                activate_(x, self._activation)
+        return x
 
     @torch.no_grad()
     def backward(self, delta: Tensor) -> None:
@@ -115,25 +126,12 @@ class Backprop:
             delta: Gradient of the loss by the output of the last ``forward``, shape (n, outputs).
         """
         for layer, x in zip(reversed(self._linears), reversed(self._inputs), strict=True):
-            is_first, is_head = layer is self._linears[0], layer is self._linears[-1]
-            if self._convolve and not is_head:
-                below = _convolution_backward(delta, x, layer, not is_first)
-            else:
-                assert layer.weight.grad is not None and layer.bias.grad is not None
-                layer.weight.grad.addmm_(delta.t(), x)
-                layer.bias.grad += delta.sum(0)
-                below = None if is_first else delta @ layer.weight
-            if below is not None:
-                delta = below
+            assert layer.weight.grad is not None and layer.bias.grad is not None
+            layer.weight.grad.addmm_(delta.t(), x)
+            layer.bias.grad += delta.sum(0)
+            if layer is not self._linears[0]:
+                delta = fast_linear(delta, layer.weight.t(), None)
                 self._multiply_by_slope(delta, x)
-
-    def _activate(self, x: Tensor) -> None:
-        if isinstance(self._activation, nn.ReLU):
-            torch.relu_(x)
-        elif isinstance(self._activation, nn.ELU):
-            nn.functional.elu_(x)
-        else:
-            torch.tanh_(x)
 
     def _multiply_by_slope(self, delta: Tensor, y: Tensor) -> None:
         """Multiply ``delta`` in place by the activation's slope, which its output ``y`` determines."""
@@ -144,28 +142,6 @@ class Backprop:
             aten.elu_backward(delta, 1, 1, 1, True, y, grad_input=delta)
         else:
             aten.tanh_backward(delta, y, grad_input=delta)
-
-
-def _convolution(x: Tensor, layer: nn.Linear) -> Tensor:
-    """``layer(x)`` as a 1x1 convolution over an image of n x 1 pixels, channels last: no data moves."""
-    out = nn.functional.conv2d(_as_image(x), layer.weight[:, :, None, None], layer.bias)
-    return out.permute(0, 2, 3, 1).reshape(len(x), -1)
-
-
-def _convolution_backward(delta: Tensor, x: Tensor, layer: nn.Linear, with_input: bool) -> Tensor | None:
-    """Add the gradients of ``layer`` to its ``grad``; return that of its input if asked for."""
-    below, weight, bias = torch.ops.aten.convolution_backward(
-        _as_image(delta), _as_image(x), layer.weight[:, :, None, None], [layer.out_features],
-        [1, 1], [0, 0], [1, 1], False, [0, 0], 1, [with_input, True, True],
-    )  # fmt: skip
-    assert layer.weight.grad is not None and layer.bias.grad is not None
-    layer.weight.grad += weight[:, :, 0, 0]
-    layer.bias.grad += bias
-    return below.permute(0, 2, 3, 1).reshape(len(x), -1) if with_input else None
-
-
-def _as_image(x: Tensor) -> Tensor:
-    return x.view(1, len(x), 1, -1).permute(0, 3, 1, 2)
 
 
 class Actor(nn.Module):

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice, check_hidden, check_positive, check_range
+from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.env import Env
-from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp
+from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 
@@ -170,6 +170,7 @@ class PPO:
         if config.minibatches > rows:
             raise ValueError(f"minibatches must be at most the {rows} transitions of a rollout, got {config.minibatches}.")
         self.config = config
+        self._size = rows // config.minibatches
         with torch.random.fork_rng(devices=[]):  # weights depend on the seed alone
             torch.manual_seed(seed)
             self.actor = Actor(env.obs_dim, config.hidden, env.action_dim, config.activation, config.init_std)
@@ -182,9 +183,9 @@ class PPO:
         self.learning_rate = torch.tensor(config.learning_rate, device=env.device)
         self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
         self._parameters = parameters[0]
+        self._piece = rows_in_cache(max(config.hidden)) if env.device.type == "cpu" else self._size
         self._actor_pass = Backprop(self.actor.mean)
         self._critic_pass = Backprop(self.critic)
-        self._size = rows // config.minibatches
 
     @torch.no_grad()
     def act(self, obs: Tensor, noise: Tensor, action: Tensor, mean: Tensor) -> None:
@@ -204,7 +205,7 @@ class PPO:
         """Values of observations of any leading shape, computed in cache-sized pieces."""
         flat = obs.reshape(-1, obs.shape[-1])
         value = torch.empty(len(flat), device=obs.device)
-        size = min(len(flat), self._critic_pass.best_rows)
+        size = self._piece
         for start in range(0, len(flat), size):
             rows = slice(start, start + size)
             value[rows] = self._critic_pass.forward(flat[rows]).squeeze(1)
@@ -291,7 +292,7 @@ class PPO:
         minibatch = replace(minibatch, weight=minibatch.weight / minibatch.weight.sum().clamp(min=1.0))
         losses = torch.zeros(2, device=std.device)
         moved = torch.zeros_like(std)
-        for piece in minibatch.split(min(self._size, self._actor_pass.best_rows)):
+        for piece in minibatch.split(self._piece):
             mean = self._actor_pass.forward(piece.obs).t().contiguous()
             value = self._critic_pass.forward(piece.obs).squeeze(1)
             surrogate_loss, grad_mean, grad_std = self._policy_gradient(piece, mean)
@@ -393,10 +394,10 @@ class PPO:
         self.critic.load_state_dict(state["critic"])
 
     def check(self) -> None:
-        """Raise ``RuntimeError`` if a weight is not finite; reads the device once."""
+        """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
         if bool(self._parameters.isfinite().all()):
             return
         for part, module in (("actor", self.actor), ("critic", self.critic)):
             for name, value in module.named_parameters():
                 if not value.isfinite().all():
-                    raise RuntimeError(f"The weight {part}.{name} is not finite after an update of PPO.")
+                    raise SimulationError(f"The weight {part}.{name} is not finite after an update of PPO.")

@@ -81,7 +81,7 @@ class GoalSelector(abc.ABC):
         return {}
 
     def check(self) -> None:  # noqa: B027 (a selector without weights has nothing to check)
-        """Raise ``RuntimeError`` if a weight is not finite."""
+        """Raise ``SimulationError`` if a weight is not finite."""
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice, check_positive
+from deimos.checks import SimulationError, check_at_least, check_choice, check_positive
 from deimos.env import Env, EnvConfig, ObsField, Step
 from deimos.shared import Shared
 from kernels.goals import draw_candidates
@@ -262,7 +262,7 @@ class Particle(Env):
         values = {"action": self.action.tensor, "position": self.tensors["position"]}
         broken = [name for name, value in values.items() if not value[world].isfinite().all()]
         quantity = broken[0] if broken else "position"
-        raise RuntimeError(
+        raise SimulationError(
             f"World {world}: its {quantity} is not finite ({values[quantity][world].tolist()}); "
             f"{faults} world-steps were affected since the last check."
         )

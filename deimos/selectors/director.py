@@ -103,7 +103,9 @@ def pick_by_rule(score: Tensor, draw: Tensor, rule: str, percentile: float) -> T
         return score.argmax(dim=1)
     count = score.shape[1]
     kept = max(1, count - int(percentile * count / 100))
-    best_first = score.sort(dim=1, descending=True, stable=True).indices
-    in_order = best_first[:, :kept].sort(dim=1).values
-    pick = (draw * kept).long().clamp(max=kept - 1)
-    return in_order.gather(1, pick.unsqueeze(1)).squeeze(1)
+    edge = score.kthvalue(count - kept + 1, dim=1, keepdim=True).values  # the lowest score that is kept
+    above, tied = score > edge, score == edge
+    free = kept - above.sum(dim=1, keepdim=True)
+    keep = above | (tied & (tied.cumsum(dim=1) <= free))
+    nth = (draw * kept).long().clamp(max=kept - 1)
+    return (keep.cumsum(dim=1) <= nth.unsqueeze(1)).sum(dim=1)

@@ -1,0 +1,293 @@
+"""The command line: ``deimos train``, ``deimos evaluate``, ``deimos bench``.
+
+Whatever the user can mend (a flag, a folder, a disk) ends in one line on stderr and exit code 2.
+"""
+
+import contextlib
+import dataclasses
+import io
+import re
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+
+from deimos import __version__, envs, plugins, selectors
+from deimos.checks import SimulationError
+from deimos.run_folder import RunError
+
+USAGE = f"""Deimos {__version__}: robot policies trained under a Director that chooses their goals by fear.
+
+usage: deimos COMMAND [OPTIONS]
+
+commands:
+  train      train a policy and evaluate it (also: python train.py)
+  evaluate   evaluate the policy of a run folder
+  bench      measure the speed of everything
+
+Every command explains its options with --help."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run ``deimos``; returns the exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    commands: dict[str, Callable[[list[str]], int]] = {"train": train, "evaluate": evaluate, "bench": bench}
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0
+    if arguments[0] == "--version":
+        print(__version__)
+        return 0
+    if arguments[0] not in commands:
+        return _fail(f"There is no command '{arguments[0]}'; there are: {', '.join(commands)}.")
+    return commands[arguments[0]](arguments[1:])
+
+
+def train(arguments: list[str] | None = None) -> int:
+    """Run ``deimos train``; returns the exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with _one_line_errors() as outcome:
+        if any(argument.split("=")[0] == "--resume" for argument in arguments):
+            _resume(_parse(ResumeOptions, arguments, "deimos train"))
+        else:
+            _train(_parse(_train_options(), arguments, "deimos train"))
+    return outcome.code
+
+
+def evaluate(arguments: list[str]) -> int:
+    """Run ``deimos evaluate``; returns the exit code."""
+    with _one_line_errors() as outcome:
+        _evaluate(_parse(EvaluateOptions, arguments, "deimos evaluate"))
+    return outcome.code
+
+
+def bench(arguments: list[str]) -> int:
+    """Run ``deimos bench``; returns the exit code."""
+    with _one_line_errors() as outcome:
+        from deimos import bench as benchmarks
+
+        options = _parse(benchmarks.BenchOptions, arguments, "deimos bench")
+        _quiet_warp()
+        benchmarks.run(options)
+    return outcome.code
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ResumeOptions:
+    """Go on with an earlier run, from its last checkpoint."""
+
+    resume: Path
+    """Folder of the run."""
+    env_steps: int | None = None
+    """A larger budget: steps of every world in all. By default the one that the run had."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Evaluate the policy of a run against Naive and against a freshly trained Adversary."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    worlds: int | None = None
+    """Parallel worlds. By default as the run was set up."""
+    steps: int | None = None
+    """Steps of every world. By default as the run was set up."""
+    seed: int | None = None
+    """Seed of the worlds and their goals. By default as the run was set up."""
+    goal_period: int | None = None
+    """T: steps that a goal is in force. By default as in training."""
+    contexts: int = 0
+    """Instead of the evaluation, audit the fear network on this many contexts: its AUROC within each,
+    against the exact outcomes of cloned worlds."""
+
+
+def _train_options() -> type:
+    """``TrainConfig`` with every environment and selector that there is, and what belongs to the folder."""
+    from deimos.training import TrainConfig
+
+    field = dataclasses.field
+    env_default = next(f.default_factory for f in dataclasses.fields(TrainConfig) if f.name == "env")
+    return dataclasses.make_dataclass(
+        "TrainOptions",
+        [
+            ("env", _subcommands(envs), field(default_factory=env_default)),
+            ("selector", _subcommands(selectors, Annotated[None, tyro.conf.subcommand("none")]), field(default=None)),
+            ("out", Annotated[Path | None, tyro.conf.arg(
+                help="Folder of the run, which must not exist. By default runs/ENV-METHOD-sSEED-TIME."
+            )], field(default=None)),
+            ("resume", Annotated[Path | None, tyro.conf.arg(
+                help="Go on with the run in this folder from its last checkpoint; takes only --env-steps beside it."
+            )], field(default=None)),
+            ("init_from", Annotated[Path | None, tyro.conf.arg(
+                help="Start with the networks of the run in this folder."
+            )], field(default=None)),
+        ],
+        bases=(TrainConfig,), frozen=True, kw_only=True,
+        namespace={"__doc__": "Train a policy under a goal selector, then evaluate it against Naive and Adversary."},
+    )  # fmt: skip
+
+
+def _subcommands(package: Any, *more: Any) -> Any:
+    options = [
+        Annotated[plugins.load(package, name).Config, tyro.conf.subcommand(name)] for name in plugins.names(package)
+    ]
+    return Union[tuple([*more, *options])]
+
+
+def _train(options: Any) -> None:
+    from deimos import training
+
+    names = {field.name for field in dataclasses.fields(training.TrainConfig)}
+    config = training.TrainConfig(**{name: getattr(options, name) for name in names})
+    _quiet_warp()
+    with training.one_stream(training.resolve_device(config.device)):
+        trainer, folder = training.start(config, options.out, options.init_from)
+        _run(trainer, folder)
+
+
+def _resume(options: ResumeOptions) -> None:
+    from deimos import training
+
+    _quiet_warp()
+    config = training.read_config(training.RunFolder.open(options.resume))
+    with training.one_stream(training.resolve_device(config.device)):
+        trainer, folder = training.resume(options.resume, options.env_steps)
+        _run(trainer, folder)
+
+
+def _run(trainer: Any, folder: Any) -> None:
+    """Train, evaluate, draw and say where everything is."""
+    from deimos import console, figures, training
+
+    config = trainer.config
+    title = f"{training.kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
+    with _stop_on_interrupt() as stopped:
+        with console.TrainingBar(trainer) as bar:
+            finished = training.train(trainer, folder, bar.report, stopped)
+        if not finished:
+            print(f"Stopped after iteration {trainer.iteration}; go on with --resume {folder.path}", file=sys.stderr)
+            raise SystemExit(130)
+    if config.evaluation:
+        _evaluate_policy(folder, config.env, config.eval, trainer.env.device)
+    figures.draw_summary(folder, title)
+    console.print_timing(trainer)
+    print(folder.path)
+
+
+def _evaluate(options: EvaluateOptions) -> None:
+    from deimos import console, figures, training
+
+    folder = training.RunFolder.open(options.run)
+    config = training.read_config(folder)
+    _quiet_warp()
+    if options.contexts:
+        from deimos.audit import audit_fear
+
+        audit = audit_fear(training.load(folder, config), options.contexts)
+        folder.write_json("audit.json", audit)
+        console.print_audit(audit)
+        return
+    changes = {name: getattr(options, name) for name in ("worlds", "steps", "seed")}
+    try:
+        eval_config = dataclasses.replace(config.eval, **{k: v for k, v in changes.items() if v is not None})
+        period = config.env.goal_period if options.goal_period is None else options.goal_period
+        env_config = dataclasses.replace(config.env, goal_period=period)
+        if eval_config.steps < 2 * period:
+            raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
+    except ValueError as error:
+        raise RunError(str(error)) from error
+    with training.one_stream(training.resolve_device(config.device)):
+        _evaluate_policy(folder, env_config, eval_config, training.resolve_device(config.device))
+    title = f"{training.kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
+    figures.draw_summary(folder, title)
+    print(folder.path)
+
+
+def _evaluate_policy(folder: Any, env_config: Any, eval_config: Any, device: Any) -> None:
+    """Evaluate the folder's policy; replaces rows with the same key and adds the others."""
+    from deimos import console
+    from deimos.evaluation import evaluate, weights_hash
+    from deimos.policy import load_policy
+
+    policy = load_policy(folder.path, str(device))
+    with console.stage_bar("evaluating") as progress:
+        rows = evaluate(policy.scaled, env_config, eval_config, device, progress)
+    rows = [row | {"weights": weights_hash(policy.actor)} for row in rows]
+    key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
+    old = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+    fresh = {tuple(row[name] for name in key) for row in rows}
+    kept = [row for row in old if tuple(row.get(name) for name in key) not in fresh]
+    folder.write_json("evaluation.json", kept + rows)
+    console.print_evaluation(rows)
+
+
+def _parse(options: Any, arguments: list[str], program: str) -> Any:
+    """Parse by tyro, whose framed complaints become one line."""
+    stderr = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(stderr):
+            return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,))
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise RunError(_unframed(stderr.getvalue())) from None
+
+
+def _unframed(text: str) -> str:
+    """The message inside tyro's frame, without the hints below its first rules, on one line."""
+    lines = [line.strip("│╭╮╰╯ ") for line in text.splitlines()[1:]]
+    parts = " ".join(lines).split("─" * 10)
+    message = parts[0]
+    if len(parts) > 1 and "Available subcommands" in "".join(parts[1:]):
+        message += " " + next(part for part in parts[1:] if "Available" in part)
+    return re.sub(r"[─\s]+", " ", message).strip() or text.strip()
+
+
+class _Outcome:
+    code = 0
+
+
+@contextlib.contextmanager
+def _one_line_errors() -> Iterator[_Outcome]:
+    outcome = _Outcome()
+    try:
+        yield outcome
+    except (RunError, SimulationError) as error:
+        outcome.code = _fail(str(error))
+    except OSError as error:
+        outcome.code = _fail(f"{error.filename or 'A file'}: {error.strerror or error}.")
+    except SystemExit as stop:
+        outcome.code = stop.code if isinstance(stop.code, int) else 0
+
+
+def _fail(message: str) -> int:
+    print(f"deimos: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+@contextlib.contextmanager
+def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C end the iteration instead of cutting it; a second one cuts."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: Any) -> None:
+        asked.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _quiet_warp() -> None:
+    """Keep Warp's start-up report off the terminal, with its warning that there is no GPU; later ones show."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    wp.config.log_level = wp.LOG_WARNING

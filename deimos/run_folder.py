@@ -1,0 +1,160 @@
+"""A run's folder: what is written where, so that it survives a kill at any moment."""
+
+import csv
+import json
+import math
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+class RunError(Exception):
+    """A run cannot go on for a reason outside the program: a folder, a file, a disk, a device."""
+
+
+def save_tensors(path: Path, data: dict) -> None:
+    """Write a file of tensors so that at every moment either the old or the new one is whole.
+
+    Raises:
+        RunError: If it cannot be written; the file of before is untouched.
+    """
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        with temporary.open("wb") as file:
+            torch.save(data, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
+        temporary.unlink(missing_ok=True)
+        raise RunError(f"{path} could not be written ({_first_line(error)}); what was there is untouched.") from error
+
+
+def load_tensors(path: Path, what: str, schema: int) -> dict:
+    """Read a file of tensors.
+
+    Raises:
+        RunError: If it is missing, broken, foreign or of another version.
+    """
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise RunError(f"There is no {what} at {path}.") from error
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError) as error:
+        raise RunError(f"{path} is not a {what}, or it is broken ({_first_line(error)}).") from error
+    if not isinstance(data, dict) or data.get("schema") != schema:
+        found = data.get("schema") if isinstance(data, dict) else None
+        raise RunError(f"{path} is not a {what} of schema {schema}, got {found}.")
+    return data
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+class RunFolder:
+    """The files of one run: ``config.json``, ``progress.csv``, ``timing.csv``, ``checkpoint.pt`` and the rest."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, path: Path) -> "RunFolder":
+        """Make the folder.
+
+        Raises:
+            RunError: If it exists or cannot be made.
+        """
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError as error:
+            raise RunError(f"{path} exists and is not overwritten; choose another --out, or go on with --resume.") from error
+        except OSError as error:
+            raise RunError(f"The run folder {path} cannot be made ({error.strerror}).") from error
+        return cls(path)
+
+    @classmethod
+    def open(cls, path: Path) -> "RunFolder":
+        """Open the folder of an earlier run.
+
+        Raises:
+            RunError: If it is not one.
+        """
+        if not (path / "config.json").is_file():
+            raise RunError(f"{path} is not a run folder: it holds no config.json.")
+        return cls(path)
+
+    def write_json(self, name: str, data: Any) -> None:
+        """Write a JSON file whole or not at all; NaN becomes null.
+
+        Raises:
+            RunError: If it cannot be written.
+        """
+        path = self.path / name
+        temporary = path.with_name(path.name + ".partial")
+        try:
+            temporary.write_text(json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n")
+            temporary.replace(path)
+        except OSError as error:
+            raise RunError(f"{path} could not be written ({error.strerror}).") from error
+
+    def read_json(self, name: str) -> Any:
+        """Read a JSON file.
+
+        Raises:
+            RunError: If it is missing or is not JSON.
+        """
+        try:
+            return json.loads((self.path / name).read_text())
+        except (OSError, ValueError) as error:
+            raise RunError(f"{self.path / name} cannot be read ({_first_line(error)}).") from error
+
+    def read_csv(self, name: str) -> list[dict[str, str]]:
+        """All whole rows of a CSV file; none if there is no file."""
+        path = self.path / name
+        if not path.is_file():
+            return []
+        with path.open(newline="") as file:
+            return [row for row in csv.DictReader(file) if None not in row.values()]
+
+    def cut_csv(self, name: str, iteration: int) -> None:
+        """Drop the rows after an iteration: a resumed run writes them again."""
+        rows = [row for row in self.read_csv(name) if int(row["iteration"]) <= iteration]
+        path = self.path / name
+        if not rows:
+            path.unlink(missing_ok=True)
+            return
+        temporary = path.with_name(path.name + ".partial")
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            writer.writerows(rows)
+        temporary.replace(path)
+
+    def append_csv(self, name: str, row: dict[str, float]) -> None:
+        """Add a row, and a header where there is none yet; NaN becomes an empty cell.
+
+        Raises:
+            RunError: If it cannot be written.
+        """
+        path = self.path / name
+        try:
+            is_new = not path.exists() or path.stat().st_size == 0
+            with path.open("a", newline="") as file:
+                writer = csv.writer(file)
+                if is_new:
+                    writer.writerow(row)
+                writer.writerow(["" if isinstance(v, float) and math.isnan(v) else repr(v) for v in row.values()])
+        except OSError as error:
+            raise RunError(f"{path} could not be written ({error.strerror}); the last checkpoint is whole.") from error
+
+
+def _without_nan(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _without_nan(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_without_nan(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data

@@ -1,0 +1,383 @@
+"""Training: a policy learns in parallel worlds whose goals a selector chooses."""
+
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+import torch
+import warp as wp
+
+from deimos import __version__
+from deimos.checks import SimulationError, check_at_least, check_choice
+from deimos.config import from_dict, kind, to_dict
+from deimos.env import EnvConfig
+from deimos.envs import particle
+from deimos.evaluation import EvalConfig
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.methods import method
+from deimos.policy import save_policy
+from deimos.ppo import PPO, PPOConfig
+from deimos.rollout import Rollout
+from deimos.run_folder import RunError, RunFolder, load_tensors, save_tensors
+from deimos.selector import SelectorConfig
+
+SCHEMA = 1  # of config.json and checkpoint.pt
+CHECKPOINT_SECONDS = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """A training run and the evaluation at its end."""
+
+    env: EnvConfig = field(default_factory=particle.Config)
+    """The environment."""
+    method: str | None = None
+    """Who chooses the goals, by name: uniform, coop, p10, p25, p50, p75, p90, antagonist. By default p25;
+    or leave it out and set up a selector."""
+    selector: SelectorConfig | None = None
+    """Who chooses the goals, in detail."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """The learner."""
+    eval: EvalConfig = field(default_factory=EvalConfig)
+    """The evaluation against Naive and Adversary at the end."""
+    evaluation: bool = True
+    """Whether the run ends with the evaluation."""
+    seed: int = 0
+    """Seed of the weights, the worlds, the goals and the exploration, in [0, 2^32)."""
+    num_envs: int = 2000
+    """Parallel worlds, at least 1."""
+    env_steps: int = 2000
+    """Steps of every world, at least 1; rounded up to whole rollouts."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to simulate and learn; auto takes the GPU where there is one."""
+    threads: int = 0
+    """CPU threads, at least 0; 0 takes one per core that this process may use. Part of what fixes a run's numbers."""
+
+    def __post_init__(self) -> None:
+        check_at_least("num_envs", self.num_envs, 1)
+        check_at_least("env_steps", self.env_steps, 1)
+        check_at_least("threads", self.threads, 0)
+        check_choice("device", self.device, ["auto", "cpu", "cuda"])
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
+        if self.method is not None and self.selector is not None:
+            raise ValueError(f"method '{self.method}' and a selector exclude each other; give one of them.")
+        if self.method is not None:
+            method(self.method)
+        if self.evaluation and self.eval.steps < 2 * self.env.goal_period:
+            raise ValueError(f"eval.steps must be at least 2 T = {2 * self.env.goal_period}, got {self.eval.steps}.")
+        transitions = self.num_envs * self.ppo.num_steps
+        if transitions < 2 or self.ppo.minibatches > transitions:
+            raise ValueError(
+                f"A rollout must hold at least 2 transitions and ppo.minibatches = {self.ppo.minibatches}, got {transitions}."
+            )
+
+    @property
+    def goals(self) -> SelectorConfig:
+        """Who chooses the goals."""
+        return self.selector or method(self.method or "p25")
+
+    @property
+    def label(self) -> str:
+        """Short name of who chooses the goals."""
+        return self.method or (kind(self.selector) if self.selector else "p25")
+
+    @property
+    def iterations(self) -> int:
+        """Rollouts in the whole run."""
+        return -(-self.env_steps // self.ppo.num_steps)
+
+
+def resolve_device(name: str) -> torch.device:
+    """The device of a name.
+
+    Raises:
+        RunError: If CUDA is asked for and there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise RunError("There is no CUDA device here; use --device cpu.")
+    return torch.device("cuda", 0) if name != "cpu" and torch.cuda.is_available() else torch.device("cpu")
+
+
+def one_stream(device: torch.device) -> AbstractContextManager:
+    """Run torch and Warp on one explicit CUDA stream, so that neither has to wait for the other.
+
+    Enter it before anything is built on the device. On the CPU it does nothing.
+    """
+    if device.type == "cpu":
+        return nullcontext()
+    stream = torch.cuda.Stream(device)
+    torch.cuda.set_stream(stream)
+    return wp.ScopedStream(wp.stream_from_torch(stream))
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Trainer:
+    """Everything that a run holds in memory, and one iteration of it."""
+
+    def __init__(self, config: TrainConfig, device: torch.device) -> None:
+        self.config = config
+        self.env = config.env.build(config.num_envs, device, config.seed)
+        self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env), config.seed))
+        self.ppo = PPO(config.ppo, self.env, config.seed)
+        self.rollout = Rollout(self.env, config.ppo.num_steps)
+        self.iteration = 0
+        self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
+        """Time spent so far in each part of an iteration [s]."""
+        self.loop.start()
+
+    def collect(self) -> None:
+        """Let the policy act for one rollout."""
+        env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
+        rollout.noise.normal_(generator=ppo.generator)
+        clock = _Clock(self.seconds)
+        for t in range(rollout.num_steps):
+            rollout.obs[t] = env.obs
+            ppo.act(env.obs, rollout.noise[t], rollout.action[t], rollout.mean[t])
+            clock.lap("policy")
+            step = env.step(rollout.action[t])
+            clock.lap("env")
+            rollout.record(t, step, loop.learn)
+            loop.advance(step)
+            clock.lap("goals")
+        rollout.obs[-1] = env.obs
+
+    def iterate(self) -> dict[str, float]:
+        """One rollout and what is learnt from it.
+
+        Returns:
+            The row of ``progress.csv``.
+
+        Raises:
+            SimulationError: If a number is not finite; nothing was learnt from it.
+        """
+        self.iteration += 1
+        try:
+            self.collect()
+            self.env.check()
+            clock = _Clock(self.seconds)
+            learner = self.ppo.update(self.rollout)
+            self.ppo.check()
+            clock.lap("update")
+            selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
+            self.loop.selector.check()
+            clock.lap("selector")
+        except SimulationError as error:
+            raise SimulationError(f"Iteration {self.iteration}: {error}") from error
+        rollout = self.rollout
+        crashes, reward = rollout.terminated.sum(), rollout.reward.mean(dtype=torch.float64)
+        transitions = rollout.reward.numel()
+        return {
+            "iteration": self.iteration,
+            "env_steps": self.iteration * rollout.num_steps,
+            "transitions": self.iteration * transitions,
+            "reward": reward.item(),
+            "crashes": int(crashes),
+            "crashes_per_1000": 1000 * int(crashes) / transitions,
+            "selected_share": self.loop.interactions.active.float().mean().item(),
+            **learner,
+            **selector,
+        }
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs."""
+        return {"iteration": self.iteration, "ppo": self.ppo.state_dict(), "loop": self.loop.state_dict()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from ``state_dict()``.
+
+        Raises:
+            RunError: If it is that of another environment or another network size.
+        """
+        try:
+            self.ppo.load_state_dict(state["ppo"])
+            self.loop.load_state_dict(state["loop"])
+        except (KeyError, ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise RunError(f"The checkpoint is that of another environment or network size: {reason}") from error
+        self.iteration = state["iteration"]
+
+
+class _Clock:
+    """Adds up the time between laps."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self._seconds = seconds
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self._seconds[name] += now - self._last
+        self._last = now
+
+
+def provenance() -> dict[str, str]:
+    """Versions, commit and platform that a run's numbers belong to."""
+    packages = ("torch", "warp-lang", "numpy")
+    home = Path(__file__).resolve().parent
+    git = subprocess.run(
+        ["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=home, capture_output=True, text=True, check=False
+    )
+    return {
+        "deimos": __version__,
+        "commit": git.stdout.strip() if git.returncode == 0 else "unknown",
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{name: version(name) for name in packages},
+    }
+
+
+def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tuple[Trainer, RunFolder]:
+    """Begin a run.
+
+    Args:
+        config: What to train.
+        path: Its folder; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
+        init_from: An earlier run whose networks this one starts with.
+
+    Raises:
+        RunError: If the folder exists, or ``init_from`` does not fit.
+    """
+    device = resolve_device(config.device)
+    config = replace(config, threads=config.threads or cores(), device="cuda" if device.type == "cuda" else "cpu")
+    torch.set_num_threads(config.threads)
+    trainer = Trainer(config, device)
+    if init_from is not None:
+        state = load_tensors(RunFolder.open(init_from).path / "checkpoint.pt", "checkpoint", SCHEMA)
+        try:
+            trainer.ppo.load_weights(state["ppo"])
+        except (KeyError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise RunError(f"The networks of {init_from} do not fit this run: {reason}") from error
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    folder = RunFolder.create(path or Path("runs") / f"{kind(config.env)}-{config.label}-s{config.seed}-{stamp}")
+    folder.write_json("config.json", {
+        "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
+        "init_from": str(init_from) if init_from else None,
+    })  # fmt: skip
+    return trainer, folder
+
+
+def load(folder: RunFolder, config: TrainConfig) -> Trainer:
+    """Rebuild a run as it was at its last checkpoint; writes nothing.
+
+    Args:
+        folder: Its folder.
+        config: Its configuration.
+
+    Raises:
+        RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
+    """
+    torch.set_num_threads(config.threads)
+    trainer = Trainer(config, resolve_device(config.device))
+    checkpoint = folder.path / "checkpoint.pt"
+    if checkpoint.exists():  # else it was killed before its first one, and begins again
+        trainer.load_state_dict(load_tensors(checkpoint, "checkpoint", SCHEMA))
+    return trainer
+
+
+def resume(path: Path, env_steps: int | None) -> tuple[Trainer, RunFolder]:
+    """Go on with a run from its last checkpoint.
+
+    Args:
+        path: Its folder.
+        env_steps: A larger budget; ``None`` for the one that it had.
+
+    Raises:
+        RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.
+    """
+    folder = RunFolder.open(path)
+    config = read_config(folder)
+    if env_steps is not None:
+        if env_steps < config.env_steps:
+            raise RunError(f"A resumed run takes only a larger budget: it had {config.env_steps} steps, got {env_steps}.")
+        config = replace(config, env_steps=env_steps)
+    trainer = load(folder, config)
+    folder.write_json("config.json", folder.read_json("config.json") | {"config": to_dict(config)})
+    for name in ("progress.csv", "timing.csv"):
+        folder.cut_csv(name, trainer.iteration)
+    return trainer, folder
+
+
+def read_config(folder: RunFolder) -> TrainConfig:
+    """The configuration that a run was started with.
+
+    Raises:
+        RunError: If it is broken or of another version.
+    """
+    data = folder.read_json("config.json")
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        raise RunError(f"{folder.path / 'config.json'} is not that of a run of schema {SCHEMA}.")
+    try:
+        return from_dict(TrainConfig, data["config"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{folder.path / 'config.json'} does not describe a run: {error}") from error
+
+
+def save(trainer: Trainer, folder: RunFolder) -> None:
+    """Write the checkpoint and the policy.
+
+    Raises:
+        RunError: If they cannot be written; the ones of before are whole.
+    """
+    save_tensors(folder.path / "checkpoint.pt", {"schema": SCHEMA, **trainer.state_dict()})
+    ppo = trainer.config.ppo
+    save_policy(folder.path / "policy.pt", trainer.ppo.actor, ppo.hidden, ppo.activation, trainer.env)
+
+
+def train(
+    trainer: Trainer,
+    folder: RunFolder,
+    report: Callable[[dict[str, float], float], None] = lambda row, fps: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Run all iterations that are left.
+
+    Args:
+        trainer: New or resumed.
+        folder: Where its files go.
+        report: Called after every iteration with its row and the frames per second.
+        stopped: Asked after every iteration; true ends the run early, with a checkpoint.
+
+    Returns:
+        Whether the budget was used up.
+
+    Raises:
+        SimulationError: If a number is not finite; the last checkpoint is that of before.
+        RunError: If a file cannot be written; the last checkpoint is whole.
+    """
+    from torch.utils.tensorboard import SummaryWriter
+
+    transitions = trainer.rollout.reward.numel()
+    saved = time.monotonic()
+    with SummaryWriter(str(folder.path), purge_step=trainer.iteration + 1) as board:
+        while trainer.iteration < trainer.config.iterations:
+            before = dict(trainer.seconds)
+            begin = time.perf_counter()
+            row = trainer.iterate()
+            fps = transitions / (time.perf_counter() - begin)
+            folder.append_csv("progress.csv", row)
+            spent = {name: seconds - before[name] for name, seconds in trainer.seconds.items()}
+            folder.append_csv("timing.csv", {"iteration": trainer.iteration, "fps": fps, **spent})
+            for name, value in row.items():
+                board.add_scalar(name, value, trainer.iteration)
+            board.add_scalar("fps", fps, trainer.iteration)
+            report(row, fps)
+            if stopped():
+                break
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                save(trainer, folder)
+                saved = time.monotonic()
+    save(trainer, folder)
+    return trainer.iteration >= trainer.config.iterations

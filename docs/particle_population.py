@@ -1,0 +1,107 @@
+"""Train and evaluate the populations of docs/particle.md, and print its tables.
+
+    python docs/particle_population.py runs/population            # trains what is missing, then prints
+    python docs/particle_population.py runs/population --audit    # adds the audit of the fear network
+
+A run that was killed goes on from its checkpoint when the command is given again.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+SEEDS = range(5)
+STEPS = {"directional": 2000, "relative": 2000, "absolute": 5000}  # thesis, 4.5.1
+CELLS = [(variant, "uniform") for variant in STEPS] + [
+    ("directional", method) for method in ("p25", "coop", "antagonist")
+]
+AUDITED = [1500, 1625, 1750, 1875, 2000]  # parallel steps: the last quarter of training
+RESAMPLES = 10_000
+
+
+def run(folder: Path, variant: str, method: str, seed: int) -> None:
+    """Train one policy, or go on with it, unless its evaluation is there."""
+    if (folder / "evaluation.json").exists():
+        return
+    command = [sys.executable, "train.py"]
+    if (folder / "config.json").exists():
+        command += ["--resume", str(folder)]
+    else:
+        command += ["--out", str(folder), "--method", method, "--seed", str(seed), "--threads", "1"]
+        command += ["--env-steps", str(STEPS[variant]), "env:particle", "--env.variant", variant]
+    subprocess.run(command, check=True, capture_output=True)
+    print("finished", folder, file=sys.stderr, flush=True)
+
+
+def audit(root: Path, seed: int) -> list[dict]:
+    """Train p25 in stages and audit its fear network after each."""
+    folder, found = root / f"audit-s{seed}", []
+    for steps in AUDITED:
+        kept = root / f"audit-s{seed}-{steps}.json"
+        if not kept.exists():
+            start = ["--method", "p25", "--seed", str(seed), "--threads", "1", "--no-evaluation", "--out", str(folder)]
+            begin = ["--resume", str(folder)] if (folder / "config.json").exists() else start
+            subprocess.run([sys.executable, "train.py", *begin, "--env-steps", str(steps)], check=True, capture_output=True)
+            command = [sys.executable, "-m", "deimos", "evaluate", str(folder), "--contexts", "200"]
+            subprocess.run(command, check=True, capture_output=True)
+            kept.write_text((folder / "audit.json").read_text())
+        found.append(json.loads(kept.read_text()) | {"seed": seed, "steps": steps})
+    return found
+
+
+def interval(values: np.ndarray) -> str:
+    """95 % percentile bootstrap interval of the median."""
+    picks = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
+    low, high = np.quantile(np.median(values[picks], axis=1), [0.025, 0.975])
+    return f"[{low:.3g}, {high:.3g}]"
+
+
+def print_tables(root: Path) -> None:
+    """One row per cell: medians over seeds, with the range."""
+    print("| variant | method | goals | crashes / 1000 (min-max) | crashes per interaction | score (min-max) "
+          "| reward | Adversary's AUROC |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|")
+    for variant, method in CELLS:
+        runs = [json.loads((root / f"{variant}-{method}-s{s}" / "evaluation.json").read_text()) for s in SEEDS]
+        for i, goals in enumerate(("naive", "adversary")):
+            column = {name: np.array([r[i][name] for r in runs]) for name in ("crashes_per_1000", "crash_rate", "score", "reward")}
+            rate, score = column["crashes_per_1000"], column["score"]
+            auroc = f"{np.median([r[1]['adversary_auroc'] for r in runs]):.3f}" if i else ""
+            print(f"| {variant} | {method} | {goals} | {np.median(rate):.3f} ({rate.min():.3f}-{rate.max():.3f}) "
+                  f"| {np.median(column['crash_rate']):.4f} | {np.median(score):.3f} ({score.min():.3f}-{score.max():.3f}) "
+                  f"| {np.median(column['reward']):.4f} | {auroc} |")  # fmt: skip
+    runs = [json.loads((root / f"directional-uniform-s{s}" / "evaluation.json").read_text()) for s in SEEDS]
+    naive, attacked = ([r[i]["interaction_crashes"] + 0.5 for r in runs] for i in (0, 1))
+    ratio = np.array(attacked) / np.array(naive)
+    gap = np.array([r[1]["crash_rate"] - r[0]["crash_rate"] for r in runs])
+    print(f"\nAdversary / Naive on the Uniform policies of Directional, (a + 0.5) / (b + 0.5) crashes: "
+          f"median {np.median(ratio):.3g} {interval(ratio)}, each {', '.join(f'{x:.3g}' for x in ratio)}. "
+          f"Difference in crashes per interaction: median {np.median(gap):.4f} {interval(gap)}.")  # fmt: skip
+
+
+def main() -> None:
+    """See the module's docstring."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("root", type=Path)
+    parser.add_argument("--workers", type=int, default=2, help="runs at a time, one thread each")
+    parser.add_argument("--audit", action="store_true")
+    options = parser.parse_args()
+    jobs = [(options.root / f"{v}-{m}-s{s}", v, m, s) for s in SEEDS for v, m in CELLS]
+    with ThreadPoolExecutor(options.workers) as pool:
+        list(pool.map(lambda job: run(*job), jobs))
+        audits = list(pool.map(lambda seed: audit(options.root, seed), SEEDS)) if options.audit else []
+    print_tables(options.root)
+    if audits:
+        print("\n| seed | parallel steps | contexts | crash share | AUROC within contexts | 95 % interval |\n|---|---|---|---|---|---|")
+    for row in (row for rows in audits for row in rows):
+        print(f"| {row['seed']} | {row['steps']} | {row['contexts']} of {row['tried']} | {row['crash_share']:.3f} "
+              f"| {row['auroc']:.3f} | [{row['low']:.3f}, {row['high']:.3f}] |")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
