@@ -2,8 +2,11 @@
 
 import importlib.util
 from pathlib import Path
+from typing import Any
 
-__version__ = "0.1.0"
+from deimos._version import __version__
+
+__all__ = ["__version__", "load_policy"]
 
 # ``kernels`` and ``terrain`` are names that other distributions use too. A foreign one first on the path
 # would fail much later and obscurely, so it is refused here.
@@ -15,3 +18,12 @@ for _name in ("kernels", "terrain"):
             f"Deimos needs its own package '{_name}' from {_HOME}, but Python found {_spec and _spec.origin}. "
             f"Another distribution is called '{_name}' too; install Deimos in an environment of its own."
         )
+
+
+def __getattr__(name: str) -> Any:
+    """Import what the package offers when it is first asked for; importing ``deimos`` alone stays light."""
+    if name == "load_policy":
+        from deimos.policy import load_policy
+
+        return load_policy
+    raise AttributeError(f"module 'deimos' has no attribute '{name}'")

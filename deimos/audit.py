@@ -63,7 +63,9 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
             if 0 < int(label.sum()) < CANDIDATES
         ]
     if not ranks:
-        raise RunError(f"None of {tried} contexts had both outcomes; the policy is too safe or too bad to rank its goals.")
+        raise RunError(
+            f"None of {tried} contexts had both outcomes; the policy is too safe or too bad to rank its goals."
+        )
     picks = np.random.default_rng(0).integers(len(ranks), size=(RESAMPLES, len(ranks)))
     low, high = np.quantile(np.array(ranks)[picks].mean(axis=1), [0.025, 0.975])
     return {
@@ -78,9 +80,7 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
 
 
 @torch.no_grad()
-def _next_contexts(
-    trainer: "Trainer", probe: Env, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
+def _next_contexts(trainer: "Trainer", probe: Env, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Go on until goals are due, and clone up to ``BATCH`` of those worlds into ``probe``, once per candidate.
 
     Returns:

@@ -134,7 +134,7 @@ def _subcommands(package: Any, *more: Any) -> Any:
     options = [
         Annotated[plugins.load(package, name).Config, tyro.conf.subcommand(name)] for name in plugins.names(package)
     ]
-    return Union[tuple([*more, *options])]
+    return Union[tuple([*more, *options])]  # noqa: UP007 (a union of a computed list)
 
 
 def _train(options: Any) -> None:
@@ -194,7 +194,7 @@ def _evaluate(options: EvaluateOptions) -> None:
     try:
         eval_config = dataclasses.replace(config.eval, **{k: v for k, v in changes.items() if v is not None})
         period = config.env.goal_period if options.goal_period is None else options.goal_period
-        env_config = dataclasses.replace(config.env, goal_period=period)
+        env_config = config.env.with_goal_period(period)
         if eval_config.steps < 2 * period:
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except ValueError as error:

@@ -16,7 +16,9 @@ _PLUGINS = {EnvConfig: envs, SelectorConfig: selectors}
 
 def to_dict(config: Any) -> dict:
     """A dataclass as a dictionary of JSON types; a plugin's configuration names its plugin in ``kind``."""
-    return {"kind": kind(config)} | _fields(config) if isinstance(config, tuple(_PLUGINS)) else _fields(config)
+    if isinstance(config, EnvConfig | SelectorConfig):
+        return {"kind": kind(config)} | _fields(config)
+    return _fields(config)
 
 
 def _fields(config: Any) -> dict:
@@ -60,7 +62,9 @@ def from_dict(cls: type, data: dict) -> Any:
     hints = typing.get_type_hints(cls)
     names = {field.name for field in dataclasses.fields(cls)}
     if unknown := sorted(set(data) - names):
-        raise ValueError(f"{cls.__module__}.{cls.__name__} has no {', '.join(unknown)}; it has: {', '.join(sorted(names))}.")
+        raise ValueError(
+            f"{cls.__module__}.{cls.__name__} has no {', '.join(unknown)}; it has: {', '.join(sorted(names))}."
+        )
     return cls(**{name: _typed(hints[name], value) for name, value in data.items()})
 
 

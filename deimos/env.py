@@ -63,6 +63,10 @@ class EnvConfig(abc.ABC):
         """
 
     @abc.abstractmethod
+    def with_goal_period(self, goal_period: int) -> "EnvConfig":
+        """The same task with another T."""
+
+    @abc.abstractmethod
     def for_evaluation(self) -> "EnvConfig":
         """The same task with every randomisation switched off and all goal clocks in step."""
 

@@ -1,6 +1,5 @@
 """The fear network: how likely is this policy to crash within T steps of getting this goal?"""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,7 +7,7 @@ from torch import Tensor, nn
 
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Resolved
-from deimos.networks import Activation, activate_, fast_linear, flatten_parameters, mlp, rows_in_cache
+from deimos.networks import Activation, Backprop, activate_, fast_linear, flatten_parameters, mlp, rows_in_cache
 from deimos.ranks import mean_over_ranks
 
 
@@ -16,15 +15,15 @@ from deimos.ranks import mean_over_ranks
 class FearConfig:
     """The fear network and how it learns (thesis, 4.2)."""
 
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = (64, 32)
     """Units of the hidden layers."""
     activation: Activation = "relu"
     """Between the layers."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     """Step size of Adam, positive."""
     epochs: int = 1
     """Passes over the window of interactions in every fit, at least 1."""
-    minibatches: int = 4
+    minibatches: int = 8
     """Parts that the window is split into, at least 1."""
     min_per_class: int = 32
     """Crashes and survivals that the window must hold before a fit, at least 1."""
@@ -39,64 +38,8 @@ class FearConfig:
             check_at_least(name, getattr(self, name), 1)
 
 
-class FearNetwork(nn.Module):
-    """A logit of (state, goal, next goal).
-
-    The first layer is linear, so it is the sum of one layer of (state, goal) and one of the next
-    goal. For N candidates of one decision the first part is computed once, not N times.
-    """
-
-    def __init__(self, state_dim: int, goal_dim: int, hidden: Sequence[int], activation: Activation) -> None:
-        super().__init__()
-        whole = mlp(state_dim + 2 * goal_dim, hidden, 1, activation)
-        first = whole[0]
-        assert isinstance(first, nn.Linear)
-        self.context = nn.Linear(state_dim + goal_dim, hidden[0])
-        self.next_goal = nn.Linear(goal_dim, hidden[0], bias=False)
-        self.rest = whole[1:]
-        with torch.no_grad():  # the two parts start as the one layer that they are
-            self.context.weight.copy_(first.weight[:, : state_dim + goal_dim])
-            self.context.bias.copy_(first.bias)
-            self.next_goal.weight.copy_(first.weight[:, state_dim + goal_dim :])
-
-    def forward(self, state: Tensor, goal: Tensor, next_goal: Tensor) -> Tensor:
-        """Logits of crashing, shape (n,), for states (n, state_dim) and goals (n, goal_dim)."""
-        first = self.context(torch.cat([state, goal], dim=1)) + self.next_goal(next_goal)
-        return self.rest(first).squeeze(1)
-
-    @torch.no_grad()
-    def score(self, state: Tensor, goal: Tensor, candidates: Tensor, workspace: int) -> Tensor:
-        """Logits of crashing for many candidates per decision.
-
-        Args:
-            state: States, shape (B, state_dim).
-            goal: Goals in force, shape (B, goal_dim).
-            candidates: Possible next goals, shape (B, N, goal_dim).
-            workspace: Memory that the activations may take [bytes].
-
-        Returns:
-            Logits, shape (B, N); the same for any workspace.
-        """
-        count, hidden = candidates.shape[1], self.context.out_features
-        context = self.context(torch.cat([state, goal], dim=1)).unsqueeze(1)
-        linears = [layer for layer in self.rest if isinstance(layer, nn.Linear)]
-        rows = workspace // (8 * max(hidden, *(layer.out_features for layer in linears)))  # one layer in, one out
-        if candidates.device.type == "cpu":
-            rows = min(rows, rows_in_cache(hidden))
-        size = max(1, rows // count)
-        logits = torch.empty(candidates.shape[:2], device=candidates.device)
-        for start in range(0, len(candidates), size):
-            part = slice(start, start + size)
-            x = fast_linear(candidates[part].reshape(-1, candidates.shape[2]), self.next_goal.weight, None)
-            x.view(-1, count, hidden).add_(context[part])
-            for layer in linears:
-                x = fast_linear(activate_(x, self.rest[0]), layer.weight, layer.bias)
-            logits[part] = x.view(-1, count)
-        return logits
-
-
 class Fear:
-    """A fear network and how it learns online.
+    """A fear network, an MLP of (state, goal, next goal) with one logit, and how it learns online.
 
     Args:
         config: Its sizes and how it learns.
@@ -110,15 +53,17 @@ class Fear:
         self.config = config
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.network = FearNetwork(state_dim, goal_dim, config.hidden, config.activation).to(device)
+            self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation).to(device)
         parameters, _ = flatten_parameters(self.network)
         self._parameters = parameters[0]
+        self._pass = Backprop(self.network)
         self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, fused=True)
         self.generator = torch.Generator(device)
         self.generator.manual_seed(seed)
         self.fitted = False
         """Whether it has learnt anything yet; before, its ranking of goals would be an arbitrary bias."""
 
+    @torch.no_grad()
     def fit(self, data: Resolved, epochs: int | None = None) -> float:
         """Learn from interactions by class-balanced binary cross-entropy on logits.
 
@@ -135,28 +80,62 @@ class Fear:
         share = mean_over_ranks(data.crashed.float().mean()).item() if len(data) else 0.0
         if min(share, 1.0 - share) * len(data) < self.config.min_per_class:
             return float("nan")
+        weight = torch.where(data.crashed, 0.5 / share, 0.5 / (1.0 - share)) / len(data)
+        inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
         target = data.crashed.float()
-        weight = torch.where(data.crashed, 0.5 / share, 0.5 / (1.0 - share))
         size = -(-len(data) // self.config.minibatches)
         losses = torch.zeros((), device=target.device)
         for _ in range(self.config.epochs if epochs is None else epochs):
             losses.zero_()
             order = torch.randperm(len(data), generator=self.generator, device=target.device)
             for rows in order.split(size):
-                logit = self.network(data.state[rows], data.goal[rows], data.next_goal[rows])
-                loss = nn.functional.binary_cross_entropy_with_logits(logit, target[rows], weight[rows])
-                assert self._parameters.grad is not None
-                self._parameters.grad.zero_()
-                loss.backward()
-                mean_over_ranks(self._parameters.grad)
-                self.optimizer.step()
-                losses += loss.detach() * (len(rows) / len(data))
+                losses += self._learn(inputs[rows], target[rows], weight[rows], len(data) / len(rows))
         self.fitted = True
         return losses.item()
 
+    def _learn(self, inputs: Tensor, target: Tensor, weight: Tensor, scale: float) -> Tensor:
+        """One step of Adam on a minibatch; ``scale`` makes its gradient one of a mean. Returns its part of the loss."""
+        assert self._parameters.grad is not None
+        self._parameters.grad.zero_()
+        logit = self._pass.forward(inputs).squeeze(1)
+        delta = torch.sigmoid(logit).sub_(target).mul_(weight * scale)  # slope of the cross-entropy by the logit
+        self._pass.backward(delta.unsqueeze(1))
+        mean_over_ranks(self._parameters.grad)
+        self.optimizer.step()
+        return nn.functional.binary_cross_entropy_with_logits(logit, target, weight, reduction="sum")
+
+    @torch.no_grad()
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
-        """Logits of crashing, shape (B, N); see ``FearNetwork.score``."""
-        return self.network.score(state, goal, candidates, self.config.workspace * 2**20)
+        """Logits of crashing for many candidates per decision.
+
+        The first layer is linear, so it is the sum of one product with (state, goal) and one with the
+        next goal: for N candidates of one decision the first is computed once, not N times.
+
+        Args:
+            state: States, shape (B, state_dim).
+            goal: Goals in force, shape (B, goal_dim).
+            candidates: Possible next goals, shape (B, N, goal_dim).
+
+        Returns:
+            Logits, shape (B, N); the same for any workspace.
+        """
+        count, goal_dim = candidates.shape[1:]
+        first, *others = [layer for layer in self.network.children() if isinstance(layer, nn.Linear)]
+        own, new = first.weight[:, :-goal_dim], first.weight[:, -goal_dim:]
+        context = nn.functional.linear(torch.cat([state, goal], dim=1), own, first.bias).unsqueeze(1)
+        rows = self.config.workspace * 2**20 // (8 * max(self.config.hidden))  # a layer's input and output
+        if candidates.device.type == "cpu":
+            rows = min(rows, rows_in_cache(max(self.config.hidden)))
+        size = max(1, rows // count)
+        logits = torch.empty(candidates.shape[:2], device=candidates.device)
+        for start in range(0, len(candidates), size):
+            part = slice(start, start + size)
+            x = nn.functional.linear(candidates[part].reshape(-1, goal_dim), new)
+            x.view(-1, count, x.shape[1]).add_(context[part])
+            for layer in others:
+                x = fast_linear(activate_(x, self.network[1]), layer.weight, layer.bias)
+            logits[part] = x.view(-1, count)
+        return logits
 
     def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite; reads the device once."""

@@ -29,14 +29,14 @@ class Resolved:
     """Goal as it was issued, shape (n, goal_dim)."""
     score: Tensor
     """What the selector thought of it then, NaN where it had no opinion, shape (n,)."""
+    reward: Tensor
+    """Sum of the rewards until it resolved, without that of a crash, shape (n,)."""
     crashed: Tensor
     """True where the policy crashed on it, bool, shape (n,)."""
-    steps: Tensor
-    """Steps from issue to resolution, int32, shape (n,)."""
-    reward: Tensor
-    """Sum of the rewards over those steps, without that of a crash, shape (n,)."""
     issued: Tensor
     """Step that it was issued after, int64, shape (n,)."""
+    resolved: Tensor
+    """Step that it was resolved on, int64, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.crashed)
@@ -68,36 +68,26 @@ class Interactions:
         self.window = window
         self.now = 0
         """Steps so far."""
-        self._slots = math.ceil(window / goal_period) + 1
-        fields = {
-            "state": ((state_dim,), torch.float32),
-            "goal": ((goal_dim,), torch.float32),
-            "next_goal": ((goal_dim,), torch.float32),
-            "score": ((), torch.float32),
-            "steps": ((), torch.int32),
-            "reward": ((), torch.float32),
-            "issued": ((), torch.int64),
-        }
-        self._pending = {
-            name: torch.zeros(num_envs, *shape, dtype=dtype, device=device) for name, (shape, dtype) in fields.items()
-        }
-        self._ring = {
-            name: torch.zeros(num_envs, self._slots, *shape, dtype=dtype, device=device)
-            for name, (shape, dtype) in (fields | {"crashed": ((), torch.bool)}).items()
-        }
-        self._resolved_at = torch.full((num_envs, self._slots), -1, dtype=torch.int64, device=device)
-        self._cursor = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.active = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """True where an interaction is pending, shape (num_envs,)."""
+        self._slots = math.ceil(window / goal_period) + 1
+        self._sizes = [state_dim, goal_dim, goal_dim, 1, 1]  # state, goal, next goal, score, reward
+        width = sum(self._sizes)
+        # One row per interaction, not one tensor per field: a few decisions per step cost what their calls cost.
+        self._pending = torch.zeros(num_envs, width, device=device)
+        self._issued = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self._ring = torch.zeros(num_envs, self._slots, width, device=device)
+        self._marks = torch.zeros(num_envs, self._slots, 3, dtype=torch.int64, device=device)
+        """Crashed, issued, resolved; steps count from 1, so a resolved step of 0 marks a free slot."""
+        self._cursor = torch.zeros(num_envs, dtype=torch.int64, device=device)
 
     def advance(self, step: Step) -> None:
         """Count a step and its rewards. Call it once per step, before ``resolve``."""
         self.now += 1
-        self._pending["steps"] += 1
-        self._pending["reward"].addcmul_(step.reward, (~step.terminated).float())
+        self._pending[:, -1].addcmul_(step.reward, (~step.terminated).float())
 
     def resolve(self, step: Step, rows: Tensor) -> None:
-        """Close what this step has decided.
+        """Close what this step has decided, and drop what it has cut off.
 
         Args:
             step: What the step gave back, before anything is reset.
@@ -105,13 +95,13 @@ class Interactions:
         """
         crashed = step.terminated[rows]
         decided = self.active[rows] & (crashed | step.goal_due[rows])
-        slot = self._cursor[rows] % self._slots
-        for name, ring in self._ring.items():
-            value = crashed if name == "crashed" else self._pending[name][rows]
-            keep = decided.view(-1, *[1] * (value.dim() - 1))
-            ring[rows, slot] = torch.where(keep, value, ring[rows, slot])
-        self._resolved_at[rows, slot] = torch.where(decided, self.now, self._resolved_at[rows, slot])
-        self._cursor[rows] += decided
+        cursor = self._cursor[rows]
+        slot = cursor % self._slots
+        marks = torch.stack([crashed.long(), self._issued[rows], torch.full_like(slot, self.now)], dim=1)
+        keep = decided.unsqueeze(1)
+        self._ring[rows, slot] = torch.where(keep, self._pending[rows], self._ring[rows, slot])
+        self._marks[rows, slot] = torch.where(keep, marks, self._marks[rows, slot])
+        self._cursor[rows] = cursor + decided
         self.active[rows] = False
 
     def open(self, rows: Tensor, state: Tensor, goal: Tensor, next_goal: Tensor, score: Tensor) -> None:
@@ -124,44 +114,34 @@ class Interactions:
             next_goal: Goals as they are issued, shape (m, goal_dim).
             score: What the selector thinks of them, shape (m,).
         """
-        pending = self._pending
-        pending["state"][rows] = state
-        pending["goal"][rows] = goal
-        pending["next_goal"][rows] = next_goal
-        pending["score"][rows] = score
-        pending["steps"][rows] = 0
-        pending["reward"][rows] = 0.0
-        pending["issued"][rows] = self.now
+        score = score.unsqueeze(1)
+        self._pending[rows] = torch.cat([state, goal, next_goal, score, torch.zeros_like(score)], dim=1)
+        self._issued[rows] = self.now
         self.active[rows] = True
 
-    def resolved(self, last: int | None = None) -> Resolved:
-        """The interactions resolved within the last steps, ordered by world and age of the slot.
+    def resolved(self) -> Resolved:
+        """The interactions resolved within the window, ordered by world."""
+        at = self._marks[:, :, 2]
+        env, slot = torch.nonzero((at > 0) & (at > self.now - self.window), as_tuple=True)
+        state, goal, next_goal, score, reward = self._ring[env, slot].split(self._sizes, dim=1)
+        crashed, issued, resolved = self._marks[env, slot].unbind(1)
+        return Resolved(
+            env=env, state=state, goal=goal, next_goal=next_goal, score=score.squeeze(1), reward=reward.squeeze(1),
+            crashed=crashed.bool(), issued=issued, resolved=resolved,
+        )  # fmt: skip
 
-        Args:
-            last: Steps to look back, at most ``window``; ``None`` for the whole window.
-        """
-        since = self.now - (self.window if last is None else min(last, self.window))
-        env, slot = torch.nonzero((self._resolved_at > since) & (self._resolved_at > 0), as_tuple=True)
-        return Resolved(env=env, **{name: ring[env, slot] for name, ring in self._ring.items()})
+    def _tensors(self) -> dict[str, Tensor]:
+        return {
+            "active": self.active, "pending": self._pending, "issued": self._issued,
+            "ring": self._ring, "marks": self._marks, "cursor": self._cursor,
+        }  # fmt: skip
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
-        return {
-            "now": self.now,
-            "pending": {name: value.clone() for name, value in self._pending.items()},
-            "ring": {name: value.clone() for name, value in self._ring.items()},
-            "resolved_at": self._resolved_at.clone(),
-            "cursor": self._cursor.clone(),
-            "active": self.active.clone(),
-        }
+        return {"now": self.now} | {name: value.clone() for name, value in self._tensors().items()}
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from ``state_dict()``."""
         self.now = state["now"]
-        for name, value in self._pending.items():
-            value.copy_(state["pending"][name])
-        for name, value in self._ring.items():
-            value.copy_(state["ring"][name])
-        self._resolved_at.copy_(state["resolved_at"])
-        self._cursor.copy_(state["cursor"])
-        self.active.copy_(state["active"])
+        for name, value in self._tensors().items():
+            value.copy_(state[name])

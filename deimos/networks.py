@@ -1,6 +1,7 @@
 """Multilayer perceptrons, their gradient without allocations, and the actor-critic."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -15,7 +16,7 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int, activation: Activation
     """Linear layers with ``activation`` between them, in PyTorch's default initialisation."""
     sizes = [inputs, *hidden]
     layers: list[nn.Module] = []
-    for size_in, size_out in zip(sizes[:-1], sizes[1:], strict=True):
+    for size_in, size_out in pairwise(sizes):
         layers += [nn.Linear(size_in, size_out), _MODULES[activation]()]
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
@@ -126,7 +127,8 @@ class Backprop:
             delta: Gradient of the loss by the output of the last ``forward``, shape (n, outputs).
         """
         for layer, x in zip(reversed(self._linears), reversed(self._inputs), strict=True):
-            assert layer.weight.grad is not None and layer.bias.grad is not None
+            assert layer.weight.grad is not None
+            assert layer.bias.grad is not None
             layer.weight.grad.addmm_(delta.t(), x)
             layer.bias.grad += delta.sum(0)
             if layer is not self._linears[0]:

@@ -23,6 +23,8 @@ class Policy(nn.Module):
         dt: Duration of a step [s]; 1 where the world has no seconds.
     """
 
+    scale: Tensor
+
     def __init__(
         self, actor: Actor, hidden: Sequence[int], activation: Activation,
         layout: Sequence[ObsField], action_bound: float, dt: float,

@@ -168,7 +168,9 @@ class PPO:
     def __init__(self, config: PPOConfig, env: Env, seed: int) -> None:
         rows = config.num_steps * env.num_envs
         if config.minibatches > rows:
-            raise ValueError(f"minibatches must be at most the {rows} transitions of a rollout, got {config.minibatches}.")
+            raise ValueError(
+                f"minibatches must be at most the {rows} transitions of a rollout, got {config.minibatches}."
+            )
         self.config = config
         self._size = rows // config.minibatches
         with torch.random.fork_rng(devices=[]):  # weights depend on the seed alone
@@ -287,7 +289,8 @@ class PPO:
         On a CPU the minibatch is worked through in pieces that suit the caches; their gradients add up.
         """
         config, std = self.config, self.actor.std
-        assert std.grad is not None and self._parameters.grad is not None
+        assert std.grad is not None
+        assert self._parameters.grad is not None
         self._parameters.grad.zero_()
         minibatch = replace(minibatch, weight=minibatch.weight / minibatch.weight.sum().clamp(min=1.0))
         losses = torch.zeros(2, device=std.device)
@@ -359,7 +362,7 @@ class PPO:
 
     @staticmethod
     def _log_normaliser(std: Tensor) -> Tensor:
-        """log of the integral of exp(-z^2 / 2) over all actions."""
+        """Log of the integral of exp(-z^2 / 2) over all actions."""
         return std.log().sum() + 0.5 * len(std) * math.log(2 * math.pi)
 
     def state_dict(self) -> dict:

@@ -71,7 +71,9 @@ class RunFolder:
         try:
             path.mkdir(parents=True)
         except FileExistsError as error:
-            raise RunError(f"{path} exists and is not overwritten; choose another --out, or go on with --resume.") from error
+            raise RunError(
+                f"{path} exists and is not overwritten; choose another --out, or go on with --resume."
+            ) from error
         except OSError as error:
             raise RunError(f"The run folder {path} cannot be made ({error.strerror}).") from error
         return cls(path)

@@ -76,7 +76,7 @@ class TrainConfig:
         transitions = self.num_envs * self.ppo.num_steps
         if transitions < 2 or self.ppo.minibatches > transitions:
             raise ValueError(
-                f"A rollout must hold at least 2 transitions and ppo.minibatches = {self.ppo.minibatches}, got {transitions}."
+                f"A rollout must hold ppo.minibatches = {self.ppo.minibatches} transitions or more, got {transitions}."
             )
 
     @property
@@ -301,7 +301,9 @@ def resume(path: Path, env_steps: int | None) -> tuple[Trainer, RunFolder]:
     config = read_config(folder)
     if env_steps is not None:
         if env_steps < config.env_steps:
-            raise RunError(f"A resumed run takes only a larger budget: it had {config.env_steps} steps, got {env_steps}.")
+            raise RunError(
+                f"A resumed run takes only a larger budget: it had {config.env_steps} steps, got {env_steps}."
+            )
         config = replace(config, env_steps=env_steps)
     trainer = load(folder, config)
     folder.write_json("config.json", folder.read_json("config.json") | {"config": to_dict(config)})

@@ -46,7 +46,9 @@ def audit(root: Path, seed: int) -> list[dict]:
         if not kept.exists():
             start = ["--method", "p25", "--seed", str(seed), "--threads", "1", "--no-evaluation", "--out", str(folder)]
             begin = ["--resume", str(folder)] if (folder / "config.json").exists() else start
-            subprocess.run([sys.executable, "train.py", *begin, "--env-steps", str(steps)], check=True, capture_output=True)
+            subprocess.run(
+                [sys.executable, "train.py", *begin, "--env-steps", str(steps)], check=True, capture_output=True
+            )
             command = [sys.executable, "-m", "deimos", "evaluate", str(folder), "--contexts", "200"]
             subprocess.run(command, check=True, capture_output=True)
             kept.write_text((folder / "audit.json").read_text())
@@ -69,7 +71,10 @@ def print_tables(root: Path) -> None:
     for variant, method in CELLS:
         runs = [json.loads((root / f"{variant}-{method}-s{s}" / "evaluation.json").read_text()) for s in SEEDS]
         for i, goals in enumerate(("naive", "adversary")):
-            column = {name: np.array([r[i][name] for r in runs]) for name in ("crashes_per_1000", "crash_rate", "score", "reward")}
+            column = {
+                name: np.array([r[i][name] for r in runs])
+                for name in ("crashes_per_1000", "crash_rate", "score", "reward")
+            }
             rate, score = column["crashes_per_1000"], column["score"]
             auroc = f"{np.median([r[1]['adversary_auroc'] for r in runs]):.3f}" if i else ""
             print(f"| {variant} | {method} | {goals} | {np.median(rate):.3f} ({rate.min():.3f}-{rate.max():.3f}) "
@@ -97,7 +102,9 @@ def main() -> None:
         audits = list(pool.map(lambda seed: audit(options.root, seed), SEEDS)) if options.audit else []
     print_tables(options.root)
     if audits:
-        print("\n| seed | parallel steps | contexts | crash share | AUROC within contexts | 95 % interval |\n|---|---|---|---|---|---|")
+        print(
+            "\n| seed | parallel steps | contexts | crash share | AUROC within contexts | 95 % interval |\n|---|---|---|---|---|---|"
+        )
     for row in (row for rows in audits for row in rows):
         print(f"| {row['seed']} | {row['steps']} | {row['contexts']} of {row['tried']} | {row['crash_share']:.3f} "
               f"| {row['auroc']:.3f} | [{row['low']:.3f}, {row['high']:.3f}] |")  # fmt: skip

@@ -207,7 +207,7 @@ def _reset_particles(
     spawn = symmetric3(params.seed, wp.static(int(Purpose.RESET)), world, episode, 0)
     first = symmetric3(params.seed, wp.static(int(Purpose.FIRST_GOAL)), world, episode, 0)
     scale = wp.vec3(goal_scale[0], goal_scale[1], goal_scale[2])
-    clock = int(0)
+    clock = 0
     if params.stagger and episode == 0:
         u = uniform4(params.seed, wp.static(int(Purpose.RESET)), world, episode, 1, 0)
         clock = int(u[0] * float(params.goal_period))

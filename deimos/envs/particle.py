@@ -90,6 +90,10 @@ class Config(EnvConfig):
         """See ``EnvConfig.build``."""
         return Particle(self, num_envs, device, seed, env_offset)
 
+    def with_goal_period(self, goal_period: int) -> "Config":
+        """See ``EnvConfig.with_goal_period``."""
+        return replace(self, goal_period=goal_period)
+
     def for_evaluation(self) -> "Config":
         """See ``EnvConfig.for_evaluation``."""
         return replace(self, stagger_goals=False)
@@ -155,9 +159,7 @@ class Particle(Env):
             name: Shared.zeros(n, wp.int32, device)
             for name in ("goal_clock", "episode_step", "episode_count", "goal_count")
         }
-        flags = {
-            name: Shared.zeros(n, wp.bool, device) for name in ("terminated", "truncated", "goal_due", "invalid")
-        }
+        flags = {name: Shared.zeros(n, wp.bool, device) for name in ("terminated", "truncated", "goal_due", "invalid")}
         out = {
             "obs": Shared.zeros((n, OBS_DIM), wp.float32, device),
             "reward": Shared.zeros(n, wp.float32, device),
@@ -192,9 +194,7 @@ class Particle(Env):
         params, state, out = self._params, self.state_arrays, self.step_arrays
         row, obs = self._row.array, self.step_arrays.obs
         self._launch_step = step_particles(params, self.action.array, state, out, record=True)
-        self._launch_reset = reset_particles(
-            params, self._mask.array, self._goal_scale.array, state, obs, record=True
-        )
+        self._launch_reset = reset_particles(params, self._mask.array, self._goal_scale.array, state, obs, record=True)
         self._launch_goals = set_goals(params, row, self._new_goal.array, state, obs, record=True)
         self._launch_draw = draw_uniforms(
             row, state.goal_count, self._draw.array, seed=int(params.seed), purpose=Purpose.GOAL,
@@ -205,8 +205,12 @@ class Particle(Env):
         """See ``Env.step``. Actions are forces [u/step^2]."""
         self.action.tensor.copy_(action)
         self._step.count.zero_()
-        self._launch_step.launch()
+        self.launch_step()
         return self._step
+
+    def launch_step(self) -> None:
+        """Run the step kernel alone, on the action of before; for benchmarks."""
+        self._launch_step.launch()
 
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""

@@ -58,14 +58,14 @@ class Director(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Rollout) -> dict[str, float]:
         """Fit the fear network to the window; the scores at issue are judged first."""
-        recent = interactions.resolved(rollout.num_steps)
         window = interactions.resolved()
-        judged = window.where(window.score.isfinite())
+        recent = window.resolved > interactions.now - rollout.num_steps
+        judged = window.score.isfinite()
         return {
-            "fear/auroc": auroc(judged.score, judged.crashed),
-            "fear/crash_share": recent.crashed.float().mean().item(),
-            "fear/resolved": float(len(recent)),
-            "fear/score": recent.score.nanmean().item(),
+            "fear/auroc": auroc(window.score[judged], window.crashed[judged]),
+            "fear/crash_share": window.crashed[recent].float().mean().item(),
+            "fear/resolved": float(recent.sum()),
+            "fear/score": window.score[recent].nanmean().item(),
             "fear/loss": self.fear.fit(window),
         }
 
