@@ -10,6 +10,8 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -105,7 +107,11 @@ def measure_env(num_envs: int, device: torch.device, rounds: int) -> dict[str, f
     steps = max(2, 1_000_000 // num_envs)  # few enough that no particle leaves the cube at rest
 
     def repeat(function: Callable[[], Any]) -> Callable[[], None]:
-        return lambda: [function() for _ in range(steps)] and None
+        def work() -> None:
+            for _ in range(steps):
+                function()
+
+        return work
 
     work = {
         "kernel": repeat(env.launch_step),
@@ -153,13 +159,13 @@ def _torch_step(
     return step
 
 
-def _numpy_step(config: particle.Config, num_envs: int) -> Callable[[], tuple[np.ndarray, ...]]:
+def _numpy_step(config: particle.Config, num_envs: int) -> Callable[[], tuple]:
     """The directional step as one would write it in NumPy, with the same outputs."""
     params = config.params(0, 0)
     action, position, velocity, target = (np.zeros((num_envs, 3), np.float32) for _ in range(4))
     clock, episode = (np.zeros(num_envs, np.int32) for _ in range(2))
 
-    def step() -> tuple[np.ndarray, ...]:
+    def step() -> tuple:
         nonlocal position, velocity, clock, episode
         force = np.clip(action, -params.max_force, params.max_force)
         velocity = np.clip(velocity + np.float32(0.5) * force, -params.max_speed, params.max_speed)
@@ -187,16 +193,19 @@ def measure_training(device: torch.device, rounds: int) -> dict[str, Any]:
     base = TrainConfig(device="cuda" if device.type == "cuda" else "cpu")
     turn = math.ceil(base.env.goal_period / base.ppo.num_steps)
     trainers = {name: Trainer(replace(base, method=name), device) for name in METHODS}
-    work: dict[str, Callable[[], Any]] = {
-        name: (lambda trainer=trainer: [trainer.iterate() for _ in range(turn)]) for name, trainer in trainers.items()
-    }
+
+    def iterate(trainer: Trainer) -> None:
+        for _ in range(turn):
+            trainer.iterate()
+
+    work: dict[str, Callable[[], Any]] = {name: partial(iterate, trainer) for name, trainer in trainers.items()}
     learn = _rsl_rl(base, device)
     if learn is not None:
         work["rsl_rl"] = lambda: learn(turn)
     for trainer in trainers.values():  # let every fear network see both classes before anything is timed
-        for _ in range(4 * turn):
-            trainer.iterate()
-        trainer.seconds = dict.fromkeys(trainer.seconds, 0.0)
+        for _ in range(4):
+            iterate(trainer)
+        trainer.seconds.update(dict.fromkeys(trainer.seconds, 0.0))
     seconds = in_turn(work, rounds, device)
     transitions = turn * base.num_envs * base.ppo.num_steps
     rows = []
@@ -221,7 +230,7 @@ def _limits(config: TrainConfig, trainer: Trainer) -> dict[str, float]:
     """Operations of the matrix products of an iteration: they bound it from below."""
 
     def products(sizes: list[int]) -> int:
-        return sum(2 * a * b for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+        return sum(2 * a * b for a, b in pairwise(sizes))
 
     space, ppo = spaces(trainer.env), config.ppo
     nets = products([trainer.env.obs_dim, *ppo.hidden, 3]) + products([trainer.env.obs_dim, *ppo.hidden, 1])

@@ -72,8 +72,9 @@ class EnvConfig(abc.ABC):
 
 
 class Env(abc.ABC):
-    """Many worlds, simulated in parallel, each pursuing a goal of its own."""
+    """Many worlds, simulated in parallel, each pursuing a goal of its own; built with an episode begun in each."""
 
+    config: EnvConfig
     num_envs: int
     device: torch.device
     layout: tuple[ObsField, ...]
@@ -89,6 +90,8 @@ class Env(abc.ABC):
     """Steps after which an episode is truncated; 0 for never."""
     obs: Tensor
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
+    episode_step: Tensor
+    """Steps since the last reset, int32, shape (num_envs,); a view."""
     tensors: dict[str, Tensor]
     """Everything that a bit-exact resume needs, by name; views, worlds along the first axis."""
 
@@ -98,6 +101,9 @@ class Env(abc.ABC):
 
         Args:
             action: Actions, float32, shape (num_envs, action_dim).
+
+        Raises:
+            ValueError: If the shape is another.
         """
 
     @abc.abstractmethod

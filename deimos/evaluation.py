@@ -145,7 +145,6 @@ def play(
         See ``evaluate``.
     """
     loop = GoalLoop(env, selector, window=steps)
-    loop.start()
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     for t in range(steps):
@@ -193,7 +192,6 @@ def train_adversary(
     collector = _Collector(env, fear)
     limit = config.adversary_steps * config.adversary_patience
     loop = GoalLoop(env, collector, window=limit)
-    loop.start()
     for t in range(1, limit + 1):
         with torch.no_grad():
             step = env.step(policy(env.obs))

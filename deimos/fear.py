@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Resolved
 from deimos.networks import Activation, Backprop, activate_, fast_linear, flatten_parameters, mlp, rows_in_cache
@@ -15,7 +16,7 @@ from deimos.ranks import mean_over_ranks
 class FearConfig:
     """The fear network and how it learns (thesis, 4.2)."""
 
-    hidden: tuple[int, ...] = (64, 32)
+    hidden: tuple[int, ...] = (32, 32)
     """Units of the hidden layers."""
     activation: Activation = "relu"
     """Between the layers."""
@@ -54,10 +55,9 @@ class Fear:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation).to(device)
-        parameters, _ = flatten_parameters(self.network)
-        self._parameters = parameters[0]
+        self._parameters, _ = flatten_parameters(self.network)
         self._pass = Backprop(self.network)
-        self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, fused=True)
+        self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = torch.Generator(device)
         self.generator.manual_seed(seed)
         self.fitted = False
@@ -121,7 +121,8 @@ class Fear:
         """
         count, goal_dim = candidates.shape[1:]
         first, *others = [layer for layer in self.network.children() if isinstance(layer, nn.Linear)]
-        own, new = first.weight[:, :-goal_dim], first.weight[:, -goal_dim:]
+        own = first.weight[:, :-goal_dim]
+        new = first.weight[:, -goal_dim:].t().expand(len(candidates), -1, -1)
         context = nn.functional.linear(torch.cat([state, goal], dim=1), own, first.bias).unsqueeze(1)
         rows = self.config.workspace * 2**20 // (8 * max(self.config.hidden))  # a layer's input and output
         if candidates.device.type == "cpu":
@@ -130,8 +131,7 @@ class Fear:
         logits = torch.empty(candidates.shape[:2], device=candidates.device)
         for start in range(0, len(candidates), size):
             part = slice(start, start + size)
-            x = nn.functional.linear(candidates[part].reshape(-1, goal_dim), new)
-            x.view(-1, count, x.shape[1]).add_(context[part])
+            x = torch.baddbmm(context[part], candidates[part], new[: len(candidates[part])]).flatten(0, 1)
             for layer in others:
                 x = fast_linear(activate_(x, self.network[1]), layer.weight, layer.bias)
             logits[part] = x.view(-1, count)
@@ -173,7 +173,7 @@ def auroc(score: Tensor, positive: Tensor) -> float:
     negatives = len(positive) - positives
     if positives == 0 or negatives == 0:
         return float("nan")
-    _, inverse, counts = torch.unique(score, return_inverse=True, return_counts=True)
-    last = counts.cumsum(0).double()
-    rank = (last - (counts - 1) / 2)[inverse]  # mean rank of each group of equals
-    return ((rank[positive].sum() - positives * (positives + 1) / 2) / (positives * negatives)).item()
+    ranked = score[~positive].sort().values
+    found = score[positive].contiguous()
+    below, not_above = (torch.searchsorted(ranked, found, side=side) for side in ("left", "right"))
+    return (below.sum() + not_above.sum()).item() / (2 * positives * negatives)

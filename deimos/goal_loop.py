@@ -32,7 +32,8 @@ class GoalLoop:
         """1 where the learner may use the transitions under the goal in force, else 0, shape (num_envs,)."""
 
     def start(self) -> None:
-        """Begin an episode in every world."""
+        """Begin a new episode in every world and drop what is pending; a fresh environment has begun already."""
+        self.interactions.active.fill_(False)
         self._reset(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
 
     def advance(self, step: Step) -> None:

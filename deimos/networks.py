@@ -21,7 +21,7 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int, activation: Activation
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
 
-def flatten_parameters(*modules: nn.Module) -> tuple[list[nn.Parameter], list[Tensor]]:
+def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]:
     """Lay the parameters and the gradients of every module end to end in memory.
 
     An optimiser or a norm then works on one long vector instead of a dozen short tensors, whose
@@ -31,8 +31,8 @@ def flatten_parameters(*modules: nn.Module) -> tuple[list[nn.Parameter], list[Te
         modules: Modules that share no parameter. Their parameters become views of the vectors.
 
     Returns:
-        One parameter vector whose ``grad`` is set, in a list for an optimiser, and the slice of
-        the gradient that belongs to each module.
+        The parameter vector, with its ``grad`` set, and the slice of the gradient that belongs to
+        each module.
     """
     tensors = [list(module.parameters()) for module in modules]
     first = tensors[0][0]
@@ -50,7 +50,7 @@ def flatten_parameters(*modules: nn.Module) -> tuple[list[nn.Parameter], list[Te
             parameter.grad = flat.grad[rows].view_as(parameter)
             start += _aligned(parameter.numel())
         slices.append(flat.grad[begin:start])
-    return [flat], slices
+    return flat, slices
 
 
 def _aligned(count: int) -> int:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.env import Env
 from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
@@ -181,10 +182,9 @@ class PPO:
         self.critic.to(env.device)
         self.generator = torch.Generator(env.device)
         self.generator.manual_seed(seed)
-        parameters, self._grads = flatten_parameters(self.actor, self.critic)
+        self._parameters, self._grads = flatten_parameters(self.actor, self.critic)
         self.learning_rate = torch.tensor(config.learning_rate, device=env.device)
-        self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True)
-        self._parameters = parameters[0]
+        self.optimizer = Adam(self._parameters, self.learning_rate)
         self._piece = rows_in_cache(max(config.hidden)) if env.device.type == "cpu" else self._size
         self._actor_pass = Backprop(self.actor.mean)
         self._critic_pass = Backprop(self.critic)
@@ -371,7 +371,6 @@ class PPO:
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "learning_rate": self.learning_rate.clone(),
             "generator": self.generator.get_state(),
         }
 
@@ -383,8 +382,6 @@ class PPO:
         """
         self.load_weights(state)
         self.optimizer.load_state_dict(state["optimizer"])
-        self.learning_rate.copy_(state["learning_rate"])
-        self.optimizer.param_groups[0]["lr"] = self.learning_rate  # loading replaced our tensor by a copy
         self.generator.set_state(state["generator"])
 
     def load_weights(self, state: dict) -> None:

@@ -76,8 +76,16 @@ class GoalSelector(abc.ABC):
                 in the choice comes from here, so that it is the same in any batch.
         """
 
-    def learn(self, interactions: Interactions, rollout: Rollout) -> dict[str, float]:
-        """Learn from what happened, once per rollout; returns numbers for the log, the same keys every time."""
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """Learn from what happened, once per rollout.
+
+        Args:
+            interactions: The pending and the recently resolved ones.
+            rollout: The transitions since the last call; ``None`` in a loop that keeps none.
+
+        Returns:
+            Numbers for the log, the same keys every time.
+        """
         return {}
 
     def check(self) -> None:  # noqa: B027 (a selector without weights has nothing to check)

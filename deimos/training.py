@@ -135,7 +135,6 @@ class Trainer:
         self.iteration = 0
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
         """Time spent so far in each part of an iteration [s]."""
-        self.loop.start()
 
     def collect(self) -> None:
         """Let the policy act for one rollout."""

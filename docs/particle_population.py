@@ -76,15 +76,18 @@ def print_tables(root: Path) -> None:
                 for name in ("crashes_per_1000", "crash_rate", "score", "reward")
             }
             rate, score = column["crashes_per_1000"], column["score"]
+            score_cell = f"{np.median(score):.3f} ({score.min():.3f}-{score.max():.3f})"
             auroc = f"{np.median([r[1]['adversary_auroc'] for r in runs]):.3f}" if i else ""
             print(f"| {variant} | {method} | {goals} | {np.median(rate):.3f} ({rate.min():.3f}-{rate.max():.3f}) "
-                  f"| {np.median(column['crash_rate']):.4f} | {np.median(score):.3f} ({score.min():.3f}-{score.max():.3f}) "
+                  f"| {np.median(column['crash_rate']):.4f} | {score_cell} "
                   f"| {np.median(column['reward']):.4f} | {auroc} |")  # fmt: skip
     runs = [json.loads((root / f"directional-uniform-s{s}" / "evaluation.json").read_text()) for s in SEEDS]
-    naive, attacked = ([r[i]["interaction_crashes"] + 0.5 for r in runs] for i in (0, 1))
-    ratio = np.array(attacked) / np.array(naive)
+    naive, attacked = (
+        np.array([(r[i]["interaction_crashes"] + 0.5) / r[i]["interactions"] for r in runs]) for i in (0, 1)
+    )
+    ratio = attacked / naive
     gap = np.array([r[1]["crash_rate"] - r[0]["crash_rate"] for r in runs])
-    print(f"\nAdversary / Naive on the Uniform policies of Directional, (a + 0.5) / (b + 0.5) crashes: "
+    print(f"\nAdversary / Naive on the Uniform policies of Directional, crashes + 0.5 per non-first interaction: "
           f"median {np.median(ratio):.3g} {interval(ratio)}, each {', '.join(f'{x:.3g}' for x in ratio)}. "
           f"Difference in crashes per interaction: median {np.median(gap):.4f} {interval(gap)}.")  # fmt: skip
 
@@ -102,9 +105,8 @@ def main() -> None:
         audits = list(pool.map(lambda seed: audit(options.root, seed), SEEDS)) if options.audit else []
     print_tables(options.root)
     if audits:
-        print(
-            "\n| seed | parallel steps | contexts | crash share | AUROC within contexts | 95 % interval |\n|---|---|---|---|---|---|"
-        )
+        print("\n| seed | parallel steps | contexts | crash share | AUROC within contexts | 95 % interval |")
+        print("|---|---|---|---|---|---|")
     for row in (row for rows in audits for row in rows):
         print(f"| {row['seed']} | {row['steps']} | {row['contexts']} of {row['tried']} | {row['crash_share']:.3f} "
               f"| {row['auroc']:.3f} | [{row['low']:.3f}, {row['high']:.3f}] |")  # fmt: skip

@@ -127,6 +127,8 @@ class Config(EnvConfig):
 class Particle(Env):
     """Particle Gym on Warp kernels; see ``Config``."""
 
+    config: Config
+
     def __init__(self, config: Config, num_envs: int, device: torch.device, seed: int, env_offset: int) -> None:
         self.config = config
         self.num_envs = num_envs
@@ -146,6 +148,7 @@ class Particle(Env):
             ObsField("last_action", 3, "u/step^2", params.force_scale),
             ObsField("goal", 3, goal_unit, goal_scale),
         )
+        self._ones = torch.ones(3, device=device)
         self._goal_box = torch.full((3,), config.goal_half_side * goal_scale, device=device)
         self._allocate()
         self._record()
@@ -174,6 +177,7 @@ class Particle(Env):
         self.obs = out["obs"].tensor
         # Observations are kept, not computed anew: what a policy saw is part of a bit-exact resume.
         self.tensors = {name: shared.tensor for name, shared in (vectors | counters).items()} | {"obs": self.obs}
+        self.episode_step = self.tensors["episode_step"]
         self._fault = out["fault"].tensor
         self._fault[1] = n
         self._step = Step(**{name: out[name].tensor for name in Step.__dataclass_fields__})
@@ -203,6 +207,9 @@ class Particle(Env):
 
     def step(self, action: Tensor) -> Step:
         """See ``Env.step``. Actions are forces [u/step^2]."""
+        if action.shape != self.action.tensor.shape:
+            expected = tuple(self.action.tensor.shape)
+            raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
         self.action.tensor.copy_(action)
         self._step.count.zero_()
         self.launch_step()
@@ -215,7 +222,7 @@ class Particle(Env):
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""
         self._mask.tensor.copy_(mask)
-        self._set_scale(self._goal_scale, goal_scale)
+        self._goal_scale.tensor.copy_(self._ones if goal_scale is None else goal_scale)
         self._launch_reset.launch()
 
     def sample_goals(self, rows: Tensor, count: int, scale: Tensor | None = None) -> Tensor:
@@ -224,8 +231,7 @@ class Particle(Env):
             self._candidates[count] = self._record_candidates(count)
         candidates, launches = self._candidates[count]
         self._set_rows(rows)
-        self._set_scale(self._candidate_scale, scale)
-        self._candidate_scale.tensor.mul_(self._goal_box)
+        torch.mul(self._goal_box, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
         for launch in launches:
             launch.set_dim((len(rows), count))
             launch.launch()
@@ -310,9 +316,3 @@ class Particle(Env):
 
     def _set_rows(self, rows: Tensor) -> None:
         self._row.tensor[: len(rows)] = rows
-
-    def _set_scale(self, shared: Shared, scale: Tensor | None) -> None:
-        if scale is None:
-            shared.tensor.fill_(1.0)
-        else:
-            shared.tensor.copy_(scale)

@@ -42,6 +42,7 @@ class Director(GoalSelector):
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
+        self._learnt_at = 0  # step of the last call of learn
         self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
@@ -53,13 +54,14 @@ class Director(GoalSelector):
         else:
             pick = (draws[:, 0] * candidates.shape[1]).long().clamp(max=candidates.shape[1] - 1)
             chosen_score = torch.full_like(draws[:, 0], torch.nan)
-        chosen = candidates[torch.arange(len(pick), device=pick.device), pick]
+        chosen = candidates.gather(1, pick.view(-1, 1, 1).expand(-1, 1, candidates.shape[2])).squeeze(1)
         return Proposal(chosen, chosen_score, torch.ones_like(pick, dtype=torch.bool))
 
-    def learn(self, interactions: Interactions, rollout: Rollout) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
         """Fit the fear network to the window; the scores at issue are judged first."""
         window = interactions.resolved()
-        recent = window.resolved > interactions.now - rollout.num_steps
+        recent = window.resolved > self._learnt_at
+        self._learnt_at = interactions.now
         judged = window.score.isfinite()
         return {
             "fear/auroc": auroc(window.score[judged], window.crashed[judged]),
@@ -75,18 +77,19 @@ class Director(GoalSelector):
 
     def state_dict(self) -> dict:
         """See ``GoalSelector.state_dict``."""
-        return self.fear.state_dict()
+        return {"fear": self.fear.state_dict(), "learnt_at": self._learnt_at}
 
     def load_state_dict(self, state: dict) -> None:
         """See ``GoalSelector.load_state_dict``."""
-        self.fear.load_state_dict(state)
+        self.fear.load_state_dict(state["fear"])
+        self._learnt_at = state["learnt_at"]
 
 
 def pick_by_rule(score: Tensor, draw: Tensor, rule: str, percentile: float) -> Tensor:
     """Index of the candidate that a rule picks in each row.
 
-    Exactly k = max(1, N - floor(p N / 100)) candidates are kept; among equal scores at the edge
-    those with the lowest index. So p = 0 keeps all, whatever the scores, and picks as Uniform does.
+    Exactly k = max(1, N - floor(p N / 100)) candidates are kept, also where scores tie at the edge.
+    So p = 0 keeps all, whatever the scores, and picks the very goal that Uniform picks.
 
     Args:
         score: Scores, shape (B, N).
@@ -103,9 +106,7 @@ def pick_by_rule(score: Tensor, draw: Tensor, rule: str, percentile: float) -> T
         return score.argmax(dim=1)
     count = score.shape[1]
     kept = max(1, count - int(percentile * count / 100))
-    edge = score.kthvalue(count - kept + 1, dim=1, keepdim=True).values  # the lowest score that is kept
-    above, tied = score > edge, score == edge
-    free = kept - above.sum(dim=1, keepdim=True)
-    keep = above | (tied & (tied.cumsum(dim=1) <= free))
-    nth = (draw * kept).long().clamp(max=kept - 1)
-    return (keep.cumsum(dim=1) <= nth.unsqueeze(1)).sum(dim=1)
+    pick = (draw * kept).long().clamp(max=kept - 1)
+    if kept == count:
+        return pick
+    return score.topk(kept, dim=1, sorted=False).indices.gather(1, pick.unsqueeze(1)).squeeze(1)

@@ -1,0 +1,112 @@
+"""Environments in rsl_rl's training loop."""
+
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from deimos.checks import check_positive
+from deimos.env import Env
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.ppo import PPOConfig
+from deimos.selector import GoalSelector
+from deimos.selectors import uniform
+
+
+class RslRlVecEnv(VecEnv):
+    """An environment as rsl_rl 5 wants it: goals are issued and worlds that are done begin anew within ``step``.
+
+    Everything that it returns is a copy that later steps leave alone. rsl_rl asks a selector for goals but
+    does not let it learn: a Director stays uniform until its owner calls, say after every iteration,
+    ``loop.selector.learn(loop.interactions, None)``.
+
+    Args:
+        env: The worlds, as they were built.
+        selector: Who chooses their goals; ``None`` for Uniform.
+        reward_scale: What rewards are multiplied with, positive.
+
+    Attributes:
+        loop: The worlds, their selector and their interactions.
+    """
+
+    def __init__(self, env: Env, selector: GoalSelector | None = None, reward_scale: float = 1.0) -> None:
+        check_positive("reward_scale", reward_scale, finite=True)
+        self.env = env
+        self.reward_scale = reward_scale
+        self.cfg = spaces(env)
+        self.loop = GoalLoop(env, selector or uniform.Config().build(self.cfg, seed=0))
+        self.num_envs = env.num_envs
+        self.num_actions = env.action_dim
+        self.device = env.device
+        # Without a limit, the largest number that the clock can hold.
+        self.max_episode_length = env.time_limit or torch.iinfo(env.episode_step.dtype).max
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Steps since every world's reset, int32, shape (num_envs,): the clock of the time limit itself.
+
+        Setting it sets the clock, so that ``init_at_random_ep_len`` spreads the time limits.
+        """
+        return self.env.episode_step
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: Tensor) -> None:
+        self.env.episode_step.copy_(steps)
+
+    def get_observations(self) -> TensorDict:
+        """What to act on next: ``policy``, float32, shape (num_envs, obs_dim)."""
+        return TensorDict({"policy": self.env.obs.clone()}, batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Tensor]]:
+        """Simulate one step of every world, issue the goals that are due and reset the worlds that are done.
+
+        Args:
+            actions: Actions, float32, shape (num_envs, num_actions); the environment clips them.
+
+        Returns:
+            What to act on next; scaled rewards, shape (num_envs,); worlds that crashed or were truncated,
+            bool, shape (num_envs,); and ``time_outs``: 1 where a world was truncated, else 0, shape (num_envs,).
+
+        Raises:
+            SimulationError: If an action or a state is not finite.
+        """
+        step = self.env.step(actions)
+        self.env.check()  # rsl_rl looks for NaN in what comes back, but a clipped NaN is a number
+        rewards = step.reward * self.reward_scale
+        dones = step.terminated | step.truncated
+        extras = {"time_outs": step.truncated.float()}
+        self.loop.advance(step)
+        return self.get_observations(), rewards, dones, extras
+
+
+def runner_config(ppo: PPOConfig) -> dict[str, Any]:
+    """The configuration of rsl_rl's ``OnPolicyRunner`` that says the same as ``ppo``.
+
+    The reward scale is not in it: give it to the environment.
+    """
+    network = {"class_name": "MLPModel", "hidden_dims": list(ppo.hidden), "activation": ppo.activation}
+    spread = {"class_name": "GaussianDistribution", "init_std": ppo.init_std, "std_type": "scalar"}
+    return {
+        "num_steps_per_env": ppo.num_steps,
+        "save_interval": 2**31,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": network | {"distribution_cfg": spread},
+        "critic": dict(network),
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": ppo.epochs,
+            "num_mini_batches": ppo.minibatches,
+            "learning_rate": ppo.learning_rate,
+            "schedule": "adaptive" if ppo.desired_kl else "fixed",
+            "desired_kl": ppo.desired_kl or None,
+            "gamma": ppo.discount,
+            "lam": ppo.gae_lambda,
+            "clip_param": ppo.clip,
+            "use_clipped_value_loss": ppo.clip_value,
+            "value_loss_coef": ppo.value_coef,
+            "entropy_coef": ppo.entropy_coef,
+            "max_grad_norm": ppo.max_grad_norm,
+        },
+    }

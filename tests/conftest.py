@@ -1,0 +1,61 @@
+"""Fixtures of all tests: the devices that they run on, and the reference of every random draw."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+wp.config.log_level = wp.LOG_WARNING
+torch.set_num_threads(1)
+
+DEVICES = ["cpu"]
+if wp.get_cuda_device_count() > 0 and torch.cuda.is_available():  # a torch without CUDA cannot share its memory
+    DEVICES.append("cuda:0")
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    """Name of a device; on CUDA, torch and Warp run on one stream for as long as the test lasts."""
+    if request.param == "cpu":
+        yield "cpu"
+        return
+    stream = torch.cuda.Stream(request.param)
+    with torch.cuda.stream(stream), wp.ScopedStream(wp.stream_from_torch(stream)):
+        yield request.param
+
+
+@pytest.fixture
+def torch_device(device):
+    """The same device, for torch."""
+    return torch.device(device)
+
+
+def _philox(counter, key):
+    """Philox4x32-10 as the paper states it; counters (..., 4) and keys (..., 2) give words (..., 4)."""
+    low = np.uint64(0xFFFFFFFF)
+    counter, key = np.asarray(counter, np.uint64) & low, np.asarray(key, np.uint64) & low
+    r0, l0, r1, l1 = np.moveaxis(counter, -1, 0)
+    k0, k1 = np.moveaxis(key, -1, 0)
+    for _ in range(10):
+        product_0, product_1 = np.uint64(0xD2511F53) * r0, np.uint64(0xCD9E8D57) * r1
+        high_0, high_1 = product_0 >> np.uint64(32), product_1 >> np.uint64(32)
+        r0, l0, r1, l1 = high_1 ^ l0 ^ k0, product_1 & low, high_0 ^ l1 ^ k1, product_0 & low
+        k0, k1 = (k0 + np.uint64(0x9E3779B9)) & low, (k1 + np.uint64(0xBB67AE85)) & low
+    return np.stack(np.broadcast_arrays(r0, l0, r1, l1), axis=-1).astype(np.uint32)
+
+
+@pytest.fixture
+def philox_reference():
+    """Words (..., 4) of counters (..., 4) and keys (..., 2)."""
+    return _philox
+
+
+@pytest.fixture
+def uniform_reference():
+    """Numbers in [0, 1), float64, shape (..., 4), of one address; its parts broadcast."""
+
+    def uniforms(seed, purpose, world, count, index=0, block=0):
+        counter = np.stack(np.broadcast_arrays(world, count, index, block), axis=-1)
+        return (_philox(counter, [seed, purpose]) >> np.uint32(8)) * 2.0**-24
+
+    return uniforms

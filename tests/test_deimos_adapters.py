@@ -1,0 +1,390 @@
+"""Environments in rsl_rl's and gymnasium's training loops."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import env_checker, passive_env_checker
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from rsl_rl.runners import OnPolicyRunner
+
+from deimos.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from deimos.adapters.rsl_rl import RslRlVecEnv
+from deimos.checks import SimulationError
+from deimos.envs import particle
+from deimos.fear import FearConfig
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.selectors import director, uniform
+
+TIME_LIMIT = 12
+# Particles start anywhere in the cube and cross a tenth of it per step, so that some crash, some reach the
+# time limit, and some get two goals before either.
+CONFIG = particle.Config(
+    goal_period=5, time_limit=TIME_LIMIT, max_speed=100.0, max_force=100.0, spawn_range=990.0
+)  # fmt: skip
+CPU = torch.device("cpu")
+
+
+class Bare:
+    """An environment and its goal loop, driven by hand: what an adapter must show and nothing else."""
+
+    def __init__(self, num_envs, seed, device=CPU, config=CONFIG):
+        self.env = config.build(num_envs, device, seed)
+        self.loop = GoalLoop(self.env, uniform.Config().build(spaces(self.env), seed))
+
+    def step(self, action):
+        """Copies of the last observation, reward, terminated, truncated, and the observation to act on next."""
+        step = self.env.step(action)
+        ended = [x.clone() for x in (step.obs, step.reward, step.terminated, step.truncated)]
+        self.loop.advance(step)
+        return *ended, self.env.obs.clone()
+
+
+def random_actions(num_steps, num_envs, seed=0, bound=150.0):
+    """Forces, float32, shape (num_steps, num_envs, 3); a third of them beyond the bound of ``CONFIG``."""
+    return np.random.default_rng(seed).uniform(-bound, bound, (num_steps, num_envs, 3)).astype(np.float32)
+
+
+def rsl_rl_runner(env, num_steps=8):
+    """A small PPO of rsl_rl, and a list that gets the losses of every update."""
+    model = {"class_name": "MLPModel", "hidden_dims": [16], "activation": "elu"}
+    runner = OnPolicyRunner(env, {
+        "num_steps_per_env": num_steps,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": model | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": CONFIG.max_force}},
+        "critic": dict(model),
+        "algorithm": {"class_name": "PPO", "num_learning_epochs": 2, "num_mini_batches": 2},
+        "save_interval": 1000,
+    }, log_dir=None, device=str(env.device))  # fmt: skip
+    losses, update = [], runner.alg.update
+    runner.alg.update = lambda: losses.append(update()) or losses[-1]
+    return runner, losses
+
+
+def test_adapters_are_optional():
+    """Importing the package of adapters, or what they wrap, needs neither rsl_rl nor gymnasium."""
+    code = (
+        "import sys, deimos.adapters, deimos.goal_loop, deimos.envs.particle; "
+        "assert not {'rsl_rl', 'gymnasium', 'tensordict'} & set(sys.modules)"
+    )
+    home = Path(__file__).resolve().parent.parent
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, cwd=home)
+
+
+class TestRslRl:
+    """``RslRlVecEnv``."""
+
+    def test_runner_trains(self, torch_device):
+        """rsl_rl's own runner trains on it: losses are finite, weights move, episodes start at random lengths."""
+        torch.manual_seed(0)
+        env = RslRlVecEnv(Bare(64, 0, torch_device).env)
+        runner, losses = rsl_rl_runner(env)
+        before = [p.detach().clone() for p in runner.alg.get_policy().parameters()]
+        runner.learn(num_learning_iterations=2, init_at_random_ep_len=True)
+        assert len(losses) == 2
+        assert all(np.isfinite(value) for loss in losses for value in loss.values())
+        after = list(runner.alg.get_policy().parameters())
+        assert all(not torch.equal(old, new) for old, new in zip(before, after, strict=True))
+
+    def test_equals_the_bare_loop(self, torch_device):
+        """Rewards, dones and observations are those of the bare loop; time-outs are the time limits and no more."""
+        n, scale = 64, 0.25
+        bare = Bare(n, 3, torch_device)
+        env = RslRlVecEnv(CONFIG.build(n, torch_device, 3), reward_scale=scale)
+        assert (env.num_envs, env.num_actions, env.max_episode_length) == (n, 3, TIME_LIMIT)
+        assert torch.equal(env.get_observations()["policy"], bare.env.obs)
+        length = torch.zeros(n, dtype=torch.int64, device=torch_device)
+        crashes = time_outs = 0
+        for action in torch.from_numpy(random_actions(40, n)).to(torch_device):
+            length += 1
+            obs, rewards, dones, extras = env.step(action)
+            _, reward, terminated, truncated, next_obs = bare.step(action)
+            assert torch.equal(rewards, scale * reward)
+            assert torch.equal(dones, terminated | truncated)
+            assert torch.equal(obs["policy"], next_obs)
+            assert extras["time_outs"].dtype == torch.float32
+            assert torch.equal(extras["time_outs"].bool(), (length == TIME_LIMIT) & ~terminated)
+            length[dones] = 0
+            assert torch.equal(env.episode_length_buf.long(), length)
+            crashes, time_outs = crashes + terminated.sum(), time_outs + extras["time_outs"].sum()
+        assert crashes > 20
+        assert time_outs > 20
+        assert env.loop.interactions.active.any()
+
+    def test_returns_copies(self, torch_device):
+        """What a step gave back is the same after the next one, and writing into it changes no world."""
+        env = RslRlVecEnv(CONFIG.build(16, torch_device, 0))
+        actions = torch.from_numpy(random_actions(2, 16)).to(torch_device)
+        obs, rewards, dones, extras = env.step(actions[0])
+        kept = [obs["policy"], rewards, dones, extras["time_outs"]]
+        before = [x.clone() for x in kept]
+        current = env.get_observations()["policy"]
+        assert current.data_ptr() != env.env.obs.data_ptr()
+        env.step(actions[1])
+        assert all(torch.equal(x, y) for x, y in zip(kept, before, strict=True))
+        assert not torch.equal(env.get_observations()["policy"], before[0])
+        env.get_observations()["policy"].fill_(7.0)
+        assert not (env.env.obs == 7.0).any()
+
+    def test_setting_the_episode_length_moves_the_time_limit(self, torch_device):
+        """A world that is told to be one step before its limit times out on the next step, alone."""
+        env = RslRlVecEnv(particle.Config(time_limit=TIME_LIMIT).build(4, torch_device, 0))
+        env.episode_length_buf = torch.tensor([0, TIME_LIMIT - 1, 3, 0], device=torch_device)
+        *_, extras = env.step(torch.zeros(4, 3, device=torch_device))
+        assert extras["time_outs"].tolist() == [0.0, 1.0, 0.0, 0.0]
+        assert env.episode_length_buf.tolist() == [1, 0, 4, 1]
+
+    def test_without_a_time_limit(self):
+        """Episodes that never time out have the longest length there is, which rsl_rl can still draw from."""
+        env = RslRlVecEnv(particle.Config().build(4, CPU, 0))
+        assert env.max_episode_length == 2**31 - 1
+        env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+        assert env.step(torch.zeros(4, 3))[3]["time_outs"].sum() == 0
+
+    def test_director_learns_from_rsl_rl(self, torch_device):
+        """Interactions that rsl_rl's loop collected, in inference mode, fit a fear network outside of it."""
+        torch.manual_seed(0)
+        env = CONFIG.build(64, torch_device, 0)
+        config = director.Config(percentile=75.0, candidates=20, fear=FearConfig(min_per_class=4))
+        env = RslRlVecEnv(env, config.build(spaces(env), seed=0))
+        runner, _ = rsl_rl_runner(env, num_steps=12)
+        selector, interactions = env.loop.selector, env.loop.interactions
+        runner.learn(num_learning_iterations=1)
+        assert not selector.fear.fitted
+        assert np.isfinite(selector.fear.fit(interactions.resolved()))
+        runner.learn(num_learning_iterations=1)
+        resolved = interactions.resolved()
+        assert resolved.score[resolved.issued > 12].isfinite().all()
+        assert np.isfinite(selector.fear.fit(resolved))
+
+    def test_refuses_what_is_not_finite(self, torch_device):
+        """A NaN action, which clipping may turn into a number, stops the loop."""
+        env = RslRlVecEnv(CONFIG.build(4, torch_device, 0))
+        action = torch.zeros(4, 3, device=torch_device)
+        action[2, 1] = torch.nan
+        with pytest.raises(SimulationError, match="World 2: its action is not finite"):
+            env.step(action)
+
+    @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+    def test_refuses_a_bad_reward_scale(self, scale):
+        """The message names the argument, what it must be and what it was."""
+        with pytest.raises(ValueError, match=f"reward_scale must be finite and positive, got {scale}"):
+            RslRlVecEnv(CONFIG.build(1, CPU, 0), reward_scale=scale)
+
+
+def spec(config=CONFIG):
+    """What ``gymnasium.make`` and ``gymnasium.make_vec`` need to build either view."""
+    return EnvSpec(
+        "Deimos-v0", entry_point=GymnasiumEnv, vector_entry_point=GymnasiumVectorEnv, kwargs={"config": config}
+    )
+
+
+def play(envs, actions, **reset):
+    """First observations, then the observations, rewards, terminated, truncated and infos of every step."""
+    return [envs.reset(**reset)[0], *(envs.step(action) for action in actions)]
+
+
+def same(a, b):
+    """Whether two structures of arrays are equal, bit for bit and type for type, by gymnasium's own rule."""
+    return env_checker.data_equivalence(a, b, exact=True)
+
+
+class TestGymnasium:
+    """``GymnasiumEnv`` and ``GymnasiumVectorEnv``."""
+
+    # The two warnings left are gymnasium's doubts about an unbounded observation.
+    @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is -?infinity")
+    @pytest.mark.parametrize("variant", ["absolute", "directional", "relative"])
+    def test_passes_gymnasiums_checker(self, variant):
+        """``check_env`` has nothing to say about one world, its spec included."""
+        env = gymnasium.make(spec(particle.Config(variant=variant, time_limit=TIME_LIMIT)))
+        assert env.spec is not None  # else the checker would skip what concerns determinism
+        env_checker.check_env(env.unwrapped)
+
+    def test_vector_passes_gymnasiums_checks(self):
+        """The parts of ``check_env`` that a vector environment can pass have nothing to say either."""
+        envs = gymnasium.make_vec(spec(), num_envs=5, vectorization_mode="vector_entry_point")
+        assert isinstance(envs, GymnasiumVectorEnv)
+        assert envs.spec is not None
+        assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        passive_env_checker.check_observation_space(envs.observation_space)
+        passive_env_checker.check_action_space(envs.action_space)
+        env_checker.check_reset_return_type(envs)
+        env_checker.check_reset_seed_determinism(envs)
+        env_checker.check_reset_options(envs)
+        passive_env_checker.env_reset_passive_checker(envs)
+        for action in random_actions(20, 5):
+            obs = envs.step(action)[0]
+            passive_env_checker.check_obs(obs, envs.observation_space, "step")
+        env_checker.check_returned_data_not_reused(GymnasiumVectorEnv(CONFIG, 1))  # it reads ``terminated`` as a bool
+
+    def test_vector_equals_gymnasiums_own(self):
+        """Observations, rewards, dones and infos are those of ``SyncVectorEnv`` over single worlds, bit for bit."""
+        n, seed = 8, 5
+        single = [lambda i=i: GymnasiumEnv(CONFIG, seed, env_offset=i) for i in range(n)]
+        theirs = SyncVectorEnv(single, autoreset_mode=AutoresetMode.SAME_STEP)
+        ours = GymnasiumVectorEnv(CONFIG, n, seed)
+        assert ours.observation_space == theirs.observation_space
+        assert ours.action_space == theirs.action_space
+        assert ours.metadata == theirs.metadata
+        actions = random_actions(40, n)
+        found, expected = play(ours, actions), play(theirs, actions)
+        assert all(same(a, b) for a, b in zip(found, expected, strict=True))
+        terminated, truncated = (np.stack([step[i] for step in found[1:]]) for i in (2, 3))
+        assert terminated.sum() > 2
+        assert truncated.sum() > 2
+
+    def test_equals_the_bare_loop(self, torch_device):
+        """``final_obs`` is where an episode ended, under its last goal; the observation is that after the reset."""
+        n, seed = 32, 4
+        bare = Bare(n, seed, torch_device)
+        envs = GymnasiumVectorEnv(CONFIG, n, seed, torch_device)
+        np.testing.assert_array_equal(envs.reset()[0], bare.env.obs.cpu())
+        ended = 0
+        for action in random_actions(30, n):
+            obs, reward, terminated, truncated, infos = envs.step(action)
+            expected = [x.cpu().numpy() for x in bare.step(torch.from_numpy(action).to(torch_device))]
+            for found, value in zip((reward, terminated, truncated, obs), expected[1:], strict=True):
+                np.testing.assert_array_equal(found, value)
+            done = terminated | truncated
+            np.testing.assert_array_equal(infos.get("_final_obs", np.zeros(n, bool)), done)
+            for world in np.flatnonzero(done):
+                np.testing.assert_array_equal(infos["final_obs"][world], expected[0][world])
+                assert not np.array_equal(obs[world], expected[0][world])
+                assert not obs[world, :3].any()  # a new episode starts at rest
+            ended += done.sum()
+        assert ended > 20
+
+    def test_single_world_shows_new_goals_and_terminal_observations(self):
+        """One world equals the bare loop: the new goal where it goes on, the old one where the episode ends."""
+        bare, env = Bare(1, 9), GymnasiumEnv(CONFIG, 9)
+        env.reset()
+        ends = goals = 0
+        for action in random_actions(100, 1):
+            before = bare.env.goal.clone()
+            last_obs, reward, terminated, truncated, next_obs = bare.step(torch.from_numpy(action))
+            done = bool(terminated | truncated)
+            obs, *rest = env.step(action[0])
+            np.testing.assert_array_equal(obs, (last_obs if done else next_obs)[0])
+            assert rest == [reward.item(), terminated.item(), truncated.item(), {}]
+            if done:
+                np.testing.assert_array_equal(env.reset()[0], next_obs[0])
+            ends += done
+            goals += not done and not torch.equal(before, bare.env.goal)
+        assert ends > 5
+        assert goals > 5
+
+    def test_statistics_wrapper_sees_whole_episodes(self):
+        """The returns and lengths that gymnasium's ``RecordEpisodeStatistics`` finds are those counted by hand."""
+        n = 8
+        envs = RecordEpisodeStatistics(GymnasiumVectorEnv(CONFIG, n, seed=2), buffer_length=1000)
+        envs.reset()
+        total, length, returns, lengths = np.zeros(n), np.zeros(n, int), [], []
+        for action in random_actions(60, n):
+            _, reward, terminated, truncated, _ = envs.step(action)
+            total, length = total + reward, length + 1
+            for world in np.flatnonzero(terminated | truncated):
+                returns.append(total[world])
+                lengths.append(length[world])
+                total[world] = length[world] = 0
+        assert list(envs.return_queue) == returns
+        assert list(envs.length_queue) == lengths
+        assert max(lengths) == TIME_LIMIT
+        assert min(lengths) < TIME_LIMIT
+
+    def test_equal_seeds_give_equal_episodes(self):
+        """A seed fixes everything, whoever gets it and whatever was before; another seed gives something else."""
+        actions = random_actions(20, 4)
+        first, second = GymnasiumVectorEnv(CONFIG, 4, seed=1), GymnasiumVectorEnv(CONFIG, 4, seed=2)
+        expected = play(first, actions)
+        assert all(same(a, b) for a, b in zip(play(second, actions, seed=1), expected, strict=True))
+        assert all(same(a, b) for a, b in zip(play(first, actions, seed=1), expected, strict=True))
+        other = play(first, actions, seed=2)
+        assert not np.isclose(other[0], expected[0])[:, 3:6].any()  # where particles start
+        assert not np.isclose(other[0], expected[0])[:, 9:12].any()  # their goals
+
+    def test_reset_without_a_seed_goes_on(self):
+        """The episodes after such a reset are new ones, and a second reset at once skips none of them."""
+        actions = random_actions(3, 4)
+        once, twice = GymnasiumVectorEnv(CONFIG, 4), GymnasiumVectorEnv(CONFIG, 4)
+        start, *_ = play(once, actions)
+        play(twice, actions)
+        following = once.reset()[0]
+        assert not np.array_equal(following, start)
+        twice.reset()
+        np.testing.assert_array_equal(twice.reset()[0], following)
+
+    def test_reset_drops_pending_interactions(self):
+        """An interaction that a reset cuts off is neither a crash nor a survival, later either."""
+        envs = GymnasiumVectorEnv(particle.Config(goal_period=5, max_force=100.0), 4)
+        idle = np.zeros((4, 3))
+        play(envs, [idle] * 7)
+        assert envs.loop.interactions.active.all()
+        envs.reset()
+        assert not envs.loop.interactions.active.any()
+        for _ in range(5):
+            envs.step(idle)
+        assert len(envs.loop.interactions.resolved()) == 0
+
+    def test_selector_chooses_the_goals(self):
+        """A configured selector is built for the worlds, anew for every seed."""
+        envs = GymnasiumVectorEnv(CONFIG, 4, selector=director.Config(percentile=75.0, candidates=7))
+        selector = envs.loop.selector
+        assert isinstance(selector, director.Director)
+        envs.reset(seed=1)
+        assert envs.loop.selector is not selector
+        assert envs.loop.selector.num_candidates == 7
+
+    @pytest.mark.parametrize("bound", [1.0, 100.0, float("inf")])
+    def test_action_space_is_what_the_environment_takes(self, bound):
+        """Actions are bounded by the environment's bound, and unbounded where it has none."""
+        space = GymnasiumVectorEnv(particle.Config(max_force=bound), 2).single_action_space
+        assert space == gymnasium.spaces.Box(-bound, bound, (3,), np.float32)
+        assert space.is_bounded() == np.isfinite(bound)
+
+    def test_returns_copies(self):
+        """Writing into what came back changes no world, and an action is not kept."""
+        ours, untouched = GymnasiumVectorEnv(CONFIG, 4), GymnasiumVectorEnv(CONFIG, 4)
+        actions = random_actions(20, 4)
+        expected = play(untouched, actions)
+        ours.reset()[0].fill(7.0)
+        for action, step in zip(actions.copy(), expected[1:], strict=True):
+            found = ours.step(action)
+            assert same(found, step)
+            for array in (*found[:4], action):
+                array.fill(1)
+
+    def test_refuses_what_it_cannot_take(self):
+        """Messages name the argument, what it must be and what it was."""
+        envs, idle = GymnasiumVectorEnv(CONFIG, 4), np.zeros((4, 3))
+        envs.reset()
+        with pytest.raises(ValueError, match=r"actions must have shape \(4, 3\), got \(3,\)"):
+            envs.step(np.zeros(3))
+        with pytest.raises(ValueError, match=r"options must be empty, got .*reset_mask"):
+            envs.reset(options={"reset_mask": np.ones(4, bool)})
+        with pytest.raises(ValueError, match=r"seed must be in \[0, 2\^32\), got 4294967296"):
+            envs.reset(seed=2**32)
+        with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+            GymnasiumVectorEnv(CONFIG, 0)
+        idle[3, 0] = np.nan
+        with pytest.raises(SimulationError, match="World 3: its action is not finite"):
+            envs.step(idle)
+
+    def test_single_world_must_be_reset(self):
+        """A single world takes no step before its first reset nor after the end of an episode."""
+        env, idle = GymnasiumEnv(particle.Config(time_limit=2)), np.zeros(3)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(idle)
+        env.reset()
+        assert not env.step(idle)[3]
+        assert env.step(idle)[3]
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(idle)
+        env.reset()
+        env.step(idle)

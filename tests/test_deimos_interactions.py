@@ -1,0 +1,421 @@
+"""When an interaction begins, how it resolves, and how long it is remembered."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from deimos.env import Step
+from deimos.envs import particle
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.interactions import Interactions, Resolved
+from deimos.rollout import Rollout
+from deimos.selectors import uniform
+
+STATE_DIM, GOAL_DIM = 4, 2
+
+
+def make_step(num_envs, device, *, terminated=(), truncated=(), goal_due=(), reward=1.0):
+    """A step in which the listed worlds crashed, were cut off, or have a goal due."""
+
+    def mask(rows):
+        flags = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        flags[list(rows)] = True
+        return flags
+
+    terminated, truncated, goal_due = mask(terminated), mask(truncated), mask(goal_due)
+    done = terminated | truncated
+    return Step(
+        obs=torch.zeros(num_envs, STATE_DIM + GOAL_DIM, device=device),
+        reward=torch.as_tensor(reward, dtype=torch.float32, device=device).expand(num_envs).clone(),
+        terminated=terminated,
+        truncated=truncated,
+        goal_due=goal_due,
+        invalid=mask([]),
+        count=torch.stack([(goal_due & ~done).sum(), done.sum()]).int(),
+    )
+
+
+def make_interactions(num_envs, device, *, goal_period=3, window=None):
+    """A fresh book, with the window that training has."""
+    window = 2 * goal_period if window is None else window
+    return Interactions(num_envs, STATE_DIM, GOAL_DIM, goal_period, window, device)
+
+
+def advance(interactions, step):
+    """Do with a step what the loop does, and return the worlds that are due and not done."""
+    interactions.advance(step)
+    done = step.terminated | step.truncated
+    due = torch.nonzero(step.goal_due & ~done).flatten()
+    interactions.resolve(step, torch.cat([due, torch.nonzero(done).flatten()]))
+    return due
+
+
+def issue(interactions, rows, marks, device):
+    """Open interactions whose parts can be told from each other: mark + 0.25 k in part k."""
+    marks = torch.as_tensor(marks, dtype=torch.float32, device=device).unsqueeze(1)
+    interactions.open(
+        torch.as_tensor(rows, dtype=torch.int64, device=device),
+        state=marks.repeat(1, STATE_DIM),
+        goal=marks.repeat(1, GOAL_DIM) + 0.25,
+        next_goal=marks.repeat(1, GOAL_DIM) + 0.5,
+        score=marks.squeeze(1) + 0.75,
+    )
+
+
+def build_loop(device, num_envs=2, **config):
+    """A started loop on Particle Gym with uniform goals; nobody moves unless acted upon."""
+    env = particle.Config(**({"goal_period": 5} | config)).build(num_envs, device, seed=0)
+    loop = GoalLoop(env, uniform.Config().build(spaces(env), seed=0))
+    loop.start()
+    return loop
+
+
+def run(loop, steps, *, crash=()):
+    """Take steps with no force; the listed worlds crash on the last of them."""
+    env = loop.env
+    for n in range(steps):
+        if crash and n == steps - 1:
+            env.tensors["position"][list(crash)] = 2 * particle.HALF_SIDE
+        loop.advance(env.step(torch.zeros(env.num_envs, 3, device=env.device)))
+
+
+# How an interaction resolves
+
+
+def test_nothing_is_there_at_first(torch_device):
+    """Before anything was issued nothing is pending, and no step resolves anything."""
+    interactions = make_interactions(3, torch_device)
+    assert not interactions.active.any()
+    assert len(interactions.resolved()) == 0
+    advance(interactions, make_step(3, torch_device, terminated=[0], goal_due=[0, 1], truncated=[2]))
+    assert len(interactions.resolved()) == 0
+
+
+def test_first_goals_are_no_interactions(torch_device):
+    """A crash or a survival under a first goal is no interaction; only goals of the selector are."""
+    loop = build_loop(torch_device)
+    run(loop, 4, crash=[0])
+    assert len(loop.interactions.resolved()) == 0
+    run(loop, 1)  # world 1 survives its first goal and gets one of the selector's
+    assert len(loop.interactions.resolved()) == 0
+    assert loop.interactions.active.tolist() == [False, True]
+    run(loop, 4)  # so does world 0, which has had a second first goal since its crash
+    assert loop.interactions.active.tolist() == [True, True]
+    assert len(loop.interactions.resolved()) == 0
+
+
+def test_survivor_is_labelled_at_its_last_step_and_not_before(torch_device):
+    """A world that lives is labelled as survived when its next goal falls due, after exactly T steps."""
+    loop = build_loop(torch_device)
+    run(loop, 5)
+    for _ in range(4):
+        run(loop, 1)
+        assert len(loop.interactions.resolved()) == 0
+        assert loop.interactions.active.all()
+    run(loop, 1)
+    resolved = loop.interactions.resolved()
+    assert resolved.env.tolist() == [0, 1]
+    assert resolved.crashed.tolist() == [False, False]
+    assert resolved.issued.tolist() == [5, 5]
+    assert resolved.resolved.tolist() == [10, 10]
+    assert loop.interactions.active.all()  # of the next one
+
+
+@pytest.mark.parametrize("steps", [1, 3, 5])
+def test_crash_within_the_period_is_labelled_at_once(torch_device, steps):
+    """A crash on any of the T steps, the first and the last included, is labelled on that step."""
+    loop = build_loop(torch_device)
+    run(loop, 5)
+    run(loop, steps, crash=[1])
+    resolved = loop.interactions.resolved()
+    resolved = resolved.where(resolved.crashed)
+    assert resolved.env.tolist() == [1]
+    assert resolved.issued.tolist() == [5]
+    assert resolved.resolved.tolist() == [5 + steps]
+    assert loop.interactions.active.tolist() == [True, False]
+
+
+def test_crash_on_a_goal_change_is_charged_to_the_old_goal(torch_device):
+    """A crash on the very step that the next goal is due on belongs to the goal that was in force."""
+    loop = build_loop(torch_device)
+    run(loop, 5)
+    old = loop.env.goal.clone()
+    run(loop, 5, crash=[0])
+    resolved = loop.interactions.resolved()
+    assert resolved.env.tolist() == [0, 1]
+    assert resolved.crashed.tolist() == [True, False]
+    assert torch.equal(resolved.next_goal, old)
+    assert loop.env.tensors["goal_count"].tolist() == [1, 2]  # nothing was chosen for the crashed world
+    run(loop, 4)
+    assert len(loop.interactions.resolved()) == 2  # and its first goal is charged with nothing
+
+
+def test_truncated_interaction_is_dropped(torch_device):
+    """A time limit before the T-th step leaves no label, then or later."""
+    loop = build_loop(torch_device, time_limit=8)
+    run(loop, 8)
+    assert not loop.interactions.active.any()
+    assert loop.env.tensors["episode_count"].tolist() == [3, 3]
+    for _ in range(40):
+        run(loop, 1)
+        assert len(loop.interactions.resolved()) == 0
+
+
+def test_time_limit_on_the_last_step_keeps_the_label(torch_device):
+    """An interaction whose T-th step is the time limit is a survival or a crash, never dropped."""
+    loop = build_loop(torch_device, time_limit=10)
+    run(loop, 10, crash=[1])
+    resolved = loop.interactions.resolved()
+    assert resolved.env.tolist() == [0, 1]
+    assert resolved.crashed.tolist() == [False, True]
+    assert resolved.issued.tolist() == [5, 5]
+    assert not loop.interactions.active.any()  # what follows the limit is a first goal
+
+
+def test_every_ending_by_hand(torch_device):
+    """Crash and due decide; a cut-off alone drops; a crash outweighs both; what is not listed stays pending."""
+    interactions = make_interactions(6, torch_device)
+    issue(interactions, range(6), torch.arange(6.0), torch_device)
+    step = make_step(6, torch_device, terminated=[0, 1], truncated=[2, 3], goal_due=[1, 3, 4])
+    assert advance(interactions, step).tolist() == [4]
+    resolved = interactions.resolved()
+    assert resolved.env.tolist() == [0, 1, 3, 4]
+    assert resolved.crashed.tolist() == [True, True, False, False]
+    assert interactions.active.tolist() == [False, False, False, False, False, True]
+    advance(interactions, make_step(6, torch_device, terminated=[2, 5]))
+    assert interactions.resolved().env.tolist() == [0, 1, 3, 4, 5]
+
+
+def test_interaction_straddles_rollouts(torch_device):
+    """Rollouts shorter than T cut nothing: an interaction goes on over as many of them as it takes."""
+    loop = build_loop(torch_device, goal_period=10)
+    env, rollout = loop.env, Rollout(loop.env, num_steps=4)
+    found = []
+    for _ in range(7):
+        for t in range(rollout.num_steps):
+            step = env.step(torch.zeros(2, 3, device=torch_device))
+            rollout.record(t, step, loop.learn)
+            loop.advance(step)
+        loop.selector.learn(loop.interactions, rollout)
+        found.append(loop.interactions.resolved())
+    assert [len(resolved) for resolved in found] == [0, 0, 0, 0, 2, 2, 2]
+    assert found[-1].issued.tolist() == [10, 10]
+    assert found[-1].resolved.tolist() == [20, 20]
+
+
+# What is kept
+
+
+def test_parts_stay_what_they_were(torch_device):
+    """State, goal, next goal and score come back each in its own place, as they were at the moment of the choice."""
+    interactions = make_interactions(4, torch_device)
+    tensors = [torch.rand(2, size, device=torch_device) for size in (STATE_DIM, GOAL_DIM, GOAL_DIM)]
+    tensors.append(torch.tensor([0.5, torch.nan], device=torch_device))
+    kept = [tensor.clone() for tensor in tensors]
+    interactions.open(torch.tensor([3, 1], device=torch_device), *tensors)
+    for tensor in tensors:
+        tensor.fill_(-1.0)
+    advance(interactions, make_step(4, torch_device, goal_due=[1, 3]))
+    resolved = interactions.resolved()
+    assert resolved.env.tolist() == [1, 3]
+    for name, value in zip(("state", "goal", "next_goal", "score"), kept, strict=True):
+        torch.testing.assert_close(getattr(resolved, name), value[[1, 0]], rtol=0, atol=0, equal_nan=True, msg=name)
+
+
+@pytest.mark.parametrize("variant", ["absolute", "directional", "relative"])
+def test_loop_stores_the_moment_of_the_choice(torch_device, variant):
+    """State and old goal are those seen just before the choice, the next goal is the one seen just after it."""
+    loop = build_loop(torch_device, num_envs=8, variant=variant, spawn_range=500.0)
+    env = loop.env
+    force = torch.tensor(np.random.default_rng(0).uniform(-1, 1, (8, 3)), dtype=torch.float32, device=torch_device)
+    for n in range(10):
+        step = env.step(force)
+        if n == 4:
+            state, goal = env.state(step.obs).clone(), env.goal.clone()
+        loop.advance(step)
+        if n == 4:
+            issued = env.goal.clone()
+    resolved = loop.interactions.resolved()
+    assert resolved.env.tolist() == list(range(8))
+    assert torch.equal(resolved.state, state)
+    assert torch.equal(resolved.goal, goal)
+    # The goal as it was given, and as it is seen: apart by a quotient, a sum, a difference and a product.
+    torch.testing.assert_close(resolved.next_goal, issued, rtol=3 * 2.0**-24, atol=2 * 2.3 * 2.0**-24)
+    if variant == "relative":  # as it was issued, not as it looks when the particle has moved on
+        way = 5 * force.sign().abs() * 1e-4
+        assert bool(((resolved.next_goal - env.goal).abs() > way).any())
+        assert not torch.equal(resolved.next_goal, env.goal)
+
+
+def test_reward_sums_exclude_the_crash_step(torch_device):
+    """Rewards add up from the step after the choice; that of a crash is not among them."""
+    interactions = make_interactions(2, torch_device)
+    advance(interactions, make_step(2, torch_device, reward=100.0))  # before the choice
+    issue(interactions, [0, 1], [0.0, 1.0], torch_device)
+    advance(interactions, make_step(2, torch_device, reward=[1.0, 2.0]))
+    advance(interactions, make_step(2, torch_device, reward=[4.0, 8.0]))
+    advance(interactions, make_step(2, torch_device, terminated=[0], goal_due=[0, 1], reward=[16.0, 32.0]))
+    resolved = interactions.resolved()
+    assert resolved.crashed.tolist() == [True, False]
+    assert resolved.reward.tolist() == [5.0, 42.0]
+
+
+def test_reward_starts_anew_with_every_interaction(torch_device):
+    """Nothing of an earlier interaction or of the time between is left in the next sum."""
+    interactions = make_interactions(1, torch_device)
+    for reward in (1.0, 2.0, 4.0):
+        issue(interactions, [0], [reward], torch_device)
+        advance(interactions, make_step(1, torch_device, goal_due=[0], reward=reward))
+        advance(interactions, make_step(1, torch_device, reward=1000.0))
+        newest = interactions.resolved()
+        assert newest.reward[newest.resolved.argmax()] == reward
+
+
+def test_window_drops_the_old_ones(torch_device):
+    """An interaction is kept for exactly as many steps as the window has."""
+    interactions = make_interactions(2, torch_device, goal_period=3, window=6)
+    issue(interactions, [0, 1], [0.0, 1.0], torch_device)
+    advance(interactions, make_step(2, torch_device, terminated=[0]))
+    advance(interactions, make_step(2, torch_device))
+    advance(interactions, make_step(2, torch_device, goal_due=[1]))
+    kept = [interactions.resolved().env.tolist()]
+    for _ in range(6):
+        advance(interactions, make_step(2, torch_device))
+        kept.append(interactions.resolved().env.tolist())
+    assert kept == [[0, 1], [0, 1], [0, 1], [0, 1], [1], [1], []]
+
+
+def test_rows_can_be_filtered(torch_device):
+    """A filter keeps the listed rows of every part."""
+    interactions = make_interactions(3, torch_device)
+    issue(interactions, [0, 1, 2], [0.0, 1.0, 2.0], torch_device)
+    advance(interactions, make_step(3, torch_device, terminated=[1], goal_due=[0, 1, 2]))
+    survived = interactions.resolved()
+    survived = survived.where(~survived.crashed)
+    assert len(survived) == 2
+    assert survived.env.tolist() == [0, 2]
+    assert survived.state[:, 0].tolist() == [0.0, 2.0]
+    for name in Resolved.__dataclass_fields__:
+        assert len(getattr(survived, name)) == 2
+
+
+# Against a plain list
+
+
+@dataclass
+class PlainWorld:
+    """One world as a list of what happened: the same rules, without rings, masks or tensors."""
+
+    clock: int = 0
+    pending: dict | None = None
+
+    def advance(self, now, crashed, truncated, goal_period, reward, mark):
+        """Take one step; return what it resolved, and whether a goal is chosen after it."""
+        self.clock += 1
+        due = self.clock >= goal_period
+        if self.pending is not None and not crashed:
+            self.pending["reward"] += reward
+        closed = None
+        if self.pending is not None and (crashed or due):
+            closed = self.pending | {"crashed": crashed, "resolved": now}
+        if crashed or truncated:
+            self.pending, self.clock = None, 0
+        elif due:
+            self.pending, self.clock = {"mark": mark, "issued": now, "reward": 0.0}, 0
+        return closed, due and not crashed and not truncated
+
+
+@pytest.mark.parametrize(("goal_period", "windows"), [(1, 2), (2, 2), (3, 2), (8, 2), (4, 5)])
+def test_equals_a_plain_list(torch_device, goal_period, windows):
+    """Whatever crashes when, the rings hold just what lists that never forget hold within the window."""
+    rng = np.random.default_rng(seed=goal_period)
+    n, window = 24, windows * goal_period
+    # From worlds that hardly ever crash to worlds that crash on every other step, and some that are cut off.
+    crash_rate = np.repeat([0.02, 1 / goal_period / 2, 0.5, 0.9], n // 4)
+    cut_rate = np.tile([0.0, 0.0, 0.1], n // 3)
+    interactions = make_interactions(n, torch_device, goal_period=goal_period, window=window)
+    worlds = [PlainWorld(clock=int(rng.integers(goal_period))) for _ in range(n)]
+    history = []
+    most = 0
+    for now in range(1, 40 * goal_period + 1):
+        crashed = rng.random(n) < crash_rate
+        # Worst for a ring: a crash right after a survival.
+        crashed |= np.array([w.pending is not None and w.clock == 0 for w in worlds]) & (rng.random(n) < 0.5)
+        truncated = ~crashed & (rng.random(n) < cut_rate)
+        reward = rng.integers(8, size=n) / 8  # sums of these are exact
+        due = np.array([world.clock + 1 >= goal_period for world in worlds])
+        step = make_step(
+            n, torch_device, terminated=np.flatnonzero(crashed), truncated=np.flatnonzero(truncated),
+            goal_due=np.flatnonzero(due), reward=reward,
+        )  # fmt: skip
+        rows = advance(interactions, step)
+        chosen = []
+        for env, world in enumerate(worlds):
+            mark = float(now * n + env)
+            closed, chooses = world.advance(
+                now, bool(crashed[env]), bool(truncated[env]), goal_period, reward[env], mark
+            )
+            if closed:
+                history.append(closed | {"env": env})
+            if chooses:
+                chosen.append(env)
+        assert rows.tolist() == chosen
+        if chosen:
+            issue(interactions, rows, rows.float() + now * n, torch_device)
+
+        kept = [entry for entry in history if entry["resolved"] > now - window]
+        expected = sorted(
+            (
+                e["env"],
+                e["resolved"],
+                e["issued"],
+                e["crashed"],
+                e["reward"],
+                e["mark"],
+                e["mark"] + 0.25,
+                e["mark"] + 0.75,
+            )
+            for e in kept
+        )
+        got = interactions.resolved()
+        columns = (
+            got.env, got.resolved, got.issued, got.crashed, got.reward, got.state[:, 0], got.goal[:, 1], got.score
+        )  # fmt: skip
+        assert sorted(zip(*(column.tolist() for column in columns), strict=True)) == expected
+        assert got.env.tolist() == sorted(got.env.tolist())
+        assert interactions.active.tolist() == [world.pending is not None for world in worlds]
+        per_world = np.bincount([entry["env"] for entry in kept], minlength=n)
+        most = max(most, per_world.max())
+    # The test has seen rings as full as they can be: s survivals, T apart, and a crash right after the last.
+    assert most == (windows if goal_period == 1 else windows + 1)
+    assert most <= math.ceil(window / goal_period) + 1
+
+
+# Resume
+
+
+def test_resume_is_exact(torch_device):
+    """A book that goes on from a state dictionary resolves what one that was never closed resolves."""
+    book, other = (make_interactions(4, torch_device) for _ in range(2))
+    issue(book, [0, 1, 2], [0.0, 1.0, 2.0], torch_device)
+    advance(book, make_step(4, torch_device, terminated=[1], reward=3.0))
+    saved = book.state_dict()
+    kept = {name: value.clone() if isinstance(value, torch.Tensor) else value for name, value in saved.items()}
+    results = []
+    for interactions in (book, other):
+        if interactions is other:
+            other.load_state_dict(saved)
+        advance(interactions, make_step(4, torch_device, goal_due=[0], reward=5.0))
+        issue(interactions, [0], [7.0], torch_device)
+        advance(interactions, make_step(4, torch_device, terminated=[0], goal_due=[2]))
+        results.append(vars(interactions.resolved()) | {"now": torch.tensor(interactions.now)})
+    assert results[0].keys() == results[1].keys()
+    for name, value in results[0].items():
+        assert torch.equal(value, results[1][name]), name
+    assert len(results[0]["env"]) == 4
+    assert results[0]["reward"].tolist() == [8.0, 0.0, 0.0, 9.0]
+    for name, value in kept.items():  # the steps since have not reached into it
+        assert torch.equal(saved[name], value) if isinstance(value, torch.Tensor) else saved[name] == value

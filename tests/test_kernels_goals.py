@@ -1,0 +1,177 @@
+"""Goal clocks and uniform candidates."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.goals import count_events, draw_candidates, goal_is_due, time_is_up
+from kernels.random import Purpose
+
+SIGMAS = 5.0  # a sound generator's mean is off by more than this once in 1.7 million tests
+
+
+@wp.kernel(enable_backward=False)
+def _judge_clocks(
+    # In
+    clock: wp.array[int],
+    bound: wp.array[int],
+    done: wp.array[wp.bool],
+    # Out
+    due: wp.array[wp.bool],
+    up: wp.array[wp.bool],
+    count: wp.array[int],
+):
+    i = wp.tid()
+    due[i] = goal_is_due(clock[i], bound[i])
+    up[i] = time_is_up(clock[i], bound[i])
+    count_events(due[i], done[i], count)
+
+
+def draw(row, goal_count, scale, count, device, *, seed=0, world_offset=0):
+    """The kernel's output, float32, shape (n, count, goal_dim)."""
+    row = wp.array(np.asarray(row, np.int32), dtype=wp.int32, device=device)
+    goal_count = wp.array(np.asarray(goal_count, np.int32), dtype=wp.int32, device=device)
+    scale = wp.array(np.asarray(scale, np.float32), dtype=wp.float32, device=device)
+    candidate = wp.full((*row.shape, count, *scale.shape), np.nan, dtype=wp.float32, device=device)
+    draw_candidates(row, goal_count, scale, candidate, seed=seed, world_offset=world_offset)
+    return candidate.numpy()
+
+
+@pytest.mark.parametrize("goal_dim", [1, 2, 3, 4, 5, 6])
+def test_candidates_match_reference(device, uniform_reference, goal_dim):
+    """Component 4 b + l of candidate k is lane l of block b of the world's draw k, scaled, bit for bit."""
+    rng = np.random.default_rng(seed=goal_dim)
+    goal_count = rng.integers(1000, size=20)
+    row = rng.permutation(20)[:11]
+    scale = rng.uniform(0.1, 2000.0, size=goal_dim).astype(np.float32)
+
+    candidate = draw(row, goal_count, scale, 7, device, seed=9, world_offset=50)
+
+    expected = np.empty_like(candidate)
+    for i, env in enumerate(row):
+        for k in range(7):
+            for c in range(goal_dim):
+                u = uniform_reference(9, Purpose.CANDIDATE, 50 + env, goal_count[env], k, c // 4)[c % 4]
+                # 2 u - 1 is exact in float32, so the product with the scale rounds once.
+                expected[i, k, c] = np.float32(2.0 * u - 1.0) * scale[c]
+    np.testing.assert_array_equal(candidate, expected)
+
+
+def test_candidates_are_uniform_in_the_box(device):
+    """Every component keeps to [-scale, scale), has a uniform number's mean and spread, and ignores the rest."""
+    scale = np.array([0.5, 1.0, 1250.0, 3.0, 10.0], np.float32)
+    x = draw(np.arange(2000), np.zeros(2000), scale, 20, device).reshape(-1, 5).astype(np.float64) / scale
+    n = len(x)
+
+    assert x.min() >= -1.0
+    assert x.max() < 1.0
+    assert np.all(np.abs(x.mean(axis=0)) < SIGMAS / np.sqrt(3 * n))  # the variance of a component is 1/3
+    # Its square has the mean 1/3 and the variance 1/5 - 1/9 = 4/45.
+    assert np.all(np.abs((x**2).mean(axis=0) - 1 / 3) < SIGMAS * np.sqrt(4 / 45 / n))
+    correlation = np.corrcoef(x.T) - np.eye(5)
+    assert np.all(np.abs(correlation) < SIGMAS / np.sqrt(n))
+
+
+def test_first_of_a_longer_list_are_the_same(device):
+    """Asking for fewer candidates gives the first ones of a longer list."""
+    longer = draw([3, 1], [4, 5, 6, 7], [1.0, 2.0, 3.0], 100, device)
+    for count in (1, 2, 33):
+        np.testing.assert_array_equal(draw([3, 1], [4, 5, 6, 7], [1.0, 2.0, 3.0], count, device), longer[:, :count])
+
+
+def test_candidates_are_independent_of_the_other_rows(device):
+    """A world is offered the same goals alone, in any order, and whatever the others' counts are."""
+    goal_count = np.arange(30)
+    everyone = draw(np.arange(30), goal_count, [1.0, 2.0, 3.0], 5, device)
+    np.testing.assert_array_equal(draw([21], goal_count, [1.0, 2.0, 3.0], 5, device)[0], everyone[21])
+    others = np.where(goal_count == 21, 21, 77)
+    np.testing.assert_array_equal(draw([2, 21], others, [1.0, 2.0, 3.0], 5, device)[1], everyone[21])
+
+
+def test_two_shards_are_offered_what_the_whole_is(device):
+    """World 0 of a shard with an offset of 20 is world 20 of the whole."""
+    whole = draw(np.arange(40), np.arange(40), [1.0], 3, device)
+    shard = draw(np.arange(20), np.arange(20, 40), [1.0], 3, device, world_offset=20)
+    np.testing.assert_array_equal(shard, whole[20:])
+
+
+def test_every_goal_worlds_and_seed_differ(device):
+    """Another goal of the same world, another world and another seed are offered other candidates."""
+    base = draw([0], [0, 0], [1.0, 1.0, 1.0], 4, device)
+    for other in (
+        draw([0], [1, 0], [1.0, 1.0, 1.0], 4, device),
+        draw([1], [0, 0], [1.0, 1.0, 1.0], 4, device),
+        draw([0], [0, 0], [1.0, 1.0, 1.0], 4, device, seed=1),
+    ):
+        assert np.all(base != other)
+
+
+def test_candidates_land_in_shared_memory(device):
+    """A torch view made before the launch sees the candidates at the same address."""
+    row = wp.array([0, 1], dtype=wp.int32, device=device)
+    scale = wp.array([1.0, 1.0, 1.0], dtype=wp.float32, device=device)
+    candidate = wp.full((2, 4, 3), np.nan, dtype=wp.float32, device=device)
+    view = wp.to_torch(candidate)
+    draw_candidates(row, row, scale, candidate, seed=0, world_offset=0)
+    assert view.data_ptr() == candidate.ptr
+    assert bool((view.abs() <= 1).all())
+
+
+def test_recorded_draw_waits_for_its_launch(device):
+    """A recorded launch writes nothing until it is replayed, and then only the rows that it is sized for."""
+    row = wp.array([0, 1], dtype=wp.int32, device=device)
+    scale = wp.array([1.0, 1.0, 1.0], dtype=wp.float32, device=device)
+    candidate = wp.full((2, 4, 3), np.nan, dtype=wp.float32, device=device)
+    launch = draw_candidates(row, row, scale, candidate, seed=0, world_offset=0, record=True)
+    assert np.isnan(candidate.numpy()).all()
+    launch.set_dim((1, 4))
+    launch.launch()
+    np.testing.assert_array_equal(candidate.numpy()[0], draw([0], [0], [1.0, 1.0, 1.0], 4, device)[0])
+    assert np.isnan(candidate.numpy()[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"row": ((2,), wp.int64)}, r"row must be int32\(2,\).*got int64\(2,\)"),
+        ({"goal_count": ((5,), wp.float32)}, r"goal_count must be int32\(5,\).*got float32\(5,\)"),
+        ({"scale": ((4,), wp.float32)}, r"scale must be float32\(3,\).*got float32\(4,\)"),
+        ({"candidate": ((4, 7, 3), wp.float32)}, r"candidate must be float32\(2, 7, 3\).*got float32\(4, 7, 3\)"),
+        ({"candidate": ((2, 7, 3), wp.float64)}, r"candidate must be float32\(2, 7, 3\).*got float64\(2, 7, 3\)"),
+    ],
+)
+def test_draw_candidates_rejects(device, wrong, message):
+    """The message names the argument, what it must be and what it was."""
+    right = {
+        "row": ((2,), wp.int32),
+        "goal_count": ((5,), wp.int32),
+        "scale": ((3,), wp.float32),
+        "candidate": ((2, 7, 3), wp.float32),
+    }
+    arrays = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in (right | wrong).items()}
+    with pytest.raises(ValueError, match=message):
+        draw_candidates(**arrays, seed=0, world_offset=0)
+
+
+def test_clocks_and_counts_by_hand(device):
+    """A goal is due at T and after it, an episode ends at its limit unless that is 0, and done comes first."""
+    clock = [2, 3, 4, 5, 5, 0]
+    bound = [3, 3, 3, 0, 5, 0]
+    done = [False, False, True, False, True, False]
+    expected_due = [False, True, True, True, True, True]
+    expected_up = [False, True, True, False, True, False]
+    clock, bound = (wp.array(a, dtype=wp.int32, device=device) for a in (clock, bound))
+    due, up = (wp.full(6, value, dtype=wp.bool, device=device) for value in (True, True))
+    count = wp.array([10, 20], dtype=wp.int32, device=device)
+
+    wp.launch(
+        _judge_clocks,
+        dim=6,
+        inputs=[clock, bound, wp.array(done, dtype=wp.bool, device=device)],
+        outputs=[due, up, count],
+        device=device,
+    )
+
+    assert due.numpy().tolist() == expected_due
+    assert up.numpy().tolist() == expected_up
+    assert count.numpy().tolist() == [10 + 3, 20 + 2]  # due and not done: worlds 1, 3, 5; done: 2 and 4
