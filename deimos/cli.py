@@ -53,6 +53,9 @@ def train(arguments: list[str] | None = None) -> int:
         if any(argument.split("=")[0] == "--resume" for argument in arguments):
             _resume(_parse(ResumeOptions, arguments, "deimos train"))
         else:
+            only = plugins.names(envs)
+            if len(only) == 1:  # one choice is no sub-command to tyro; its name is still good to say
+                arguments = [argument for argument in arguments if argument != f"env:{only[0]}"]
             _train(_parse(_train_options(), arguments, "deimos train"))
     return outcome.code
 

@@ -34,7 +34,7 @@ def run(folder: Path, variant: str, method: str, seed: int) -> None:
     else:
         command += ["--out", str(folder), "--method", method, "--seed", str(seed), "--threads", "1"]
         command += ["--env-steps", str(STEPS[variant]), "env:particle", "--env.variant", variant]
-    subprocess.run(command, check=True, capture_output=True)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     print("finished", folder, file=sys.stderr, flush=True)
 
 

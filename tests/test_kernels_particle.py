@@ -118,9 +118,6 @@ def step_reference(variant, x, v, f, target):
     return x_new, v_new, f_new, crashed, reward, obs
 
 
-# Steps
-
-
 @pytest.mark.parametrize("num_envs", [1, 257])
 @pytest.mark.parametrize("variant", list(Variant))
 def test_step_matches_reference(device, variant, num_envs):
@@ -165,7 +162,7 @@ def test_constant_force_follows_the_sum_of_its_steps(device):
 
 @pytest.mark.parametrize("variant", list(Variant))
 def test_mirror_worlds_move_as_mirror_images(device, variant):
-    """The cube has no preferred direction: mirrored states, goals and forces give mirrored steps and the same reward."""
+    """The cube prefers no direction: mirrored states, goals and forces give mirrored steps and the same rewards."""
     rng = np.random.default_rng(seed=2)
     n = 100
     x, v, f = rng.uniform(-1000, 1000, (n, 3)), rng.uniform(-10, 10, (n, 3)), rng.uniform(-2, 2, (n, 3))
@@ -397,9 +394,6 @@ def test_recorded_step_reads_what_is_there_at_its_launch(device):
     np.testing.assert_array_equal(state.position.numpy(), np.full((2, 3), 1.5))
 
 
-# Resets
-
-
 @pytest.mark.parametrize("num_envs", [1, 257])
 @pytest.mark.parametrize("variant", list(Variant))
 def test_reset_matches_reference(device, uniform_reference, variant, num_envs):
@@ -496,9 +490,6 @@ def test_reset_works_in_shared_memory(device):
         assert view.data_ptr() == array.ptr
     assert position.tolist() == [[5.0] * 3, [0.0] * 3]
     assert obs.isfinite().all(dim=1).tolist() == [False, True]
-
-
-# Goals
 
 
 @pytest.mark.parametrize("num_envs", [1, 257])
@@ -622,9 +613,6 @@ def test_make_relative_works_in_shared_memory(device):
     make_relative(params, rows, vectors([1.0, 2.0, 4.0], 1, device), candidate)
     assert view.data_ptr() == candidate.ptr
     assert view.tolist() == [[[0.5, 0.0, -1.0]] * 2]
-
-
-# Errors
 
 
 # A struct refuses another dtype or number of dimensions by itself; the launcher checks the lengths.
