@@ -341,15 +341,18 @@ class PPO:
     def _value_gradient(self, batch: Batch, value: Tensor) -> tuple[Tensor, Tensor]:
         """The value loss and its gradient by the value.
 
-        Where clipping makes the loss larger the clipped loss counts, and that one is flat.
+        Where the value has moved too far and clipping makes the loss larger, the clipped loss counts,
+        and that one is flat. Inside the clip both are the same but for rounding, which must not decide.
         """
         error = value - batch.returns
         loss = error.square()
         grad = error * batch.weight * (2.0 * self.config.value_coef)
         if self.config.clip_value:
-            step = (value - batch.value).clamp_(-self.config.clip, self.config.clip)
+            step = value - batch.value
+            inside = step.abs() <= self.config.clip
+            step.clamp_(-self.config.clip, self.config.clip)
             clipped = (batch.value + step).sub_(batch.returns).square_()
-            grad *= loss >= clipped
+            grad *= inside | (loss >= clipped)
             loss = torch.maximum(loss, clipped)
         return loss @ batch.weight, grad
 

@@ -1,0 +1,306 @@
+"""The learner against textbook sums, autograd, torch's own Adam, and rsl_rl on the same data."""
+
+import math
+
+import pytest
+import torch
+from rsl_rl.algorithms import PPO as RslPPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from deimos.adam import Adam
+from deimos.checks import SimulationError
+from deimos.envs import particle
+from deimos.networks import Backprop, flatten_parameters, mlp
+from deimos.ppo import PPO, PPOConfig, advantages
+from deimos.rollout import Rollout
+
+NUM_ENVS, NUM_STEPS = 50, 24
+
+
+def advantages_reference(reward, value, next_value, terminated, truncated, discount, gae_lambda):
+    """Equation 16 of the paper, summed term by term up to the end of the episode or of the rollout."""
+    steps, envs = reward.shape
+    result = torch.zeros(steps, envs, dtype=torch.float64)
+    for env in range(envs):
+        for t in range(steps):
+            weight = 1.0
+            for k in range(t, steps):
+                future = 0.0 if terminated[k, env] else next_value[k, env].item()
+                result[t, env] += weight * (reward[k, env].item() + discount * future - value[k, env].item())
+                weight *= discount * gae_lambda
+                if terminated[k, env] or truncated[k, env]:
+                    break
+    return result
+
+
+def test_advantages_match_the_sum():
+    """Advantages equal the paper's sum over random rollouts with terminations and truncations everywhere."""
+    generator = torch.Generator().manual_seed(0)
+    reward, value, next_value = (torch.randn(12, 40, generator=generator) for _ in range(3))
+    terminated = torch.rand(12, 40, generator=generator) < 0.1
+    truncated = (torch.rand(12, 40, generator=generator) < 0.1) & ~terminated
+    found = advantages(reward, value, next_value, terminated, truncated, discount=0.9, gae_lambda=0.8)
+    expected = advantages_reference(reward, value, next_value, terminated, truncated, 0.9, 0.8)
+    # Twelve additions of numbers of order 1 in float32.
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=12 * 2**-22)
+
+
+@pytest.mark.parametrize(("terminated", "truncated", "target"), [(True, False, 1.0), (False, True, 3.0)])
+def test_a_time_limit_keeps_its_future(terminated, truncated, target):
+    """With reward 1, next value 4 and discount 0.5 the target is 1 after a crash and 3 at a time limit."""
+    one = torch.ones(1, 1)
+    found = advantages(
+        one, 0 * one, 4 * one, torch.full((1, 1), terminated), torch.full((1, 1), truncated),
+        discount=0.5, gae_lambda=0.95,
+    )  # fmt: skip
+    assert found.item() == target
+
+
+def test_advantages_reject_another_shape():
+    """The message names the argument, what it must be and what it was."""
+    one = torch.ones(2, 3)
+    with pytest.raises(ValueError, match=r"next_value must have the shape of reward, \(2, 3\), got \(3, 2\)"):
+        advantages(one, one, one.t(), one.bool(), one.bool(), discount=0.5, gae_lambda=0.5)
+
+
+@pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])
+@pytest.mark.parametrize("rows", [1, 257])
+def test_backprop_is_autograd(activation, rows):
+    """The written-out passes give autograd's output and gradients, and add to what is there."""
+    torch.manual_seed(0)
+    net = mlp(7, (16, 9), 3, activation)
+    x, delta = torch.randn(rows, 7), torch.randn(rows, 3)
+    expected = torch.autograd.grad((net(x) * delta).sum(), list(net.parameters()))
+    flatten_parameters(net)
+    backprop = Backprop(net)
+    torch.testing.assert_close(backprop.forward(x), net(x).detach(), rtol=1e-5, atol=1e-6)
+    backprop.backward(delta)
+    for parameter, gradient in zip(net.parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * math.sqrt(rows))
+    backprop.backward(delta)
+    for parameter, gradient in zip(net.parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.grad, 2 * gradient, rtol=1e-4, atol=2e-5 * math.sqrt(rows))
+
+
+def test_flat_parameters_keep_the_network():
+    """Laying parameters end to end changes no output, aligns each to 64 bytes and gives every module its gradient."""
+    torch.manual_seed(0)
+    nets = [mlp(3, (5,), 2, "relu"), mlp(3, (4,), 1, "relu")]
+    x = torch.randn(8, 3)
+    before = [net(x) for net in nets]
+    flat, slices = flatten_parameters(*nets)
+    for net, output, gradient in zip(nets, before, slices, strict=True):
+        assert torch.equal(net(x), output)
+        net(x).sum().backward()
+        total = sum(float(p.grad.square().sum()) for p in net.parameters())
+        assert float(gradient.square().sum()) == pytest.approx(total)
+        assert all(p.data_ptr() % 64 == flat.data_ptr() % 64 for p in net.parameters())
+
+
+def test_adam_is_torchs():
+    """Fifty steps over changing gradients and step sizes end where torch.optim.Adam ends."""
+    generator = torch.Generator().manual_seed(0)
+    ours, theirs = (torch.nn.Parameter(torch.ones(33)) for _ in range(2))
+    ours.grad, theirs.grad = torch.zeros(33), torch.zeros(33)
+    rate = torch.tensor(1e-2)
+    adam, reference = Adam(ours, rate), torch.optim.Adam([theirs], lr=1e-2)
+    for step in range(50):
+        gradient = torch.randn(33, generator=generator) * 10.0 ** (step % 5 - 3)
+        ours.grad.copy_(gradient)
+        theirs.grad.copy_(gradient)
+        rate.fill_(1e-2 / (1 + step))
+        reference.param_groups[0]["lr"] = rate.item()
+        adam.step()
+        reference.step()
+    # Each step rounds a handful of operations on numbers of order 1.
+    torch.testing.assert_close(ours.data, theirs.data, rtol=1e-5, atol=1e-6)
+
+
+def filled(env, ppo, seed=1, *, truncations=False):
+    """A rollout of random transitions that the policy might have made."""
+    generator = torch.Generator().manual_seed(seed)
+    rollout = Rollout(env, ppo.config.num_steps)
+    for tensor in (rollout.obs, rollout.final_obs, rollout.noise):
+        tensor.normal_(generator=generator)
+    for t in range(rollout.num_steps):
+        ppo.act(rollout.obs[t], rollout.noise[t], rollout.action[t], rollout.mean[t])
+    rollout.reward.uniform_(0.0, 100.0, generator=generator)
+    rollout.terminated.bernoulli_(0.05, generator=generator)
+    if truncations:
+        rollout.truncated.bernoulli_(0.05, generator=generator)
+        rollout.truncated &= ~rollout.terminated
+    return rollout
+
+
+def rsl_rl_like(ppo, rollout):
+    """rsl_rl's learner with the same weights and the same data, after it has computed its returns."""
+    config = ppo.config
+    obs = TensorDict({"policy": rollout.obs[0]}, batch_size=[NUM_ENVS])
+    groups = {"actor": ["policy"], "critic": ["policy"]}
+    spread = {"class_name": "GaussianDistribution", "init_std": config.init_std, "std_type": "scalar"}
+    actor = MLPModel(obs, groups, "actor", 3, list(config.hidden), config.activation, distribution_cfg=spread)
+    critic = MLPModel(obs, groups, "critic", 1, list(config.hidden), config.activation)
+    for theirs, ours in ((actor.mlp, ppo.actor.mean), (critic.mlp, ppo.critic)):
+        theirs.load_state_dict(dict(zip(theirs.state_dict(), ours.state_dict().values(), strict=True)))
+    storage = RolloutStorage("rl", NUM_ENVS, NUM_STEPS, obs, [3])
+    learner = RslPPO(
+        actor, critic, storage, num_learning_epochs=config.epochs, num_mini_batches=config.minibatches,
+        clip_param=config.clip, gamma=config.discount, lam=config.gae_lambda, value_loss_coef=config.value_coef,
+        entropy_coef=config.entropy_coef, learning_rate=config.learning_rate, max_grad_norm=config.max_grad_norm,
+        use_clipped_value_loss=config.clip_value, schedule="adaptive", desired_kl=config.desired_kl,
+    )  # fmt: skip
+    with torch.no_grad():
+        for t in range(NUM_STEPS):
+            obs = TensorDict({"policy": rollout.obs[t]}, batch_size=[NUM_ENVS])
+            learner.act(obs)
+            learner.transition.actions = rollout.action[t]
+            learner.transition.actions_log_prob = actor.get_output_log_prob(rollout.action[t])
+            done = rollout.terminated[t] | rollout.truncated[t]
+            learner.process_env_step(
+                obs, rollout.reward[t] * config.reward_scale, done, {"time_outs": rollout.truncated[t].float()}
+            )
+        learner.compute_returns(TensorDict({"policy": rollout.obs[-1]}, batch_size=[NUM_ENVS]))
+    return learner
+
+
+def small_learner(time_limit=0, **changes):
+    env = particle.Config(time_limit=time_limit).build(NUM_ENVS, torch.device("cpu"), seed=0)
+    config = PPOConfig(num_steps=NUM_STEPS, hidden=(32, 16), activation="elu", **changes)
+    return env, PPO(config, env, seed=0)
+
+
+def test_returns_and_advantages_are_rsl_rls():
+    """Returns and normalised advantages agree with rsl_rl's to float32 rounding where nothing is truncated."""
+    env, ppo = small_learner()
+    rollout = filled(env, ppo)
+    storage = rsl_rl_like(ppo, rollout).storage
+    batch, _ = ppo.batch(rollout)
+    torch.testing.assert_close(batch.returns, storage.returns.flatten(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(batch.advantage, storage.advantages.flatten(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(batch.log_prob, storage.actions_log_prob.flatten(), rtol=1e-5, atol=1e-5)
+
+
+def test_returns_differ_from_rsl_rls_at_time_limits_only_by_the_value():
+    """rsl_rl continues a truncated episode with V of the observation before; given that one, returns agree."""
+    env, ppo = small_learner(time_limit=100)
+    rollout = filled(env, ppo, truncations=True)
+    storage = rsl_rl_like(ppo, rollout).storage
+    assert rollout.truncated.any()
+    apart = (ppo.batch(rollout)[0].returns - storage.returns.flatten()).abs().max()
+    assert apart > 1e-3
+    rollout.final_obs.copy_(rollout.obs[:-1])
+    torch.testing.assert_close(ppo.batch(rollout)[0].returns, storage.returns.flatten(), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("clip_value", [True, False])
+def test_a_full_update_is_rsl_rls(monkeypatch, clip_value):
+    """After 5 x 4 minibatches in the same order, losses, step size and all weights agree to float32 rounding."""
+    env, ppo = small_learner(clip_value=clip_value)
+    rollout = filled(env, ppo)
+    learner = rsl_rl_like(ppo, rollout)
+    order = torch.randperm(NUM_ENVS * NUM_STEPS, generator=torch.Generator().manual_seed(3))
+    monkeypatch.setattr(torch, "randperm", lambda *args, **kwargs: order)
+    theirs = learner.update()
+    ours = ppo.update(rollout, order)
+    assert ours["value_loss"] == pytest.approx(theirs["value"], rel=1e-4)
+    assert ours["surrogate_loss"] == pytest.approx(theirs["surrogate"], rel=1e-3, abs=1e-5)
+    assert ours["learning_rate"] == pytest.approx(learner.learning_rate, rel=1e-5)
+    # Adam divides by the root of the mean square, so where a gradient is nearly 0 its rounding is blown up to a share
+    # of the step; twenty steps of at most 1e-2 each then differ by a few 1e-4 at the very worst.
+    pairs = [*zip(ppo.actor.mean.state_dict().values(), learner.actor.mlp.state_dict().values(), strict=True)]
+    pairs += zip(ppo.critic.state_dict().values(), learner.critic.mlp.state_dict().values(), strict=True)
+    pairs.append((ppo.actor.std.data, learner.actor.distribution.std_param.data))
+    for mine, other in pairs:
+        torch.testing.assert_close(mine, other, rtol=1e-4, atol=5e-5)
+
+
+def test_transitions_of_weight_zero_teach_nothing():
+    """What stands in a transition of weight 0 changes no weight of the networks."""
+    results = []
+    for garbage in (1.0, 50.0):
+        env, ppo = small_learner()
+        rollout = filled(env, ppo)
+        rollout.weight[:, 7] = 0.0
+        rollout.reward[:, 7] = garbage
+        order = torch.arange(NUM_ENVS * NUM_STEPS)
+        ppo.update(rollout, order)
+        results.append([value.clone() for value in ppo.actor.state_dict().values()])
+    for first, second in zip(*results, strict=True):
+        torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)
+
+
+def test_rows_that_do_not_divide_are_left_out():
+    """A rollout that does not split evenly is learnt from without its remainder, on equal minibatches."""
+    env, ppo = small_learner(minibatches=7)
+    metrics = ppo.update(filled(env, ppo))
+    assert all(math.isfinite(value) for value in metrics.values())
+
+
+@pytest.mark.parametrize(("kl", "factor"), [(0.021, 1 / 1.5), (0.0049, 1.5), (0.01, 1.0), (0.0, 1.0)])
+def test_the_step_size_follows_the_divergence(kl, factor):
+    """Above twice the desired divergence the step shrinks, below half of it grows, and at 0 it stays."""
+    _, ppo = small_learner()
+    ppo._adapt_learning_rate(torch.tensor(kl))
+    assert ppo.learning_rate.item() == pytest.approx(1e-3 * factor)
+
+
+def test_the_step_size_stays_in_its_range():
+    """However often it is adapted, the step size stays in [1e-5, 1e-2]."""
+    _, ppo = small_learner()
+    for kl, limit in ((1.0, 1e-5), (1e-6, 1e-2)):
+        for _ in range(40):
+            ppo._adapt_learning_rate(torch.tensor(kl))
+        assert ppo.learning_rate.item() == pytest.approx(limit)
+
+
+def test_weights_depend_on_the_seed_alone():
+    """Two learners of one seed start alike whatever torch's global generator has done; another seed differs."""
+    env, first = small_learner()
+    torch.rand(17)
+    second, third = PPO(first.config, env, seed=0), PPO(first.config, env, seed=1)
+    assert all(torch.equal(a, b) for a, b in zip(first.actor.parameters(), second.actor.parameters(), strict=True))
+    assert not torch.equal(first.actor.mean[0].weight, third.actor.mean[0].weight)
+
+
+def test_a_learner_goes_on_from_its_state_bit_for_bit():
+    """Saved, loaded into a fresh learner and updated, it has the weights of the one that never stopped."""
+    env, ppo = small_learner()
+    rollout = filled(env, ppo)
+    ppo.update(rollout)
+    state = ppo.state_dict()
+    state = {k: v if not isinstance(v, dict) else {n: w.clone() if isinstance(w, torch.Tensor) else w
+             for n, w in v.items()} for k, v in state.items()}  # fmt: skip
+    ppo.update(rollout)
+    other = PPO(ppo.config, env, seed=9)
+    other.load_state_dict(state)
+    other.update(rollout)
+    assert all(torch.equal(a, b) for a, b in zip(ppo.actor.parameters(), other.actor.parameters(), strict=True))
+    assert torch.equal(ppo.learning_rate, other.learning_rate)
+
+
+def test_a_weight_that_is_not_finite_is_named():
+    """The check names the weight."""
+    _, ppo = small_learner()
+    ppo.check()
+    ppo.critic[0].bias.data[3] = torch.nan
+    with pytest.raises(SimulationError, match=r"critic\.0\.bias is not finite"):
+        ppo.check()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("num_steps", 0, "num_steps must be at least 1, got 0"),
+        ("learning_rate", math.nan, "learning_rate must be finite and positive, got nan"),
+        ("discount", 1.5, r"discount must be in \[0, 1\], got 1.5"),
+        ("hidden", (), "hidden must be one or more positive layer sizes"),
+        ("activation", "gelu", "activation must be one of relu, elu, tanh, got 'gelu'"),
+        ("entropy_coef", math.nan, "entropy_coef must be in"),
+    ],
+)
+def test_config_rejects(field, value, message):
+    """The message names the field, what it must be and what it was."""
+    with pytest.raises(ValueError, match=message):
+        PPOConfig(**{field: value})
