@@ -45,7 +45,7 @@ class EvalConfig:
     """Crashes among them that it needs, at least 0."""
     adversary_patience: int = 10
     """It gives up collecting after this many times ``adversary_steps``, at least 1."""
-    fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32))
+    fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32, min_per_class=8))
     """The Adversary's fear network."""
 
     def __post_init__(self) -> None:
