@@ -1,10 +1,15 @@
 """A run's folder: what is written where, so that it survives a kill at any moment."""
 
+import contextlib
 import csv
 import json
 import math
 import os
 import pickle
+import struct
+import warnings
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +18,10 @@ import torch
 
 class RunError(Exception):
     """A run cannot go on for a reason outside the program: a folder, a file, a disk, a device."""
+
+
+# What reading a broken or foreign archive was seen to raise.
+_BROKEN = (OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, struct.error, zlib.error)
 
 
 def save_tensors(path: Path, data: dict) -> None:
@@ -29,7 +38,8 @@ def save_tensors(path: Path, data: dict) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # nor can anything be deleted on a read-only disk
+            temporary.unlink(missing_ok=True)
         raise RunError(f"{path} could not be written ({_first_line(error)}); what was there is untouched.") from error
 
 
@@ -40,13 +50,18 @@ def load_tensors(path: Path, what: str, schema: int) -> dict:
         RunError: If it is missing, broken, foreign or of another version.
     """
     try:
-        data = torch.load(path, map_location="cpu", weights_only=True)
+        with zipfile.ZipFile(path) as archive:  # torch reads on over damaged bytes; the archive's checksums tell
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} is damaged")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what torch says of a foreign file; it is refused all the same
+            data = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise RunError(f"There is no {what} at {path}.") from error
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError) as error:
+    except (*_BROKEN, zipfile.BadZipFile, pickle.UnpicklingError) as error:
         raise RunError(f"{path} is not a {what}, or it is broken ({_first_line(error)}).") from error
-    if not isinstance(data, dict) or data.get("schema") != schema:
-        found = data.get("schema") if isinstance(data, dict) else None
+    found = data.get("schema") if isinstance(data, dict) else None
+    if not isinstance(found, int) or found != schema:
         raise RunError(f"{path} is not a {what} of schema {schema}, got {found}.")
     return data
 
