@@ -6,9 +6,11 @@ Whatever the user can mend (a flag, a folder, a disk) ends in one line on stderr
 import contextlib
 import dataclasses
 import io
+import os
 import re
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Union
@@ -16,7 +18,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from deimos import __version__, envs, plugins, selectors
-from deimos.checks import SimulationError
+from deimos.checks import SimulationError, check_at_least
 from deimos.run_folder import RunError
 
 USAGE = f"""Deimos {__version__}: robot policies trained under a Director that chooses their goals by fear.
@@ -53,11 +55,21 @@ def train(arguments: list[str] | None = None) -> int:
         if any(argument.split("=")[0] == "--resume" for argument in arguments):
             _resume(_parse(ResumeOptions, arguments, "deimos train"))
         else:
+            _check_names(arguments)
             only = plugins.names(envs)
             if len(only) == 1:  # one choice is no sub-command to tyro; its name is still good to say
                 arguments = [argument for argument in arguments if argument != f"env:{only[0]}"]
             _train(_parse(_train_options(), arguments, "deimos train"))
     return outcome.code
+
+
+def _check_names(arguments: list[str]) -> None:
+    """Refuse an unknown ``env:NAME`` or ``selector:NAME``; tyro would list the choices of the other."""
+    for kind, names in (("env", plugins.names(envs)), ("selector", ["none", *plugins.names(selectors)])):
+        known = [f"{kind}:{name}" for name in names]
+        for argument in arguments:
+            if argument.startswith(f"{kind}:") and argument not in known:
+                raise RunError(f"There is no '{argument}'; there are: {', '.join(known)}.")
 
 
 def evaluate(arguments: list[str]) -> int:
@@ -104,7 +116,10 @@ class EvaluateOptions:
     """T: steps that a goal is in force. By default as in training."""
     contexts: int = 0
     """Instead of the evaluation, audit the fear network on this many contexts: its AUROC within each,
-    against the exact outcomes of cloned worlds."""
+    against the exact outcomes of cloned worlds. 0 for no audit."""
+
+    def __post_init__(self) -> None:
+        check_at_least("contexts", self.contexts, 0)
 
 
 def _train_options() -> type:
@@ -170,7 +185,7 @@ def _run(trainer: Any, folder: Any) -> None:
     with _stop_on_interrupt() as stopped:
         with console.TrainingBar(trainer) as bar:
             finished = training.train(trainer, folder, bar.report, stopped)
-        if not finished:
+        if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; go on with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(130)
     if config.evaluation:
@@ -241,12 +256,11 @@ def _parse(options: Any, arguments: list[str], program: str) -> Any:
 
 def _unframed(text: str) -> str:
     """The message inside tyro's frame, without the hints below its first rules, on one line."""
-    lines = [line.strip("│╭╮╰╯ ") for line in text.splitlines()[1:]]
-    parts = " ".join(lines).split("─" * 10)
-    message = parts[0]
-    if len(parts) > 1 and "Available subcommands" in "".join(parts[1:]):
-        message += " " + next(part for part in parts[1:] if "Available" in part)
-    return re.sub(r"[─\s]+", " ", message).strip() or text.strip()
+    lines = [line.strip("│ ") for line in text.splitlines()[1:]]
+    rule = r"(?m)^[╰─╯-]+$"  # drawn with dashes where stdout is not UTF-8
+    parts = [part for part in re.split(rule, "\n".join(lines)) if part.strip()] or [text]
+    message = parts[0] + "".join(part for part in parts[1:] if part.lstrip().startswith("Available"))
+    return re.sub(r"^\s*Error parsing \w+Options:", "", message)
 
 
 class _Outcome:
@@ -262,6 +276,9 @@ def _one_line_errors() -> Iterator[_Outcome]:
         outcome.code = _fail(str(error))
     except OSError as error:
         outcome.code = _fail(f"{error.filename or 'A file'}: {error.strerror or error}.")
+    except KeyboardInterrupt:
+        _fail("Interrupted; what was written before is whole.")
+        outcome.code = 130
     except SystemExit as stop:
         outcome.code = stop.code if isinstance(stop.code, int) else 0
 
@@ -288,9 +305,19 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def _quiet_warp() -> None:
-    """Keep Warp's start-up report off the terminal, with its warning that there is no GPU; later ones show."""
+    """Keep Warp's start-up report off the terminal, with its warning that there is no GPU; all else shows."""
     import warp as wp
 
-    wp.config.log_level = wp.LOG_ERROR
-    wp.init()
     wp.config.log_level = wp.LOG_WARNING
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)  # the warning is printed from C
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            said = [line for line in file.read().decode().splitlines() if "find or load the NVIDIA" not in line]
+            if said:
+                print(*said, sep="\n", file=sys.stderr)

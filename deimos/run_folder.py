@@ -20,8 +20,10 @@ class RunError(Exception):
     """A run cannot go on for a reason outside the program: a folder, a file, a disk, a device."""
 
 
-# What reading a broken or foreign archive was seen to raise.
-_BROKEN = (OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, struct.error, zlib.error)
+_UNREADABLE = (  # what reading damaged and foreign archives was seen to raise
+    OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError,
+    struct.error, zlib.error, zipfile.BadZipFile, pickle.UnpicklingError,
+)  # fmt: skip
 
 
 def save_tensors(path: Path, data: dict) -> None:
@@ -58,8 +60,9 @@ def load_tensors(path: Path, what: str, schema: int) -> dict:
             data = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise RunError(f"There is no {what} at {path}.") from error
-    except (*_BROKEN, zipfile.BadZipFile, pickle.UnpicklingError) as error:
-        raise RunError(f"{path} is not a {what}, or it is broken ({_first_line(error)}).") from error
+    except _UNREADABLE as error:  # torch's own words on foreign objects advise to run them
+        reason = "it holds more than tensors" if isinstance(error, pickle.UnpicklingError) else _first_line(error)
+        raise RunError(f"{path} is not a {what}, or it is broken ({reason}).") from error
     found = data.get("schema") if isinstance(data, dict) else None
     if not isinstance(found, int) or found != schema:
         raise RunError(f"{path} is not a {what} of schema {schema}, got {found}.")

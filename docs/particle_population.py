@@ -2,11 +2,13 @@
 
     python docs/particle_population.py runs/population            # trains what is missing, then prints
     python docs/particle_population.py runs/population --audit    # adds the audit of the fear network
+    python docs/particle_population.py runs/population --pilots   # the pilots instead: one seed of many settings
 
 A run that was killed goes on from its checkpoint when the command is given again.
 """
 
 import argparse
+import csv
 import json
 import subprocess
 import sys
@@ -22,6 +24,25 @@ CELLS = [(variant, "uniform") for variant in STEPS] + [
 ]
 AUDITED = [1500, 1625, 1750, 1875, 2000]  # parallel steps: the last quarter of training
 RESAMPLES = 10_000
+PILOTS = [  # each under Uniform goals, seed 0: variant and what differs from the defaults
+    ("directional", ""),
+    ("directional", "--env.reward reciprocal"),
+    ("directional", "--env.reward exponential --env.reward-length 5"),
+    ("directional", "--env.max-force inf"),
+    ("directional", "--env.max-speed 5"),
+    ("directional", "--env.max-speed 20"),
+    ("directional", "--env.goal-period 50"),
+    ("directional", "--env.stagger-goals"),
+    ("directional", "--env.obs-scale raw"),
+    ("directional", "--ppo.activation elu"),
+    ("directional", "--ppo.hidden 128 128"),
+    ("directional", "--ppo.reward-scale 1"),
+    ("directional", "--ppo.num-steps 16"),
+    ("directional", "--ppo.num-steps 48"),
+    ("directional", "--ppo.entropy-coef 0"),
+    ("relative", "--env.reward reciprocal"),
+    ("absolute", "--env.reward reciprocal"),
+]
 
 
 def run(folder: Path, variant: str, method: str, seed: int) -> None:
@@ -36,6 +57,22 @@ def run(folder: Path, variant: str, method: str, seed: int) -> None:
         command += ["--env-steps", str(STEPS[variant]), "env:particle", "--env.variant", variant]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     print("finished", folder, file=sys.stderr, flush=True)
+
+
+def pilot(root: Path, number: int) -> str:
+    """Train and evaluate one pilot; returns its row of the table."""
+    variant, changes = PILOTS[number]
+    folder = root / f"pilot-{number:02d}"
+    if not (folder / "evaluation.json").exists():
+        command = [sys.executable, "train.py", "--method", "uniform", "--threads", "1", "--out", str(folder)]
+        command += ["--env-steps", str(STEPS[variant]), "--env.variant", variant, *changes.split()]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    naive = json.loads((folder / "evaluation.json").read_text())[0]
+    with (folder / "progress.csv").open() as file:
+        crashes = [float(row["crashes_per_1000"]) for row in csv.DictReader(file)]
+    eighths = [np.mean(part) for part in np.array_split(crashes, 8)]
+    return (f"| {variant} | {f'`{changes}`' if changes else 'defaults'} | {', '.join(f'{x:.2g}' for x in eighths)} "
+            f"| {naive['crashes_per_1000']:.3f} | {naive['score']:.3f} |")  # fmt: skip
 
 
 def audit(root: Path, seed: int) -> list[dict]:
@@ -98,7 +135,15 @@ def main() -> None:
     parser.add_argument("root", type=Path)
     parser.add_argument("--workers", type=int, default=2, help="runs at a time, one thread each")
     parser.add_argument("--audit", action="store_true")
+    parser.add_argument("--pilots", action="store_true")
     options = parser.parse_args()
+    if options.pilots:
+        with ThreadPoolExecutor(options.workers) as pool:
+            rows = list(pool.map(lambda number: pilot(options.root, number), range(len(PILOTS))))
+        print("| variant | differs by | crashes / 1000 in training, by eighths | against Naive | score |")
+        print("|---|---|---|---|---|")
+        print("\n".join(rows))
+        return
     jobs = [(options.root / f"{v}-{m}-s{s}", v, m, s) for s in SEEDS for v, m in CELLS]
     with ThreadPoolExecutor(options.workers) as pool:
         list(pool.map(lambda job: run(*job), jobs))
