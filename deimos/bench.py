@@ -242,13 +242,20 @@ def _limits(config: TrainConfig, trainer: Trainer) -> dict[str, float]:
     interaction = products([space.state_dim + 2 * space.goal_dim, *fear.hidden, 1])
     scores = decisions * method("p25").candidates * candidate  # type: ignore[attr-defined]
     fit = 3 * fear.epochs * 2 * config.num_envs * interaction
-    a = torch.randn(2048, 2048, device=trainer.env.device)
-    seconds = min(in_turn({"product": lambda: a @ a}, 5, trainer.env.device)["product"])
+    device = trainer.env.device
+    a = torch.randn(2048, 2048, device=device)
+    big, copy = (torch.zeros(2**24, device=device) for _ in range(2))
+    threads = torch.get_num_threads()
+    seconds = min(in_turn({"product": lambda: a @ a}, 5, device)["product"])
+    torch.set_num_threads(1)  # Warp's CPU backend runs on one core
+    moved = 2 * 4 * 2**24 / min(in_turn({"copy": lambda: copy.copy_(big)}, 5, device)["copy"])
+    torch.set_num_threads(threads)
     return {
         "update [GFLOP]": update / 1e9,
         "scores [GFLOP]": scores / 1e9,
         "fit [GFLOP]": fit / 1e9,
         "peak product [GFLOP/s]": 2 * 2048**3 / seconds / 1e9,
+        "copy, one core [GB/s]": moved / 1e9,
         "director's products / learner's": (scores + fit) / update,
     }
 

@@ -9,7 +9,9 @@ class SimulationError(RuntimeError):
 
 
 def check_at_least(name: str, value: int, least: int) -> None:
-    """Raise ``ValueError`` unless ``value`` is at least ``least``."""
+    """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
+    if not isinstance(value, int):
+        raise ValueError(f"{name} must be a whole number, got {value}.")
     if not value >= least:
         raise ValueError(f"{name} must be at least {least}, got {value}.")
 

@@ -231,11 +231,11 @@ def _evaluate_policy(folder: Any, env_config: Any, eval_config: Any, device: Any
     from deimos.policy import load_policy
 
     policy = load_policy(folder.path, str(device))
+    old = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
     with console.stage_bar("evaluating") as progress:
         rows = evaluate(policy.scaled, env_config, eval_config, device, progress)
     rows = [row | {"weights": weights_hash(policy.actor)} for row in rows]
     key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
-    old = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
     fresh = {tuple(row[name] for name in key) for row in rows}
     kept = [row for row in old if tuple(row.get(name) for name in key) not in fresh]
     folder.write_json("evaluation.json", kept + rows)

@@ -72,9 +72,12 @@ def print_evaluation(rows: list[dict]) -> None:
         ("crashes under first goals", "first_goal_crashes", "d"),
         ("Adversary's AUROC", "adversary_auroc", ".3f"),
         ("Adversary's interactions", "adversary_interactions", "d"),
+        ("crashes among them", "adversary_crashes", "d"),
     ):
         table.add_row(label, *[_cell(row.get(name), form) for row in rows])
     Console().print(table)
+    if any(row.get("weak_adversary") for row in rows):
+        Console().print("weak adversary: it has seen too few crashes, or ranks goals too badly, to prove much")
 
 
 def print_audit(audit: dict) -> None:

@@ -24,6 +24,7 @@ from deimos.selectors import director, uniform
 Policy = Callable[[Tensor], Tensor]
 """Observations, shape (n, obs_dim), to actions, shape (n, action_dim)."""
 
+WEAK_CRASHES, WEAK_AUROC = 100, 0.6  # below either, resisting the Adversary proves nothing
 HELD_OUT = 5  # every fifth world of the collection is kept for the Adversary's AUROC
 
 
@@ -185,8 +186,9 @@ def train_adversary(
     goals alone would show few crashes of a safe policy, its own choices alone no survivals.
 
     Returns:
-        The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps`` and
-        ``adversary_auroc`` (on every fifth world, which it did not learn from).
+        The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``,
+        ``adversary_auroc`` (on every fifth world, which it did not learn from) and ``weak_adversary``:
+        whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
     """
     fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed)
     collector = _Collector(env, fear)
@@ -213,11 +215,14 @@ def train_adversary(
     fear.check()
     held_out = data.where(data.env % HELD_OUT == 0)
     logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
+    crashes = int(data.crashed.sum())
+    quality = auroc(logits, held_out.crashed) if fear.fitted else math.nan
     return fear, {
         "adversary_steps": t,
         "adversary_interactions": len(data),
-        "adversary_crashes": int(data.crashed.sum()),
-        "adversary_auroc": auroc(logits, held_out.crashed) if fear.fitted else math.nan,
+        "adversary_crashes": crashes,
+        "adversary_auroc": quality,
+        "weak_adversary": crashes < WEAK_CRASHES or not quality >= WEAK_AUROC,
     }
 
 

@@ -88,8 +88,9 @@ class Fear:
         for _ in range(self.config.epochs if epochs is None else epochs):
             losses.zero_()
             order = torch.randperm(len(data), generator=self.generator, device=target.device)
-            for rows in order.split(size):
-                losses += self._learn(inputs[rows], target[rows], weight[rows], len(data) / len(rows))
+            shuffled = zip(*(part[order].split(size) for part in (inputs, target, weight)), strict=True)
+            for minibatch in shuffled:
+                losses += self._learn(*minibatch, scale=len(data) / len(minibatch[0]))
         self.fitted = True
         return losses.item()
 
@@ -128,14 +129,13 @@ class Fear:
         if candidates.device.type == "cpu":
             rows = min(rows, rows_in_cache(max(self.config.hidden)))
         size = max(1, rows // count)
-        logits = torch.empty(candidates.shape[:2], device=candidates.device)
-        for start in range(0, len(candidates), size):
-            part = slice(start, start + size)
-            x = torch.baddbmm(context[part], candidates[part], new[: len(candidates[part])]).flatten(0, 1)
+        logits = []
+        for part_context, part in zip(context.split(size), candidates.split(size), strict=True):
+            x = torch.baddbmm(part_context, part, new[: len(part)]).flatten(0, 1)
             for layer in others:
                 x = fast_linear(activate_(x, self.network[1]), layer.weight, layer.bias)
-            logits[part] = x.view(-1, count)
-        return logits
+            logits.append(x.view(-1, count))
+        return logits[0] if len(logits) == 1 else torch.cat(logits)
 
     def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite; reads the device once."""

@@ -38,7 +38,7 @@ def require(
         )
 
 
-def require_positive(name: str, value: float) -> None:
-    """Raise ``ValueError`` unless ``value`` is a number above 0 (infinity passes, NaN does not)."""
-    if not value > 0:
-        raise ValueError(f"{name} must be positive, got {value}.")
+def require_axes(name: str, array: wp.array, axes: int) -> None:
+    """Raise ``ValueError`` unless ``array`` has that many axes."""
+    if array.ndim != axes:
+        raise ValueError(f"{name} must have {axes} axes, got the shape {array.shape}.")

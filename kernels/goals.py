@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from kernels.check import require
+from kernels.check import require, require_axes
 from kernels.random import Purpose, uniform4
 
 wp.set_module_options({"enable_backward": False})
@@ -83,6 +83,7 @@ def draw_candidates(
         ValueError: If an array has another shape, dtype or device.
     """
     require("row", row, dtype=wp.int32)
+    require_axes("candidate", candidate, 3)
     require("goal_count", goal_count, dtype=wp.int32, shape=goal_count.shape, like=row)
     require("scale", scale, dtype=wp.float32, shape=candidate.shape[2:], like=row)
     require("candidate", candidate, dtype=wp.float32, shape=(*row.shape, *candidate.shape[1:]), like=row)

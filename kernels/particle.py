@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from kernels.check import require
+from kernels.check import require, require_axes
 from kernels.goals import count_events, goal_is_due, time_is_up
 from kernels.particle_rewards import shape_reward
 from kernels.random import Purpose, symmetric3, uniform4
@@ -19,6 +19,7 @@ from kernels.random import Purpose, symmetric3, uniform4
 wp.set_module_options({"enable_backward": False})
 
 OBS_DIM = 12  # velocity, position, last action, goal; three components each
+BROKEN = ("action", "velocity", "position", "goal")  # quantities by their bit in ``ParticleStep.fault``
 GOAL_START = 9  # where the goal starts in the observation
 
 
@@ -79,9 +80,9 @@ class ParticleStep:
     terminated: wp.array[wp.bool]  # crashed
     truncated: wp.array[wp.bool]  # reached the time limit without a crash
     goal_due: wp.array[wp.bool]  # the goal has been in force for its whole period
-    invalid: wp.array[wp.bool]  # the action or the state is not finite
+    invalid: wp.array[wp.bool]  # the action, or the state before the step, is not finite
     count: wp.array[int]  # (2,): worlds with a goal due that are not done, worlds that are done
-    fault: wp.array[int]  # (2,): invalid world-steps so far, lowest world among them
+    fault: wp.array[int]  # (3,): invalid world-steps so far, lowest world among them, bits of BROKEN
 
 
 @wp.func
@@ -128,9 +129,26 @@ def is_outside(position: wp.vec3, half_side: float) -> wp.bool:
     return wp.abs(position[0]) > half_side or wp.abs(position[1]) > half_side or wp.abs(position[2]) > half_side
 
 
+@wp.func
+def find_broken(action: wp.vec3, velocity: wp.vec3, position: wp.vec3, target: wp.vec3) -> int:
+    """One bit for each of BROKEN that is not finite."""
+    broken = int(0)
+    if not wp.isfinite(action):
+        broken = broken | 1
+    if not wp.isfinite(velocity):
+        broken = broken | 2
+    if not wp.isfinite(position):
+        broken = broken | 4
+    if not wp.isfinite(target):
+        broken = broken | 8
+    return broken
+
+
 @wp.kernel
 def _step_particles(params: ParticleParams, action: wp.array[wp.vec3], state: ParticleState, out: ParticleStep):
     env = wp.tid()
+    # Judged before anything is clipped: a clipped NaN may come out as a bound.
+    broken = find_broken(action[env], state.velocity[env], state.position[env], state.target[env])
     force = clamp3(action[env], params.max_force)
     velocity = clamp3(state.velocity[env] + 0.5 * force, params.max_speed)
     position = state.position[env] + velocity
@@ -138,8 +156,6 @@ def _step_particles(params: ParticleParams, action: wp.array[wp.vec3], state: Pa
     state.velocity[env] = velocity
     state.position[env] = position
 
-    # A clipped NaN may come out as a bound, so the action is judged before it is clipped.
-    invalid = not (wp.isfinite(action[env]) and wp.isfinite(position))
     crashed = is_outside(position, params.half_side)
     distance = goal_distance(params, state.target[env], position, velocity)
     out.reward[env] = shape_reward(params.reward_shape, distance, params.largest_distance, params.reward_length)
@@ -151,11 +167,12 @@ def _step_particles(params: ParticleParams, action: wp.array[wp.vec3], state: Pa
     out.terminated[env] = crashed
     out.truncated[env] = truncated
     out.goal_due[env] = goal_due
-    out.invalid[env] = invalid
+    out.invalid[env] = broken != 0
     count_events(goal_due, crashed or truncated, out.count)
-    if invalid:
+    if broken != 0:
         wp.atomic_add(out.fault, 0, 1)
         wp.atomic_min(out.fault, 1, env)
+        wp.atomic_or(out.fault, 2, broken)
     write_obs(params, state, env, out.obs)
 
 
@@ -172,7 +189,7 @@ def step_particles(
         action: Forces [u/step^2], vec3, shape (num_envs,). Clipped to ``params.max_force``.
         state: The particles. Updated.
         out: What the step gives back. Written, but for ``count`` (added to: zero it before the
-            launch) and ``fault`` (added to: zero its first and raise its second entry once read).
+            launch) and ``fault`` (added to; start it at 0, num_envs, 0).
         record: Return the launch, to be replayed with ``launch()``, instead of making it.
 
     Raises:
@@ -307,6 +324,7 @@ def set_goals(
     require("row", row, dtype=wp.int32)
     require("goal", goal, dtype=wp.vec3, like=row)
     require("obs", obs, dtype=wp.float32, shape=(state.position.shape[0], OBS_DIM), like=row)
+    require("state.position", state.position, dtype=wp.vec3, shape=state.position.shape, like=row)
     _require_state(state, state.position)
     return wp.launch(
         _set_goals,
@@ -350,6 +368,7 @@ def make_relative(
     """
     require("row", row, dtype=wp.int32)
     require("position", position, dtype=wp.vec3, shape=position.shape, like=row)
+    require_axes("candidate", candidate, 3)
     require("candidate", candidate, dtype=wp.float32, shape=(row.shape[0], candidate.shape[1], 3), like=row)
     return wp.launch(
         _make_relative,
@@ -373,5 +392,5 @@ def _require_step(out: ParticleStep, like: wp.array) -> None:
     require("out.reward", out.reward, dtype=wp.float32, like=like)
     for name in ("terminated", "truncated", "goal_due", "invalid"):
         require(f"out.{name}", getattr(out, name), dtype=wp.bool, like=like)
-    for name in ("count", "fault"):
-        require(f"out.{name}", getattr(out, name), dtype=wp.int32, shape=(2,), like=like)
+    require("out.count", out.count, dtype=wp.int32, shape=(2,), like=like)
+    require("out.fault", out.fault, dtype=wp.int32, shape=(3,), like=like)

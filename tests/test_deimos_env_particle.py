@@ -13,7 +13,7 @@ from deimos.env import Step
 from deimos.envs.particle import HALF_SIDE, Config
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.selectors import uniform
-from kernels.particle import ParticleState, ParticleStep
+from kernels.particle import ParticleState
 
 VARIANTS = ["absolute", "directional", "relative"]
 U = 2.0**-24  # relative error of one float32 operation
@@ -71,18 +71,16 @@ def put_outside(env, rows):
 def test_warp_and_torch_see_one_allocation(torch_device):
     """Every tensor of state and step lies at the address of its Warp array, and keeps it over steps and goals."""
     env = build(torch_device, variant="relative", time_limit=7)
-    tensors = dict(env.tensors)
     step = env.step(constant_actions(8, torch_device))
-    tensors |= {name: getattr(step, name) for name in Step.__dataclass_fields__}
     loop = build_loop(env)
     for _ in range(10):
         loop.advance(env.step(constant_actions(8, torch_device)))
-    seen = set()
-    for arrays, struct in ((env.state_arrays, ParticleState), (env.step_arrays, ParticleStep)):
-        for name in struct.vars.keys() & tensors.keys():
-            assert tensors[name].data_ptr() == getattr(arrays, name).ptr, name
-            seen.add(name)
-    assert seen == set(tensors)
+    state = {name: getattr(env.state_arrays, name) for name in ParticleState.vars} | {"obs": env.step_arrays.obs}
+    assert env.tensors.keys() == state.keys()
+    for name, array in state.items():
+        assert env.tensors[name].data_ptr() == array.ptr, name
+    for name in Step.__dataclass_fields__:
+        assert getattr(step, name).data_ptr() == getattr(env.step_arrays, name).ptr, name
 
 
 def test_views_are_made_once(torch_device):
@@ -534,12 +532,12 @@ def test_sound_worlds_pass_the_check(torch_device):
 
 
 def test_check_names_world_and_action(torch_device):
-    """A NaN action stops the run with the world, the quantity, its value and how often it happened."""
+    """A NaN action stops the run with the world, the quantity and how often it happened."""
     env = build(torch_device)
     action = constant_actions(8, torch_device)
     action[5, 1] = torch.nan
     env.step(action)
-    with pytest.raises(SimulationError, match=r"World 5: its action is not finite \(\[.*nan.*\]\); 1 world-steps"):
+    with pytest.raises(SimulationError, match="World 5: its action is not finite; 1 world-steps"):
         env.check()
 
 
@@ -563,7 +561,7 @@ def test_check_names_world_and_position(torch_device, value):
     env.tensors["position"][4, 2] = value
     for _ in range(3):
         env.step(constant_actions(8, torch_device))
-    with pytest.raises(SimulationError, match=rf"World 2: its position is not finite \(\[{value}.*; 6 world-steps"):
+    with pytest.raises(SimulationError, match="World 2: its position is not finite; 6 world-steps"):
         env.check()
 
 
@@ -573,7 +571,7 @@ def test_check_finds_any_broken_state(torch_device, name):
     env = build(torch_device)
     env.tensors[name][3, 1] = torch.nan
     env.step(constant_actions(8, torch_device))
-    with pytest.raises(SimulationError, match="World 3"):
+    with pytest.raises(SimulationError, match=f"World 3: its {'goal' if name == 'target' else name} is not finite"):
         env.check()
 
 
@@ -584,6 +582,7 @@ def test_check_finds_any_broken_state(torch_device, name):
         ("reward", "cubic", "reward must be one of linear, reciprocal, exponential, got 'cubic'"),
         ("obs_scale", "big", "obs_scale must be one of unit, raw, got 'big'"),
         ("goal_period", 0, "goal_period must be at least 1, got 0"),
+        ("goal_period", 2.5, "goal_period must be a whole number, got 2.5"),
         ("time_limit", -1, "time_limit must be at least 0, got -1"),
         ("max_speed", math.nan, "max_speed must be finite and positive, got nan"),
         ("max_speed", math.inf, "max_speed must be finite and positive, got inf"),

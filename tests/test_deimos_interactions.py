@@ -405,6 +405,7 @@ def test_equals_a_plain_list(torch_device, goal_period, windows):
 def test_resume_is_exact(torch_device):
     """A book that goes on from a state dictionary resolves what one that was never closed resolves."""
     book, other = (make_interactions(4, torch_device) for _ in range(2))
+    advance(book, make_step(4, torch_device))
     issue(book, [0, 1, 2], [0.0, 1.0, 2.0], torch_device)
     advance(book, make_step(4, torch_device, terminated=[1], reward=3.0))
     saved = book.state_dict()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.check import require, require_positive
+from kernels.check import require, require_axes
 
 
 def test_accepts_what_fits(device):
@@ -77,14 +77,9 @@ def test_rejects_an_unset_array_of_a_struct(device):
         require("bodies.mass", Bodies().mass)
 
 
-@pytest.mark.parametrize("value", [1e-30, 1, 2.5, float("inf")])
-def test_positive_numbers_pass(value):
-    """Every number above 0 passes, infinity too."""
-    require_positive("mass", value)
-
-
-@pytest.mark.parametrize("value", [0.0, -0.0, -1.0, float("-inf"), float("nan")])
-def test_other_numbers_are_rejected(value):
-    """Zero, negative numbers and NaN are refused with the name and the value."""
-    with pytest.raises(ValueError, match=rf"mass must be positive, got {value}\."):
-        require_positive("mass", value)
+def test_the_number_of_axes_is_checked():
+    """An array with another number of axes is refused with its shape."""
+    array = wp.zeros((2, 3), dtype=float, device="cpu")
+    require_axes("candidate", array, 2)
+    with pytest.raises(ValueError, match=r"candidate must have 3 axes, got the shape \(2, 3\)\."):
+        require_axes("candidate", array, 3)

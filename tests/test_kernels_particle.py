@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.particle import (
+    BROKEN,
     GOAL_START,
     OBS_DIM,
     ParticleParams,
@@ -75,7 +76,7 @@ def make_step(num_envs, device, *, garbage=np.nan, flag=True):
     for name in FLAGS:
         setattr(out, name, wp.full(num_envs, flag, dtype=wp.bool, device=device))
     out.count = wp.zeros(2, dtype=wp.int32, device=device)
-    out.fault = wp.array([0, num_envs], dtype=wp.int32, device=device)
+    out.fault = wp.array([0, num_envs, 0], dtype=wp.int32, device=device)
     return out
 
 
@@ -263,7 +264,8 @@ def test_non_finite_numbers_are_flagged(device, name, value, variant):
             setattr(state, name, vectors(array, 5, device))
         step_particles(make_params(variant), action, state, out)
         assert out.invalid.numpy().tolist() == [False, False, False, True, False]
-        assert out.fault.numpy().tolist() == [1, 3]
+        bit = 1 << BROKEN.index("goal" if name == "target" else name)
+        assert out.fault.numpy().tolist() == [1, 3, bit]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -284,7 +286,7 @@ def test_faults_add_up_until_they_are_read(device):
         action[worlds, 1] = np.nan
         step_particles(params, vectors(action, 6, device), state, out)
         assert np.flatnonzero(out.invalid.numpy()).tolist() == worlds
-    assert out.fault.numpy().tolist() == [4, 2]
+    assert out.fault.numpy().tolist() == [4, 2, 1 << BROKEN.index("action")]
 
 
 @pytest.mark.parametrize("variant", list(Variant))
@@ -651,7 +653,6 @@ def test_rejects_a_wrong_output(device, name):
         ("goals", "obs", r"float32\(4, 12\)"),
         ("relative", "row", r"int32\(7, 7\)"),
         ("relative", "position", r"vec3f\(7, 7\)"),
-        ("relative", "candidate", r"float32\(1, 7, 3\)"),
     ],
 )
 def test_rejects_a_wrong_argument(device, call, name, right):
@@ -660,6 +661,14 @@ def test_rejects_a_wrong_argument(device, call, name, right):
     wrong = {name: wp.zeros((7, 7), dtype=wp.float64, device=device)}
     with pytest.raises(ValueError, match=rf"^{name} must be {right}.*got float64\(7, 7\)"):
         launch_by_name(call, state, out, device, **wrong)
+
+
+@pytest.mark.parametrize("shape", [(1, 3), (1, 1, 4), (2, 1, 3)])
+def test_rejects_candidates_of_another_shape(device, shape):
+    """Candidates have a row per listed world and three components, and the message says what they were."""
+    wrong = {"candidate": wp.zeros(shape, dtype=wp.float32, device=device)}
+    with pytest.raises(ValueError, match=r"^candidate must .*got .*\(" + ", ".join(map(str, shape))):
+        launch_by_name("relative", make_state(4, device), make_step(4, device), device, **wrong)
 
 
 def launch_by_name(call, state, out, device, **wrong):

@@ -120,7 +120,7 @@ def test_configured_shape_is_the_one_that_steps_reward(device, variant, name):
         setattr(state, field, wp.zeros(1, dtype=wp.int32, device=device))
     for field in ("terminated", "truncated", "goal_due", "invalid"):
         setattr(out, field, wp.zeros(1, dtype=wp.bool, device=device))
-    out.count, out.fault = (wp.zeros(2, dtype=wp.int32, device=device) for _ in range(2))
+    out.count, out.fault = (wp.zeros(n, dtype=wp.int32, device=device) for n in (2, 3))
     out.obs = wp.full((1, 12), np.nan, dtype=wp.float32, device=device)
     out.reward = wp.full(1, np.nan, dtype=wp.float32, device=device)
     state.target.fill_(wp.vec3(*goal))

@@ -14,6 +14,7 @@ from deimos.env import Env, EnvConfig, ObsField, Step
 from deimos.shared import Shared
 from kernels.goals import draw_candidates
 from kernels.particle import (
+    BROKEN,
     OBS_DIM,
     ParticleParams,
     ParticleState,
@@ -168,7 +169,7 @@ class Particle(Env):
             "reward": Shared.zeros(n, wp.float32, device),
             **flags,
             "count": Shared.zeros(2, wp.int32, device),
-            "fault": Shared.zeros(2, wp.int32, device),
+            "fault": Shared.zeros(3, wp.int32, device),
         }
         self.state_arrays, self.step_arrays = ParticleState(), ParticleStep()
         for struct, arrays in ((self.state_arrays, vectors | counters), (self.step_arrays, out)):
@@ -179,7 +180,7 @@ class Particle(Env):
         self.tensors = {name: shared.tensor for name, shared in (vectors | counters).items()} | {"obs": self.obs}
         self.episode_step = self.tensors["episode_step"]
         self._fault = out["fault"].tensor
-        self._fault[1] = n
+        self._clear_faults()
         self._step = Step(**{name: out[name].tensor for name in Step.__dataclass_fields__})
         self.action = Shared.zeros(n, wp.vec3, device)
         self._mask = Shared.zeros(n, wp.bool, device)
@@ -266,16 +267,18 @@ class Particle(Env):
 
     def check(self) -> None:
         """See ``Env.check``."""
-        faults, world = self._fault.tolist()
+        faults, world, bits = self._fault.tolist()
         if faults == 0:
             return
-        values = {"action": self.action.tensor, "position": self.tensors["position"]}
-        broken = [name for name, value in values.items() if not value[world].isfinite().all()]
-        quantity = broken[0] if broken else "position"
+        self._clear_faults()
+        broken = " and ".join(name for bit, name in enumerate(BROKEN) if bits & 1 << bit)
         raise SimulationError(
-            f"World {world}: its {quantity} is not finite ({values[quantity][world].tolist()}); "
-            f"{faults} world-steps were affected since the last check."
+            f"World {world}: its {broken} is not finite; {faults} world-steps were affected since the last check."
         )
+
+    def _clear_faults(self) -> None:
+        self._fault.zero_()
+        self._fault[1] = self.num_envs
 
     def reference_policy(self, brake: bool = True) -> Callable[[Tensor], Tensor]:
         """A controller that follows goals and brakes in time for the wall.
