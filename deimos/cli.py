@@ -196,10 +196,13 @@ def _run(trainer: Any, folder: Any) -> None:
 
 
 def _evaluate(options: EvaluateOptions) -> None:
+    import torch
+
     from deimos import console, figures, training
 
     folder = training.RunFolder.open(options.run)
     config = training.read_config(folder)
+    torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
     _quiet_warp()
     if options.contexts:
         from deimos.audit import audit_fear

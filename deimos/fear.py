@@ -90,11 +90,11 @@ class Fear:
             order = torch.randperm(len(data), generator=self.generator, device=target.device)
             shuffled = zip(*(part[order].split(size) for part in (inputs, target, weight)), strict=True)
             for minibatch in shuffled:
-                losses += self._learn(*minibatch, scale=len(data) / len(minibatch[0]))
+                losses += self._learn(len(data) / len(minibatch[0]), *minibatch)
         self.fitted = True
         return losses.item()
 
-    def _learn(self, inputs: Tensor, target: Tensor, weight: Tensor, scale: float) -> Tensor:
+    def _learn(self, scale: float, inputs: Tensor, target: Tensor, weight: Tensor) -> Tensor:
         """One step of Adam on a minibatch; ``scale`` makes its gradient one of a mean. Returns its part of the loss."""
         assert self._parameters.grad is not None
         self._parameters.grad.zero_()

@@ -138,6 +138,7 @@ def finished(tmp_path_factory):
     done = subprocess.run(command, cwd=path.parent, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+    assert "Warp" not in done.stderr
     return path, done.stdout
 
 
@@ -348,8 +349,8 @@ def test_true_process_says_one_line(copied, arguments):
         check=False,
     )
     assert done.returncode == 2
-    assert re.fullmatch(r"deimos: [^\n─-]*[^\n]*\.\n", done.stderr), done.stderr
-    assert "-----" not in done.stderr  # what is left of a frame where there is no UTF-8
+    assert re.fullmatch(r"deimos: [^\n]+\n", done.stderr), done.stderr
+    assert "---" not in done.stderr  # what is left of a frame where there is no UTF-8
     assert done.stdout == ""
     assert contents(copied.parent) == before
 
@@ -528,7 +529,9 @@ def test_interrupt_during_the_evaluation_is_one_line(copied, monkeypatch, capfd)
     monkeypatch.setattr("deimos.evaluation.evaluate", interrupt)
     before = contents(copied)
     assert cli.main(["evaluate", str(copied)]) == 130
-    assert re.fullmatch(r"deimos: Interrupted.*\n", capfd.readouterr().err)
+    err = capfd.readouterr().err
+    assert err.splitlines()[-1].startswith("deimos: Interrupted")
+    assert "Traceback" not in err
     assert contents(copied) == before
 
 
