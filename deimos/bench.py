@@ -205,6 +205,7 @@ def measure_training(device: torch.device, rounds: int) -> dict[str, Any]:
     for trainer in trainers.values():  # let every fear network see both classes before anything is timed
         for _ in range(4):
             iterate(trainer)
+        trainer.synchronise = True
         trainer.seconds.update(dict.fromkeys(trainer.seconds, 0.0))
     seconds = in_turn(work, rounds, device)
     transitions = turn * base.num_envs * base.ppo.num_steps

@@ -14,6 +14,8 @@ def check_at_least(name: str, value: int, least: int) -> None:
         raise ValueError(f"{name} must be a whole number, got {value}.")
     if not value >= least:
         raise ValueError(f"{name} must be at least {least}, got {value}.")
+    if value >= 2**31:
+        raise ValueError(f"{name} must be below 2^31, got {value}.")
 
 
 def check_positive(name: str, value: float, *, finite: bool = False) -> None:

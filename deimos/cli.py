@@ -11,9 +11,10 @@ import re
 import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 
@@ -98,6 +99,8 @@ class ResumeOptions:
     """Folder of the run."""
     env_steps: int | None = None
     """A larger budget: steps of every world in all. By default the one that the run had."""
+    device: Literal["auto", "cpu", "cuda"] | None = None
+    """Where to go on. By default where it was."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,12 +117,17 @@ class EvaluateOptions:
     """Seed of the worlds and their goals. By default as the run was set up."""
     goal_period: int | None = None
     """T: steps that a goal is in force. By default as in training."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to simulate; auto takes the GPU where there is one."""
     contexts: int = 0
     """Instead of the evaluation, audit the fear network on this many contexts: its AUROC within each,
     against the exact outcomes of cloned worlds. 0 for no audit."""
 
     def __post_init__(self) -> None:
         check_at_least("contexts", self.contexts, 0)
+        given = [name for name in ("worlds", "steps", "seed", "goal_period") if getattr(self, name) is not None]
+        if self.contexts and given:
+            raise ValueError(f"contexts audits the run as it was trained and excludes {', '.join(given)}.")
 
 
 def _train_options() -> type:
@@ -171,8 +179,8 @@ def _resume(options: ResumeOptions) -> None:
 
     _quiet_warp()
     config = training.read_config(training.RunFolder.open(options.resume))
-    with training.one_stream(training.resolve_device(config.device)):
-        trainer, folder = training.resume(options.resume, options.env_steps)
+    with training.one_stream(training.resolve_device(options.device or config.device)):
+        trainer, folder = training.resume(options.resume, options.env_steps, options.device)
         _run(trainer, folder)
 
 
@@ -181,17 +189,16 @@ def _run(trainer: Any, folder: Any) -> None:
     from deimos import console, figures, training
 
     config = trainer.config
-    title = f"{training.kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
     with _stop_on_interrupt() as stopped:
         with console.TrainingBar(trainer) as bar:
             finished = training.train(trainer, folder, bar.report, stopped)
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; go on with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(130)
-    if config.evaluation:
-        _evaluate_policy(folder, config.env, config.eval, trainer.env.device)
-    figures.draw_summary(folder, title)
-    console.print_timing(trainer)
+    rows = _evaluate_policy(folder, config.env, config.eval, trainer.env.device) if config.evaluation else []
+    figures.draw_summary(folder, _title(config), rows)
+    if trainer.env.device.type == "cpu":  # a GPU works on while the host counts
+        console.print_timing(trainer)
     print(folder.path)
 
 
@@ -204,10 +211,13 @@ def _evaluate(options: EvaluateOptions) -> None:
     config = training.read_config(folder)
     torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
     _quiet_warp()
+    device = training.resolve_device(options.device)
     if options.contexts:
         from deimos.audit import audit_fear
 
-        audit = audit_fear(training.load(folder, config), options.contexts)
+        with training.one_stream(device):
+            trainer = training.load(folder, dataclasses.replace(config, device=options.device))
+            audit = audit_fear(trainer, options.contexts)
         folder.write_json("audit.json", audit)
         console.print_audit(audit)
         return
@@ -220,15 +230,20 @@ def _evaluate(options: EvaluateOptions) -> None:
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except ValueError as error:
         raise RunError(str(error)) from error
-    with training.one_stream(training.resolve_device(config.device)):
-        _evaluate_policy(folder, env_config, eval_config, training.resolve_device(config.device))
-    title = f"{training.kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
-    figures.draw_summary(folder, title)
+    with training.one_stream(device):
+        rows = _evaluate_policy(folder, env_config, eval_config, device)
+    figures.draw_summary(folder, _title(config), rows)
     print(folder.path)
 
 
-def _evaluate_policy(folder: Any, env_config: Any, eval_config: Any, device: Any) -> None:
-    """Evaluate the folder's policy; replaces rows with the same key and adds the others."""
+def _title(config: Any) -> str:
+    from deimos.config import kind
+
+    return f"{kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
+
+
+def _evaluate_policy(folder: Any, env_config: Any, eval_config: Any, device: Any) -> list[dict]:
+    """Evaluate the folder's policy; replaces rows with the same key and adds the others. Returns the rows."""
     from deimos import console
     from deimos.evaluation import evaluate, weights_hash
     from deimos.policy import load_policy
@@ -243,6 +258,7 @@ def _evaluate_policy(folder: Any, env_config: Any, eval_config: Any, device: Any
     kept = [row for row in old if tuple(row.get(name) for name in key) not in fresh]
     folder.write_json("evaluation.json", kept + rows)
     console.print_evaluation(rows)
+    return rows
 
 
 def _parse(options: Any, arguments: list[str], program: str) -> Any:
@@ -273,17 +289,27 @@ class _Outcome:
 @contextlib.contextmanager
 def _one_line_errors() -> Iterator[_Outcome]:
     outcome = _Outcome()
+    hook, threading.excepthook = threading.excepthook, _skip_file_errors
     try:
         yield outcome
     except (RunError, SimulationError) as error:
         outcome.code = _fail(str(error))
     except OSError as error:
-        outcome.code = _fail(f"{error.filename or 'A file'}: {error.strerror or error}.")
+        what = error.filename or "A file of the run"
+        outcome.code = _fail(f"{what} could not be read or written ({error.strerror or error}).")
     except KeyboardInterrupt:
         _fail("Interrupted; what was written before is whole.")
         outcome.code = 130
     except SystemExit as stop:
         outcome.code = stop.code if isinstance(stop.code, int) else 0
+    finally:
+        threading.excepthook = hook
+
+
+def _skip_file_errors(thread: threading.ExceptHookArgs) -> None:
+    """Say nothing of a full disk that TensorBoard's thread has met: it reports it to the main thread."""
+    if not issubclass(thread.exc_type, OSError):
+        threading.__excepthook__(thread)
 
 
 def _fail(message: str) -> int:

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import check_at_least
+from deimos.checks import check_at_least, check_range
 from deimos.env import Env, EnvConfig
 from deimos.fear import Fear, FearConfig, auroc
 from deimos.goal_loop import GoalLoop, spaces
-from deimos.interactions import Resolved
+from deimos.interactions import Interactions, Resolved
 from deimos.selector import GoalSelector, Proposal
 from deimos.selectors import director, uniform
 
@@ -25,6 +25,7 @@ Policy = Callable[[Tensor], Tensor]
 """Observations, shape (n, obs_dim), to actions, shape (n, action_dim)."""
 
 WEAK_CRASHES, WEAK_AUROC = 100, 0.6  # below either, resisting the Adversary proves nothing
+FITS = 15  # fits of the Adversary's network during its ``adversary_steps``
 HELD_OUT = 5  # every fifth world of the collection is kept for the Adversary's AUROC
 
 
@@ -52,10 +53,9 @@ class EvalConfig:
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "adversary_patience"):
             check_at_least(name, getattr(self, name), 1)
-        for name in ("seed", "adversary_interactions", "adversary_crashes"):
+        for name in ("adversary_interactions", "adversary_crashes"):
             check_at_least(name, getattr(self, name), 0)
-        if self.seed >= 2**32 - 1:
-            raise ValueError(f"seed must be below 2^32 - 1, got {self.seed}.")
+        check_range("seed", self.seed, 0, 2**32 - 2)
 
 
 def weights_hash(module: nn.Module) -> str:
@@ -86,7 +86,7 @@ def evaluate(
     Returns:
         One row for ``naive`` and one for ``adversary``. In each: ``reward`` per transition, ``crashes``,
         ``crashes_per_1000`` transitions, ``interactions`` (issued early enough to end in time),
-        ``crash_rate`` (share of those that crashed), the same for first goals apart,
+        ``crash_rate`` (share of those that crashed), steps and crashes under first goals apart,
         ``return_per_step`` (see ``play``) and ``score``: its place between the policy that does
         nothing (0) and the environment's reference policy (1), both under the Naive goals; and for
         the Adversary the size of its collection and its AUROC on worlds that it did not learn from.
@@ -194,13 +194,14 @@ def train_adversary(
     collector = _Collector(env, fear)
     limit = config.adversary_steps * config.adversary_patience
     loop = GoalLoop(env, collector, window=limit)
+    pause = max(env.goal_period, config.adversary_steps // FITS)
     for t in range(1, limit + 1):
         with torch.no_grad():
             step = env.step(policy(env.obs))
         loop.advance(step)
-        if t % env.goal_period == 0 or t == config.adversary_steps:
+        if t % pause == 0 or t == limit:
             progress(min(1.0, t / config.adversary_steps))
-            data = loop.interactions.resolved()
+            data = _whole(loop.interactions)
             fear.fit(_training_part(data), epochs=1)
             enough = (
                 len(data) >= config.adversary_interactions
@@ -210,7 +211,7 @@ def train_adversary(
             if enough:
                 break
     env.check()
-    data = loop.interactions.resolved()
+    data = _whole(loop.interactions)
     fear.fit(_training_part(data))
     fear.check()
     held_out = data.where(data.env % HELD_OUT == 0)
@@ -224,6 +225,12 @@ def train_adversary(
         "adversary_auroc": quality,
         "weak_adversary": crashes < WEAK_CRASHES or not quality >= WEAK_AUROC,
     }
+
+
+def _whole(interactions: Interactions) -> Resolved:
+    """What was issued at least T steps ago: of the later ones only the crashes are known yet."""
+    data = interactions.resolved()
+    return data.where(data.issued <= interactions.now - interactions.goal_period)
 
 
 def _training_part(data: Resolved) -> Resolved:

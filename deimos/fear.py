@@ -29,7 +29,8 @@ class FearConfig:
     min_per_class: int = 32
     """Crashes and survivals that the window must hold before a fit, at least 1."""
     workspace: int = 64
-    """Memory for the scores of candidates [MiB], at least 1; more are scored in several parts."""
+    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. A CPU takes
+    parts of 1.5 MiB, which fit its caches."""
 
     def __post_init__(self) -> None:
         check_hidden("hidden", self.hidden)
@@ -77,9 +78,10 @@ class Fear:
         Returns:
             Mean loss of the last pass; NaN, and nothing is learnt, where a class has too few rows.
         """
-        share = mean_over_ranks(data.crashed.float().mean()).item() if len(data) else 0.0
-        if min(share, 1.0 - share) * len(data) < self.config.min_per_class:
+        crashes = int(data.crashed.sum())
+        if min(crashes, len(data) - crashes) < self.config.min_per_class:
             return float("nan")
+        share = mean_over_ranks(data.crashed.float().mean()).item()
         weight = torch.where(data.crashed, 0.5 / share, 0.5 / (1.0 - share)) / len(data)
         inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
         target = data.crashed.float()
@@ -118,7 +120,7 @@ class Fear:
             candidates: Possible next goals, shape (B, N, goal_dim).
 
         Returns:
-            Logits, shape (B, N); the same for any workspace.
+            Logits, shape (B, N); the same for any workspace, up to the rounding of float32 products.
         """
         count, goal_dim = candidates.shape[1:]
         first, *others = [layer for layer in self.network.children() if isinstance(layer, nn.Linear)]

@@ -11,8 +11,13 @@ if TYPE_CHECKING:
 BLUE, ORANGE = "#0072B2", "#D55E00"  # of Okabe and Ito's palette, told apart by the colour-blind
 
 
-def draw_summary(folder: RunFolder, title: str) -> Path:
+def draw_summary(folder: RunFolder, title: str, evaluated: list[dict]) -> Path:
     """Draw ``summary.png``: reward, crashes and fear AUROC over training, and Naive beside Adversary.
+
+    Args:
+        folder: The run.
+        title: Above it all.
+        evaluated: The rows of one evaluation, or none.
 
     Raises:
         RunError: If it cannot be written.
@@ -23,7 +28,6 @@ def draw_summary(folder: RunFolder, title: str) -> Path:
     import matplotlib.pyplot as plt
 
     rows = folder.read_csv("progress.csv")
-    evaluated = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
     figure, axes = plt.subplots(2, 2, figsize=(9, 6), layout="constrained")
     _curve(axes[0, 0], rows, "reward", "mean reward per transition", BLUE)
     _curve(axes[0, 1], rows, "crashes_per_1000", "crashes per 1000 transitions", ORANGE)
@@ -54,20 +58,22 @@ def _curve(axes: "Axes", rows: list[dict[str, str]], column: str, label: str, co
 
 
 def _bars(axes: "Axes", evaluated: list[dict]) -> None:
-    """Crashes per 1000 transitions, and the score written above, of the latest evaluation."""
+    """Crashes per 1000 transitions of one evaluation, with the score written above."""
     axes.set_ylabel("crashes per 1000 transitions")
     if not evaluated:
         axes.text(0.5, 0.5, "not evaluated", ha="center", va="center", transform=axes.transAxes, color="grey")
         axes.set_axis_off()
         return
-    latest = evaluated[-2:]
     bars = axes.bar(
-        [row["goals"].capitalize() for row in latest], [row["crashes_per_1000"] for row in latest],
+        [row["goals"].capitalize() for row in evaluated], [row["crashes_per_1000"] for row in evaluated],
         color=[BLUE, ORANGE], width=0.5,
     )  # fmt: skip
-    notes = [f"{row['crashes_per_1000']:.3g}" + _score_note(row) for row in latest]
+    notes = [f"{row['crashes_per_1000']:.3g}" + _score_note(row) for row in evaluated]
     axes.bar_label(bars, notes, padding=3)
     axes.margins(y=0.25)
+    axes.set_title(
+        f"T = {evaluated[0]['goal_period']}, {evaluated[0]['worlds']} worlds x {evaluated[0]['steps']} steps", size=9
+    )
 
 
 def _score_note(row: dict) -> str:

@@ -65,6 +65,7 @@ class Interactions:
     def __init__(
         self, num_envs: int, state_dim: int, goal_dim: int, goal_period: int, window: int, device: torch.device
     ) -> None:
+        self.goal_period = goal_period
         self.window = window
         self.now = 0
         """Steps so far."""

@@ -18,6 +18,7 @@ from deimos.env import Env
 from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
+from deimos.selector import Critic
 
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # what the adaptive schedule may reach; rsl_rl's
 
@@ -214,19 +215,21 @@ class PPO:
         return value.view(obs.shape[:-1])
 
     @torch.no_grad()
-    def update(self, rollout: Rollout, order: Tensor | None = None) -> dict[str, float]:
+    def update(self, rollout: Rollout, order: Tensor | None = None, critic: Critic | None = None) -> dict[str, float]:
         """Learn from a rollout.
 
         Args:
             rollout: What the current policy did.
             order: The order that the transitions are split into minibatches in, int64,
                 shape (num_steps * num_envs,); ``None`` draws one.
+            critic: The value function to use as the baseline; ``None`` for PPO's own. Somebody
+                else trains it, and PPO's own learns nothing then.
 
         Returns:
             Averages over all minibatches: ``value_loss``, ``surrogate_loss``, ``kl``; and, after the
             update, ``entropy``, ``learning_rate``, ``action_std``, ``explained_variance``.
         """
-        batch, explained = self.batch(rollout)
+        batch, explained = self.batch(rollout, critic)
         if order is None:
             order = torch.randperm(len(batch.obs), generator=self.generator, device=batch.obs.device)
         batch = batch.shuffled(order[: self._size * self.config.minibatches])
@@ -234,7 +237,7 @@ class PPO:
         totals = torch.zeros(3, device=batch.obs.device)
         for _ in range(self.config.epochs):
             for minibatch in batch.split(self._size):
-                totals += self._learn(minibatch, std)
+                totals += self._learn(minibatch, std, learn_value=critic is None)
         value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
         return {
             "value_loss": value_loss,
@@ -247,17 +250,17 @@ class PPO:
         }
 
     @torch.no_grad()
-    def batch(self, rollout: Rollout) -> tuple[Batch, Tensor]:
+    def batch(self, rollout: Rollout, critic: Critic | None = None) -> tuple[Batch, Tensor]:
         """Advantages, value targets and old log-probabilities of a rollout; and the share of variance explained.
 
         The networks have not changed since the rollout, so values and log-probabilities are
         computed here at once and not step by step.
         """
-        config = self.config
-        value = self.value(rollout.obs)
+        config, value_of = self.config, critic.value if critic else self.value
+        value = value_of(rollout.obs)
         next_value = value[1:].clone()
         if len(rollout.final_obs):
-            next_value = torch.where(rollout.truncated, self.value(rollout.final_obs), next_value)
+            next_value = torch.where(rollout.truncated, value_of(rollout.final_obs), next_value)
         advantage = advantages(
             rollout.reward * config.reward_scale, value[:-1], next_value, rollout.terminated, rollout.truncated,
             discount=config.discount, gae_lambda=config.gae_lambda,
@@ -283,7 +286,7 @@ class PPO:
             weight=weight.flatten(),
         ), explained
 
-    def _learn(self, minibatch: Batch, old_std: Tensor) -> Tensor:
+    def _learn(self, minibatch: Batch, old_std: Tensor, *, learn_value: bool = True) -> Tensor:
         """One step of Adam; returns value loss, surrogate loss and KL divergence, shape (3,).
 
         On a CPU the minibatch is worked through in pieces that suit the caches; their gradients add up.
@@ -297,13 +300,15 @@ class PPO:
         moved = torch.zeros_like(std)
         for piece in minibatch.split(self._piece):
             mean = self._actor_pass.forward(piece.obs).t().contiguous()
-            value = self._critic_pass.forward(piece.obs).squeeze(1)
             surrogate_loss, grad_mean, grad_std = self._policy_gradient(piece, mean)
-            value_loss, grad_value = self._value_gradient(piece, value)
             self._actor_pass.backward(grad_mean.t())
-            self._critic_pass.backward(grad_value.unsqueeze(1))
             std.grad += grad_std
-            losses += torch.stack([value_loss, surrogate_loss])
+            losses[1] += surrogate_loss
+            if learn_value:
+                value = self._critic_pass.forward(piece.obs).squeeze(1)
+                value_loss, grad_value = self._value_gradient(piece, value)
+                self._critic_pass.backward(grad_value.unsqueeze(1))
+                losses[0] += value_loss
             moved += (mean - piece.mean).square_() @ piece.weight
         std.grad -= config.entropy_coef / std
         ratio = old_std / std
@@ -361,7 +366,8 @@ class PPO:
         rate, desired = self.learning_rate, self.config.desired_kl
         factor = torch.where(kl > 2 * desired, 1 / 1.5, torch.where((kl < desired / 2) & (kl > 0), 1.5, 1.0))
         low, high = LEARNING_RATE_RANGE
-        rate.copy_(torch.where(factor < 1, (rate * factor).clamp(min=low), (rate * factor).clamp(max=high)))
+        raised, lowered = (rate * factor).clamp(max=high), (rate * factor).clamp(min=low)
+        rate.copy_(torch.where(factor > 1, raised, torch.where(factor < 1, lowered, rate)))
 
     @staticmethod
     def _log_normaliser(std: Tensor) -> Tensor:

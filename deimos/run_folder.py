@@ -10,8 +10,9 @@ import struct
 import warnings
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
@@ -32,10 +33,15 @@ def save_tensors(path: Path, data: dict) -> None:
     Raises:
         RunError: If it cannot be written; the file of before is untouched.
     """
+    _write_whole(path, lambda file: torch.save(data, file))
+
+
+def _write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
+    """Write a file under a temporary name, to the disk, and only then rename it."""
     temporary = path.with_name(path.name + ".partial")
     try:
         with temporary.open("wb") as file:
-            torch.save(data, file)
+            write(file)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -113,13 +119,8 @@ class RunFolder:
         Raises:
             RunError: If it cannot be written.
         """
-        path = self.path / name
-        temporary = path.with_name(path.name + ".partial")
-        try:
-            temporary.write_text(json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n")
-            temporary.replace(path)
-        except OSError as error:
-            raise RunError(f"{path} could not be written ({error.strerror}).") from error
+        text = json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n"
+        _write_whole(self.path / name, lambda file: file.write(text.encode()))
 
     def read_json(self, name: str) -> Any:
         """Read a JSON file.

@@ -2,6 +2,7 @@
 
 import abc
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -36,6 +37,14 @@ class Proposal:
     """What the selector thinks of each, NaN where it has no opinion, shape (B,)."""
     learn: Tensor
     """Whether the learner may use what follows, bool, shape (B,)."""
+
+
+class Critic(Protocol):
+    """A value function that somebody else trains."""
+
+    def value(self, obs: Tensor) -> Tensor:
+        """Values, in units of scaled rewards, of observations of shape (..., obs_dim)."""
+        ...
 
 
 class SelectorConfig(abc.ABC):
@@ -75,6 +84,10 @@ class GoalSelector(abc.ABC):
             draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All chance
                 in the choice comes from here, so that it is the same in any batch.
         """
+
+    def critic(self) -> "Critic | None":
+        """The value function that the learner shall use instead of its own, if this selector supplies one."""
+        return None
 
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
         """Learn from what happened, once per rollout.

@@ -2,10 +2,11 @@
 
 import os
 import platform
+import shutil
 import subprocess
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Literal
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from deimos import __version__
 from deimos.checks import SimulationError, check_at_least, check_choice
@@ -22,7 +24,7 @@ from deimos.envs import particle
 from deimos.evaluation import EvalConfig
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.methods import method
-from deimos.policy import save_policy
+from deimos.policy import load_policy, save_policy
 from deimos.ppo import PPO, PPOConfig
 from deimos.rollout import Rollout
 from deimos.run_folder import RunError, RunFolder, load_tensors, save_tensors
@@ -106,16 +108,18 @@ def resolve_device(name: str) -> torch.device:
     return torch.device("cuda", 0) if name != "cpu" and torch.cuda.is_available() else torch.device("cpu")
 
 
-def one_stream(device: torch.device) -> AbstractContextManager:
+@contextmanager
+def one_stream(device: torch.device) -> Iterator[None]:
     """Run torch and Warp on one explicit CUDA stream, so that neither has to wait for the other.
 
     Enter it before anything is built on the device. On the CPU it does nothing.
     """
     if device.type == "cpu":
-        return nullcontext()
+        yield
+        return
     stream = torch.cuda.Stream(device)
-    torch.cuda.set_stream(stream)
-    return wp.ScopedStream(wp.stream_from_torch(stream))
+    with torch.cuda.stream(stream), wp.ScopedStream(wp.stream_from_torch(stream)):
+        yield
 
 
 def cores() -> int:
@@ -134,13 +138,15 @@ class Trainer:
         self.rollout = Rollout(self.env, config.ppo.num_steps)
         self.iteration = 0
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
-        """Time spent so far in each part of an iteration [s]."""
+        """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""
+        self.synchronise = False
+        """Whether to wait for the device at the end of every part, to tell their times apart; for benchmarks."""
 
     def collect(self) -> None:
         """Let the policy act for one rollout."""
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
         rollout.noise.normal_(generator=ppo.generator)
-        clock = _Clock(self.seconds)
+        clock = _Clock(self)
         for t in range(rollout.num_steps):
             rollout.obs[t] = env.obs
             ppo.act(env.obs, rollout.noise[t], rollout.action[t], rollout.mean[t])
@@ -159,14 +165,15 @@ class Trainer:
             The row of ``progress.csv``.
 
         Raises:
-            SimulationError: If a number is not finite; nothing was learnt from it.
+            SimulationError: If a number is not finite. This trainer is spoilt then; the last checkpoint is not.
         """
         self.iteration += 1
         try:
             self.collect()
             self.env.check()
-            clock = _Clock(self.seconds)
-            learner = self.ppo.update(self.rollout)
+            _check_obs(self.rollout.obs[-1])
+            clock = _Clock(self)
+            learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
             self.ppo.check()
             clock.lap("update")
             selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
@@ -191,7 +198,12 @@ class Trainer:
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
-        return {"iteration": self.iteration, "ppo": self.ppo.state_dict(), "loop": self.loop.state_dict()}
+        return {
+            "iteration": self.iteration,
+            "made_for": _identity(self.config),
+            "ppo": self.ppo.state_dict(),
+            "loop": self.loop.state_dict(),
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from ``state_dict()``.
@@ -200,6 +212,8 @@ class Trainer:
             RunError: If it is that of another environment or another network size.
         """
         try:
+            if state["made_for"] != _identity(self.config):
+                raise ValueError(f"it was made for {state['made_for']}, this run is {_identity(self.config)}.")
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
         except (KeyError, ValueError, RuntimeError) as error:
@@ -208,14 +222,29 @@ class Trainer:
         self.iteration = state["iteration"]
 
 
+def _identity(config: TrainConfig) -> dict:
+    """What a checkpoint must have in common with the run that goes on from it."""
+    return {"env": to_dict(config.env), "selector": to_dict(config.goals), "num_envs": config.num_envs}
+
+
+def _check_obs(obs: Tensor) -> None:
+    """Raise ``SimulationError`` if an observation is not finite: what broke on a rollout's last step shows there."""
+    if not bool(obs.isfinite().all()):
+        world = int((~obs.isfinite()).any(dim=1).nonzero()[0])
+        raise SimulationError(f"World {world}: its observation is not finite.")
+
+
 class _Clock:
     """Adds up the time between laps."""
 
-    def __init__(self, seconds: dict[str, float]) -> None:
-        self._seconds = seconds
+    def __init__(self, trainer: Trainer) -> None:
+        self._seconds = trainer.seconds
+        self._device = trainer.env.device if trainer.synchronise and trainer.env.device.type == "cuda" else None
         self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
+        if self._device is not None:
+            torch.cuda.synchronize(self._device)
         now = time.perf_counter()
         self._seconds[name] += now - self._last
         self._last = now
@@ -251,21 +280,47 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
     device = resolve_device(config.device)
     config = replace(config, threads=config.threads or cores(), device="cuda" if device.type == "cuda" else "cpu")
     torch.set_num_threads(config.threads)
-    trainer = Trainer(config, device)
+    trainer = build(config, device)
     if init_from is not None:
-        state = load_tensors(RunFolder.open(init_from).path / "checkpoint.pt", "checkpoint", SCHEMA)
-        try:
-            trainer.ppo.load_weights(state["ppo"])
-        except (KeyError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
-            raise RunError(f"The networks of {init_from} do not fit this run: {reason}") from error
+        _load_weights(trainer, RunFolder.open(init_from))
     stamp = time.strftime("%Y%m%d-%H%M%S")
     folder = RunFolder.create(path or Path("runs") / f"{kind(config.env)}-{config.label}-s{config.seed}-{stamp}")
-    folder.write_json("config.json", {
-        "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
-        "init_from": str(init_from) if init_from else None,
-    })  # fmt: skip
+    try:
+        folder.write_json("config.json", {
+            "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
+            "init_from": str(init_from) if init_from else None,
+        })  # fmt: skip
+        save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
+    except RunError:
+        shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
+        raise
     return trainer, folder
+
+
+def build(config: TrainConfig, device: torch.device) -> Trainer:
+    """Make a trainer.
+
+    Raises:
+        RunError: If its worlds do not fit in memory.
+    """
+    try:
+        return Trainer(config, device)
+    except (MemoryError, RuntimeError, ValueError) as error:  # Warp, torch and NumPy each have their own
+        reason = " ".join(str(error).split())
+        raise RunError(f"{config.num_envs} worlds could not be allocated ({reason}); use fewer (num_envs).") from error
+
+
+def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
+    """Take over the networks of another run, whose observations must mean the same."""
+    state = load_tensors(origin.path / "checkpoint.pt", "checkpoint", SCHEMA)
+    try:
+        layout = load_policy(origin.path).layout
+        if layout != trainer.env.layout:
+            raise ValueError(f"it observes {layout}, this one {trainer.env.layout}")
+        trainer.ppo.load_weights(state["ppo"])
+    except (KeyError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise RunError(f"The networks of {origin.path} do not fit this run: {reason}") from error
 
 
 def load(folder: RunFolder, config: TrainConfig) -> Trainer:
@@ -279,19 +334,18 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
         RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
     """
     torch.set_num_threads(config.threads)
-    trainer = Trainer(config, resolve_device(config.device))
-    checkpoint = folder.path / "checkpoint.pt"
-    if checkpoint.exists():  # else it was killed before its first one, and begins again
-        trainer.load_state_dict(load_tensors(checkpoint, "checkpoint", SCHEMA))
+    trainer = build(config, resolve_device(config.device))
+    trainer.load_state_dict(load_tensors(folder.path / "checkpoint.pt", "checkpoint", SCHEMA))
     return trainer
 
 
-def resume(path: Path, env_steps: int | None) -> tuple[Trainer, RunFolder]:
+def resume(path: Path, env_steps: int | None = None, device: str | None = None) -> tuple[Trainer, RunFolder]:
     """Go on with a run from its last checkpoint.
 
     Args:
         path: Its folder.
         env_steps: A larger budget; ``None`` for the one that it had.
+        device: Where to go on; ``None`` for where it was.
 
     Raises:
         RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.
@@ -304,6 +358,8 @@ def resume(path: Path, env_steps: int | None) -> tuple[Trainer, RunFolder]:
                 f"A resumed run takes only a larger budget: it had {config.env_steps} steps, got {env_steps}."
             )
         config = replace(config, env_steps=env_steps)
+    if device is not None:
+        config = replace(config, device="cuda" if resolve_device(device).type == "cuda" else "cpu")
     trainer = load(folder, config)
     folder.write_json("config.json", folder.read_json("config.json") | {"config": to_dict(config)})
     for name in ("progress.csv", "timing.csv"):

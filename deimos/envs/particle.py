@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from deimos.checks import SimulationError, check_at_least, check_choice, check_positive
+from deimos.checks import SimulationError, check_at_least, check_choice, check_positive, check_range
 from deimos.env import Env, EnvConfig, ObsField, Step
 from deimos.shared import Shared
 from kernels.goals import draw_candidates
@@ -28,6 +28,7 @@ from kernels.particle import (
 from kernels.particle_rewards import RewardShape
 from kernels.random import Purpose, draw_uniforms
 
+LARGEST = 1e6  # [u] or [u/step]; beyond, float32 positions no longer tell one step from the next
 HALF_SIDE = 1000.0  # [u]; thesis, 4.1.1: the cube is 2000 length units a side
 
 
@@ -68,10 +69,12 @@ class Config(EnvConfig):
         check_at_least("goal_period", self.goal_period, 1)
         check_at_least("time_limit", self.time_limit, 0)
         check_positive("max_speed", self.max_speed, finite=True)
+        check_range("max_speed", self.max_speed, 0, LARGEST)
         check_positive("max_force", self.max_force)
         for name in ("goal_range", "reward_length"):
             if getattr(self, name) is not None:
                 check_positive(name, getattr(self, name), finite=True)
+                check_range(name, getattr(self, name), 0, LARGEST)
         if not 0 <= self.spawn_range < HALF_SIDE:
             raise ValueError(f"spawn_range must be in [0, {HALF_SIDE:g}), got {self.spawn_range}.")
 

@@ -109,4 +109,4 @@ def pick_by_rule(score: Tensor, draw: Tensor, rule: str, percentile: float) -> T
     pick = (draw * kept).long().clamp(max=kept - 1)
     if kept == count:
         return pick
-    return score.topk(kept, dim=1, sorted=False).indices.gather(1, pick.unsqueeze(1)).squeeze(1)
+    return score.topk(kept, dim=1).indices.gather(1, pick.unsqueeze(1)).squeeze(1)
