@@ -47,6 +47,7 @@ TRAIN_ERRORS = {
     "selector:director --selector.fear.hidden 0": r"hidden must be one or more positive layer sizes, got \(0,\)",
     "--num-envs 0": "num_envs must be at least 1, got 0",
     "--num-envs -3": "num_envs must be at least 1, got -3",
+    "--num-envs 2147483648": r"num_envs must be below 2\^31, got 2147483648",
     "--num-envs 2.5": "--num-envs: .*'2.5'",
     "--num-envs": "Missing value for argument '--num-envs'",
     "--env-steps 0": "env_steps must be at least 1, got 0",
@@ -174,6 +175,7 @@ def test_other_commands_refuse(here, capfd, arguments):
         ("--worlds many", "--worlds: .*'many'"),
         ("--seed -1", r"seed must be in \[0, .*, got -1"),
         ("--contexts -1", "contexts must be at least 0, got -1"),
+        ("--contexts 5 --worlds 3", "contexts audits the run as it was trained and excludes worlds"),
     ],
 )
 def test_evaluation_refuses(copied, capfd, arguments, message):

@@ -280,6 +280,26 @@ def test_a_learner_goes_on_from_its_state_bit_for_bit():
     assert torch.equal(ppo.learning_rate, other.learning_rate)
 
 
+def test_somebody_elses_critic_is_the_baseline():
+    """With a critic of a selector its values give the advantages, the actor learns and PPO's own critic does not."""
+
+    class Constant:
+        def value(self, obs):
+            return torch.full(obs.shape[:-1], 0.25)
+
+    env, ppo = small_learner()
+    rollout = filled(env, ppo)
+    batch, _ = ppo.batch(rollout, Constant())
+    assert (batch.value == 0.25).all()
+    before = [parameter.clone() for parameter in (*ppo.actor.parameters(), *ppo.critic.parameters())]
+    metrics = ppo.update(rollout, critic=Constant())
+    same = [torch.equal(a, b) for a, b in zip(before, (*ppo.actor.parameters(), *ppo.critic.parameters()), strict=True)]
+    actors = len(list(ppo.actor.parameters()))
+    assert not any(same[:actors])
+    assert all(same[actors:])
+    assert metrics["value_loss"] == 0.0
+
+
 def test_a_weight_that_is_not_finite_is_named():
     """The check names the weight."""
     _, ppo = small_learner()

@@ -52,12 +52,17 @@ FLAGS = (
 ).split()
 EARLY = 5  # iterations after which everything that can be lost has been in use
 
-# The command line itself, with another time between checkpoints and a bound on the size of a file.
+# The command line itself, with another time between checkpoints and a bound on the size of the files of iterations.
 DRIVER = """
 import resource, sys
 from deimos import cli, training
+
+def train(*arguments, original=training.train):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), -1))
+    return original(*arguments)
+
 training.CHECKPOINT_SECONDS = float(sys.argv[1])
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), -1))
+training.train = train
 sys.exit(cli.train(sys.argv[3:]))
 """
 
@@ -144,7 +149,7 @@ def undisturbed(tmp_path_factory):
 
 
 def test_the_run_exercises_the_director(undisturbed):
-    """The run that others are compared with has its full length, and its fear network learns from both classes early."""
+    """The run that others are compared with has its full length, and its fear network learns early."""
     table = rows(undisturbed)
     assert [int(row["iteration"]) for row in table] == list(range(1, CONFIG.iterations + 1))
     assert all(row["fear/auroc"] and row["fear/loss"] for row in table[EARLY:])
@@ -152,23 +157,21 @@ def test_the_run_exercises_the_director(undisturbed):
     assert checkpoint(undisturbed)["loop"]["selector"]["fear"]["fitted"]
 
 
-@pytest.mark.parametrize("checkpoint_seconds", [0.05, 1e9], ids=["between checkpoints", "before the first"])
+@pytest.mark.parametrize("checkpoint_seconds", [0.05, 1e9], ids=["between checkpoints", "at the first"])
 def test_resume_after_a_kill_is_exact(undisturbed, tmp_path, checkpoint_seconds):
     """Killed at a random iteration and resumed, a run ends as the undisturbed one did, bit for bit."""
     path = tmp_path / "run"
-    has_checkpoint = checkpoint_seconds < 1
+    least = EARLY if checkpoint_seconds < 1 else 0  # the first checkpoint is made before the first iteration
     count = random.randint(EARLY, 12)
 
     def ready():
-        if len(rows(path)) < count:
-            return False
-        return not has_checkpoint or ((path / "checkpoint.pt").exists() and checkpoint(path)["iteration"] >= EARLY)
+        return len(rows(path)) >= count and checkpoint(path)["iteration"] >= least
 
     code, stderr = send_when(start_process(path, checkpoint_seconds), signal.SIGKILL, ready)
     assert code == -signal.SIGKILL, stderr
     assert count <= len(rows(path)) < CONFIG.iterations
-    assert (path / "checkpoint.pt").exists() == has_checkpoint
-    if has_checkpoint:  # by the script itself
+    assert least <= checkpoint(path)["iteration"] <= len(rows(path))
+    if least:  # by the script itself
         command = [sys.executable, "train.py", "--resume", str(path)]
         subprocess.run(command, cwd=HOME, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True, capture_output=True)
     else:
@@ -371,6 +374,7 @@ def test_failed_write_keeps_the_last_checkpoint(tmp_path, break_disk):
 def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch):
     """A run that a full disk stopped at a checkpoint goes on from the last good one, bit for bit."""
     path = tmp_path / "run"
+    trainer, folder = training.start(CONFIG, path, None)
     synced = []
 
     def sync_twice(descriptor):
@@ -382,7 +386,7 @@ def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch)
         patch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(os, "fsync", sync_twice)
         with pytest.raises(RunError, match="No space left on device"):
-            run(CONFIG, path)
+            go_on(trainer, folder)
     assert checkpoint(path)["iteration"] == 2
     assert len(rows(path)) == 3
     resume(path)
@@ -390,7 +394,7 @@ def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch)
 
 
 def test_full_disk_is_one_line_on_the_command_line(undisturbed, tmp_path):
-    """Where no file can grow any more, the run ends with one line and exit code 2, whoever met it, and can go on."""
+    """Where no file can grow any more the run ends with one line and exit code 2, whoever met it, and can go on."""
     path = tmp_path / "run"
     process = start_process(path, 1e9, file_size=4096)  # TensorBoard's file is the first to reach it
     _, stderr = process.communicate(timeout=60)
@@ -435,6 +439,40 @@ def test_init_from_takes_weights_only(undisturbed, tmp_path):
     assert folder.read_json("config.json")["init_from"] == str(undisturbed)
     go_on(trainer, folder, iterations=1)
     assert [row["iteration"] for row in rows(folder.path)] == ["1"]
+
+
+def test_init_from_refuses_other_observations(undisturbed, tmp_path):
+    """Networks of the same size that have learnt to read other observations are refused, and no folder is made."""
+    config = replace(CONFIG, env=replace(CONFIG.env, variant="relative"))
+    with pytest.raises(RunError, match="do not fit this run"):
+        training.start(config, tmp_path / "run", undisturbed)
+    assert not (tmp_path / "run").exists()
+
+
+def test_run_that_cannot_begin_leaves_no_folder(tmp_path, monkeypatch):
+    """Where not even the configuration can be written, no half-made folder stays in the way of a second try."""
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", no_space)
+        with pytest.raises(RunError, match=r"could not be written \(.*No space left on device"):
+            training.start(CONFIG, tmp_path / "run", None)
+    assert not (tmp_path / "run").exists()
+    training.start(CONFIG, tmp_path / "run", None)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"env": replace(CONFIG.env, variant="absolute")},
+        {"env": replace(CONFIG.env, goal_period=CONFIG.env.goal_period + 1)},
+        {"method": "uniform", "selector": None},
+        {"num_envs": CONFIG.num_envs + 1},
+    ],
+    ids=["variant", "period", "selector", "worlds"],
+)
+def test_checkpoint_of_another_task_is_refused(undisturbed, other):
+    """The shapes of its tensors may fit; what it was made for must too."""
+    with pytest.raises(RunError, match="that of another environment or network size: it was made for"):
+        training.load(RunFolder.open(undisturbed), replace(CONFIG, **other))
 
 
 def test_init_from_refuses_another_size(undisturbed, tmp_path):
