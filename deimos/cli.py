@@ -256,8 +256,8 @@ def _evaluate_policy(folder: Any, env_config: Any, eval_config: Any, device: Any
     key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
     fresh = {tuple(row[name] for name in key) for row in rows}
     kept = [row for row in old if tuple(row.get(name) for name in key) not in fresh]
-    folder.write_json("evaluation.json", kept + rows)
     console.print_evaluation(rows)
+    folder.write_json("evaluation.json", kept + rows)
     return rows
 
 

@@ -52,7 +52,7 @@ def from_dict(cls: type, data: dict) -> Any:
     """Rebuild a dataclass from ``to_dict``.
 
     Raises:
-        ValueError: If a field is unknown or missing, or a value is not allowed.
+        ValueError: If a field is unknown or a value is not allowed. A missing field takes its default.
     """
     data = dict(data)
     if cls in _PLUGINS:

@@ -12,19 +12,21 @@ from types import ModuleType
 
 def names(package: ModuleType) -> list[str]:
     """Names of the plugins of ``package``, sorted: its public modules and the registered entry points."""
-    own = {module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_")}
-    return sorted(own | set(entry_points(group=package.__name__).names))
+    return sorted(_own(package) | set(entry_points(group=package.__name__).names))
+
+
+def _own(package: ModuleType) -> set[str]:
+    return {module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_")}
 
 
 def load(package: ModuleType, name: str) -> ModuleType:
-    """Import the plugin ``name`` of ``package``.
+    """Import the plugin ``name`` of ``package``; its own modules come before foreign ones of the same name.
 
     Raises:
         ValueError: If there is none; the message lists those that there are.
     """
     if name not in names(package):
         raise ValueError(f"{package.__name__} has no '{name}'; it has: {', '.join(names(package))}.")
-    foreign = entry_points(group=package.__name__, name=name)
-    if foreign:
-        return next(iter(foreign)).load()
-    return importlib.import_module(f"{package.__name__}.{name}")
+    if name in _own(package):
+        return importlib.import_module(f"{package.__name__}.{name}")
+    return next(iter(entry_points(group=package.__name__, name=name))).load()

@@ -216,7 +216,7 @@ class Trainer:
                 raise ValueError(f"it was made for {state['made_for']}, this run is {_identity(self.config)}.")
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
-        except (KeyError, ValueError, RuntimeError) as error:
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise RunError(f"The checkpoint is that of another environment or network size: {reason}") from error
         self.iteration = state["iteration"]
@@ -318,7 +318,7 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
         if layout != trainer.env.layout:
             raise ValueError(f"it observes {layout}, this one {trainer.env.layout}")
         trainer.ppo.load_weights(state["ppo"])
-    except (KeyError, RuntimeError, ValueError) as error:
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise RunError(f"The networks of {origin.path} do not fit this run: {reason}") from error
 

@@ -150,8 +150,9 @@ def copied(finished, tmp_path):
 
 
 @pytest.mark.parametrize("arguments", TRAIN_ERRORS)
-def test_training_refuses(here, capfd, arguments):
+def test_training_refuses(here, capfd, monkeypatch, arguments):
     """What cannot be trained gets one line that names it, exit code 2, and no file or folder is made."""
+    monkeypatch.setattr(training, "train", lambda *args: pytest.fail("trained all the same"))
     before = contents(here)
     assert re.search(TRAIN_ERRORS[arguments], refused(["train", *arguments.split()], capfd))
     assert contents(here) == before
