@@ -86,30 +86,28 @@ class ParticleStep:
 
 
 @wp.func
-def observed_goal(params: ParticleParams, target: wp.vec3, position: wp.vec3) -> wp.vec3:
+def observed_goal(
+    variant: int, position_scale: float, velocity_scale: float, target: wp.vec3, position: wp.vec3
+) -> wp.vec3:
     """The goal as the policy sees it."""
-    if params.variant == wp.static(int(Variant.DIRECTIONAL)):
-        return target * params.velocity_scale
-    if params.variant == wp.static(int(Variant.RELATIVE)):
-        return (target - position) * params.position_scale
-    return target * params.position_scale
+    if variant == wp.static(int(Variant.DIRECTIONAL)):
+        return target * velocity_scale
+    if variant == wp.static(int(Variant.RELATIVE)):
+        return (target - position) * position_scale
+    return target * position_scale
 
 
 @wp.func
-def goal_distance(params: ParticleParams, target: wp.vec3, position: wp.vec3, velocity: wp.vec3) -> float:
+def goal_distance(variant: int, target: wp.vec3, position: wp.vec3, velocity: wp.vec3) -> float:
     """Distance to the goal: of velocities [u/step] or of positions [u]."""
-    if params.variant == wp.static(int(Variant.DIRECTIONAL)):
+    if variant == wp.static(int(Variant.DIRECTIONAL)):
         return wp.length(velocity - target)
     return wp.length(position - target)
 
 
 @wp.func
-def write_obs(params: ParticleParams, state: ParticleState, env: int, obs: wp.array2d[float]):
-    """Write velocity, position, last action and goal, scaled."""
-    velocity = state.velocity[env] * params.velocity_scale
-    position = state.position[env] * params.position_scale
-    force = state.force[env] * params.force_scale
-    goal = observed_goal(params, state.target[env], state.position[env])
+def write_obs(env: int, velocity: wp.vec3, position: wp.vec3, force: wp.vec3, goal: wp.vec3, obs: wp.array2d[float]):
+    """Write velocity, position, last action and goal, all scaled already."""
     for i in range(3):
         obs[env, i] = velocity[i]
         obs[env, 3 + i] = position[i]
@@ -130,50 +128,89 @@ def is_outside(position: wp.vec3, half_side: float) -> wp.bool:
 
 
 @wp.func
+def is_finite(v: wp.vec3) -> wp.bool:
+    """True when every component is finite: inf - inf and nan - nan are nan. A third of the time of ``wp.isfinite``."""
+    zero = v - v
+    return zero[0] + zero[1] + zero[2] == 0.0
+
+
+@wp.func
 def find_broken(action: wp.vec3, velocity: wp.vec3, position: wp.vec3, target: wp.vec3) -> int:
     """One bit for each of BROKEN that is not finite."""
     broken = int(0)
-    if not wp.isfinite(action):
+    if is_finite((action - action) + (velocity - velocity) + (position - position) + (target - target)):
+        return broken  # one test where all is well
+    if not is_finite(action):
         broken = broken | 1
-    if not wp.isfinite(velocity):
+    if not is_finite(velocity):
         broken = broken | 2
-    if not wp.isfinite(position):
+    if not is_finite(position):
         broken = broken | 4
-    if not wp.isfinite(target):
+    if not is_finite(target):
         broken = broken | 8
     return broken
 
 
 @wp.kernel
-def _step_particles(params: ParticleParams, action: wp.array[wp.vec3], state: ParticleState, out: ParticleStep):
-    env = wp.tid()
-    # Judged before anything is clipped: a clipped NaN may come out as a bound.
-    broken = find_broken(action[env], state.velocity[env], state.position[env], state.target[env])
-    force = clamp3(action[env], params.max_force)
-    velocity = clamp3(state.velocity[env] + 0.5 * force, params.max_speed)
-    position = state.position[env] + velocity
-    state.force[env] = force
-    state.velocity[env] = velocity
-    state.position[env] = position
+def _step_particles(
+    # In
+    params: ParticleParams,
+    num_threads: int,
+    action: wp.array[wp.vec3],
+    target: wp.array[wp.vec3],
+    # In and out
+    position: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+    goal_clock: wp.array[int],
+    episode_step: wp.array[int],
+    count: wp.array[int],
+    fault: wp.array[int],
+    # Out
+    force: wp.array[wp.vec3],
+    obs: wp.array2d[float],
+    reward: wp.array[float],
+    terminated: wp.array[wp.bool],
+    truncated: wp.array[wp.bool],
+    goal_due: wp.array[wp.bool],
+    invalid: wp.array[wp.bool],
+):
+    # A grid-stride loop: on a GPU each thread has one particle; on a CPU, where Warp copies the arguments anew for
+    # every thread, one thread has them all.
+    for env in range(wp.tid(), action.shape[0], num_threads):
+        # Judged before anything is clipped: a clipped NaN may come out as a bound.
+        wanted = action[env]
+        aim = target[env]
+        v_before = velocity[env]
+        x_before = position[env]
+        broken = find_broken(wanted, v_before, x_before, aim)
+        f = clamp3(wanted, params.max_force)
+        v = clamp3(v_before + 0.5 * f, params.max_speed)
+        x = x_before + v
+        force[env] = f
+        velocity[env] = v
+        position[env] = x
 
-    crashed = is_outside(position, params.half_side)
-    distance = goal_distance(params, state.target[env], position, velocity)
-    out.reward[env] = shape_reward(params.reward_shape, distance, params.largest_distance, params.reward_length)
+        crashed = is_outside(x, params.half_side)
+        distance = goal_distance(params.variant, aim, x, v)
+        reward[env] = shape_reward(params.reward_shape, distance, params.largest_distance, params.reward_length)
 
-    state.goal_clock[env] = state.goal_clock[env] + 1
-    state.episode_step[env] = state.episode_step[env] + 1
-    goal_due = goal_is_due(state.goal_clock[env], params.goal_period)
-    truncated = time_is_up(state.episode_step[env], params.time_limit) and not crashed
-    out.terminated[env] = crashed
-    out.truncated[env] = truncated
-    out.goal_due[env] = goal_due
-    out.invalid[env] = broken != 0
-    count_events(goal_due, crashed or truncated, out.count)
-    if broken != 0:
-        wp.atomic_add(out.fault, 0, 1)
-        wp.atomic_min(out.fault, 1, env)
-        wp.atomic_or(out.fault, 2, broken)
-    write_obs(params, state, env, out.obs)
+        clock = goal_clock[env] + 1
+        age = episode_step[env] + 1
+        goal_clock[env] = clock
+        episode_step[env] = age
+        is_due = goal_is_due(clock, params.goal_period)
+        is_cut_off = time_is_up(age, params.time_limit) and not crashed
+        terminated[env] = crashed
+        truncated[env] = is_cut_off
+        goal_due[env] = is_due
+        invalid[env] = broken != 0
+        count_events(is_due, crashed or is_cut_off, count)
+        if broken != 0:
+            wp.atomic_add(fault, 0, 1)
+            wp.atomic_min(fault, 1, env)
+            wp.atomic_or(fault, 2, broken)
+        goal = observed_goal(params.variant, params.position_scale, params.velocity_scale, aim, x)
+        write_obs(env, v * params.velocity_scale, x * params.position_scale, f * params.force_scale, goal, obs)
 
 
 def step_particles(
@@ -198,11 +235,26 @@ def step_particles(
     require("action", action, dtype=wp.vec3)
     _require_state(state, action)
     _require_step(out, action)
+    num_threads = 1 if action.device.is_cpu else action.shape[0]
     return wp.launch(
         _step_particles,
-        dim=action.shape[0],
-        inputs=[params, action],
-        outputs=[state, out],
+        dim=num_threads,
+        inputs=[params, num_threads, action, state.target],
+        outputs=[
+            state.position,
+            state.velocity,
+            state.goal_clock,
+            state.episode_step,
+            out.count,
+            out.fault,
+            state.force,
+            out.obs,
+            out.reward,
+            out.terminated,
+            out.truncated,
+            out.goal_due,
+            out.invalid,
+        ],
         device=action.device,
         record_cmd=record,
     )
@@ -228,14 +280,18 @@ def _reset_particles(
     if params.stagger and episode == 0:
         u = uniform4(params.seed, wp.static(int(Purpose.RESET)), world, episode, 1, 0)
         clock = int(u[0] * float(params.goal_period))
-    state.position[env] = spawn * params.spawn_range
-    state.velocity[env] = wp.vec3(0.0)
-    state.force[env] = wp.vec3(0.0)
-    state.target[env] = wp.cw_mul(first, scale) * params.goal_range
+    position = spawn * params.spawn_range
+    target = wp.cw_mul(first, scale) * params.goal_range
+    zero = wp.vec3(0.0)
+    state.position[env] = position
+    state.velocity[env] = zero
+    state.force[env] = zero
+    state.target[env] = target
     state.goal_clock[env] = clock
     state.episode_step[env] = 0
     state.episode_count[env] = episode + 1
-    write_obs(params, state, env, obs)
+    goal = observed_goal(params.variant, params.position_scale, params.velocity_scale, target, position)
+    write_obs(env, zero, position * params.position_scale, zero, goal, obs)
 
 
 def reset_particles(
@@ -294,7 +350,7 @@ def _set_goals(
     state.target[env] = target
     state.goal_clock[env] = 0
     state.goal_count[env] = state.goal_count[env] + 1
-    seen = observed_goal(params, target, state.position[env])
+    seen = observed_goal(params.variant, params.position_scale, params.velocity_scale, target, state.position[env])
     for k in range(3):
         obs[env, wp.static(GOAL_START) + k] = seen[k]
 
