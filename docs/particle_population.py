@@ -114,7 +114,9 @@ def print_tables(root: Path) -> None:
             }
             rate, score = column["crashes_per_1000"], column["score"]
             score_cell = f"{np.median(score):.3f} ({score.min():.3f}-{score.max():.3f})"
-            auroc = f"{np.median([r[1]['adversary_auroc'] for r in runs]):.3f}" if i else ""
+            aurocs = [np.nan if r[1]["adversary_auroc"] is None else r[1]["adversary_auroc"] for r in runs]
+            weak = sum(r[1]["weak_adversary"] for r in runs)
+            auroc = f"{np.nanmedian(aurocs):.3f}{f' ({weak} of {len(runs)} weak)' if weak else ''}" if i else ""
             print(f"| {variant} | {method} | {goals} | {np.median(rate):.3f} ({rate.min():.3f}-{rate.max():.3f}) "
                   f"| {np.median(column['crash_rate']):.4f} | {score_cell} "
                   f"| {np.median(column['reward']):.4f} | {auroc} |")  # fmt: skip
