@@ -145,7 +145,7 @@ def _train_options() -> type:
                 help="Folder of the run, which must not exist. By default runs/ENV-METHOD-sSEED-TIME."
             )], field(default=None)),
             ("resume", Annotated[Path | None, tyro.conf.arg(
-                help="Go on with the run in this folder from its last checkpoint; takes only --env-steps beside it."
+                help="Go on with the run in this folder from its last checkpoint; takes only --env-steps and --device."
             )], field(default=None)),
             ("init_from", Annotated[Path | None, tyro.conf.arg(
                 help="Start with the networks of the run in this folder."

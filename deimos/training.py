@@ -122,6 +122,17 @@ def one_stream(device: torch.device) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch's CPU operations on the calling thread: waking another for small ones costs more than it saves."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def cores() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -144,6 +155,10 @@ class Trainer:
 
     def collect(self) -> None:
         """Let the policy act for one rollout."""
+        with one_thread():
+            self._collect()
+
+    def _collect(self) -> None:
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
         rollout.noise.normal_(generator=ppo.generator)
         clock = _Clock(self)
@@ -176,7 +191,8 @@ class Trainer:
             learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
             self.ppo.check()
             clock.lap("update")
-            selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
+            with one_thread():
+                selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
             self.loop.selector.check()
             clock.lap("selector")
         except SimulationError as error:
