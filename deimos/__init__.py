@@ -6,7 +6,7 @@ from typing import Any
 
 from deimos._version import __version__
 
-__all__ = ["__version__", "load_policy"]
+__all__ = ["GoalDirector", "__version__", "load_policy"]
 
 # ``kernels`` and ``terrain`` are names that other distributions use too. A foreign one first on the path
 # would fail much later and obscurely, so it is refused here.
@@ -26,4 +26,8 @@ def __getattr__(name: str) -> Any:
         from deimos.policy import load_policy
 
         return load_policy
+    if name == "GoalDirector":
+        from deimos.goal_director import GoalDirector
+
+        return GoalDirector
     raise AttributeError(f"module 'deimos' has no attribute '{name}'")

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from deimos import seeds
 from deimos.env import Env
 from deimos.fear import Fear, auroc
 from deimos.run_folder import RunError
@@ -47,7 +48,7 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
     fear = getattr(trainer.loop.selector, "fear", None)
     if not isinstance(fear, Fear) or not fear.fitted:
         raise RunError("This run's selector has no fear network that has learnt anything.")
-    generator = torch.Generator(trainer.env.device).manual_seed(trainer.config.seed)
+    generator = seeds.generator(trainer.config.seed, "audit", trainer.env.device)
     probe = trainer.config.env.build(BATCH * CANDIDATES, trainer.env.device, trainer.config.seed)
     ranks: list[float] = []
     crashes = tried = 0

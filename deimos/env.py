@@ -42,6 +42,9 @@ class Step:
     """True where the state is not physical any more, bool, shape (num_envs,)."""
     count: Tensor
     """Worlds with a goal due that are not done, and worlds that are done, int32, shape (2,)."""
+    tracking: Tensor | None = None
+    """How well each group of goal components is met, in [0, 1], float32, shape (num_envs, len(goal_groups));
+    ``None`` where there is one group and the reward itself says it."""
 
 
 class EnvConfig(abc.ABC):
@@ -90,6 +93,8 @@ class Env(abc.ABC):
     """Steps after which an episode is truncated; 0 for never."""
     obs: Tensor
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
+    goal_groups: tuple[slice, ...] = (slice(None),)
+    """Components of a goal that are met or missed together."""
     episode_step: Tensor
     """Steps since the last reset, int32, shape (num_envs,); a view."""
     tensors: dict[str, Tensor]

@@ -8,19 +8,20 @@ from torch import Tensor, nn
 from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Resolved
-from deimos.networks import Activation, Backprop, activate_, fast_linear, flatten_parameters, mlp, rows_in_cache
+from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
 from deimos.ranks import mean_over_ranks
+from deimos.seeds import generator, weights_from
 
 
 @dataclass(frozen=True, kw_only=True)
 class FearConfig:
     """The fear network and how it learns (thesis, 4.2)."""
 
-    hidden: tuple[int, ...] = (32, 32)
+    hidden: tuple[int, ...] = (64,)
     """Units of the hidden layers."""
     activation: Activation = "relu"
     """Between the layers."""
-    learning_rate: float = 3e-3
+    learning_rate: float = 1e-2
     """Step size of Adam, positive."""
     epochs: int = 1
     """Passes over the window of interactions in every fit, at least 1."""
@@ -29,8 +30,7 @@ class FearConfig:
     min_per_class: int = 32
     """Crashes and survivals that the window must hold before a fit, at least 1."""
     workspace: int = 64
-    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. A CPU takes
-    parts of 1.5 MiB, which fit its caches."""
+    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts."""
 
     def __post_init__(self) -> None:
         check_hidden("hidden", self.hidden)
@@ -53,16 +53,17 @@ class Fear:
 
     def __init__(self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int) -> None:
         self.config = config
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+        with weights_from(seed, "fear weights"):
             self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation).to(device)
         self._parameters, _ = flatten_parameters(self.network)
         self._pass = Backprop(self.network)
+        self._candidates = ManyCandidates(self.network, goal_dim, config.workspace)
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
-        self.generator = torch.Generator(device)
-        self.generator.manual_seed(seed)
+        self.generator = generator(seed, "fear minibatches", device)
         self.fitted = False
         """Whether it has learnt anything yet; before, its ranking of goals would be an arbitrary bias."""
+        self.share = 0.5
+        """Share of crashes in the data of the last fit, in (0, 1); calibration takes it back."""
 
     @torch.no_grad()
     def fit(self, data: Resolved, epochs: int | None = None) -> float:
@@ -81,7 +82,7 @@ class Fear:
         crashes = int(data.crashed.sum())
         if min(crashes, len(data) - crashes) < self.config.min_per_class:
             return float("nan")
-        share = mean_over_ranks(data.crashed.float().mean()).item()
+        self.share = share = mean_over_ranks(data.crashed.float().mean()).item()
         weight = torch.where(data.crashed, 0.5 / share, 0.5 / (1.0 - share)) / len(data)
         inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
         target = data.crashed.float()
@@ -107,12 +108,8 @@ class Fear:
         self.optimizer.step()
         return nn.functional.binary_cross_entropy_with_logits(logit, target, weight, reduction="sum")
 
-    @torch.no_grad()
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Logits of crashing for many candidates per decision.
-
-        The first layer is linear, so it is the sum of one product with (state, goal) and one with the
-        next goal: for N candidates of one decision the first is computed once, not N times.
 
         Args:
             state: States, shape (B, state_dim).
@@ -120,24 +117,9 @@ class Fear:
             candidates: Possible next goals, shape (B, N, goal_dim).
 
         Returns:
-            Logits, shape (B, N); the same for any workspace, up to the rounding of float32 products.
+            Logits, shape (B, N); see ``ManyCandidates``.
         """
-        count, goal_dim = candidates.shape[1:]
-        first, *others = [layer for layer in self.network.children() if isinstance(layer, nn.Linear)]
-        own = first.weight[:, :-goal_dim]
-        new = first.weight[:, -goal_dim:].t().expand(len(candidates), -1, -1)
-        context = nn.functional.linear(torch.cat([state, goal], dim=1), own, first.bias).unsqueeze(1)
-        rows = self.config.workspace * 2**20 // (8 * max(self.config.hidden))  # a layer's input and output
-        if candidates.device.type == "cpu":
-            rows = min(rows, rows_in_cache(max(self.config.hidden)))
-        size = max(1, rows // count)
-        logits = []
-        for part_context, part in zip(context.split(size), candidates.split(size), strict=True):
-            x = torch.baddbmm(part_context, part, new[: len(part)]).flatten(0, 1)
-            for layer in others:
-                x = fast_linear(activate_(x, self.network[1]), layer.weight, layer.bias)
-            logits.append(x.view(-1, count))
-        return logits[0] if len(logits) == 1 else torch.cat(logits)
+        return self._candidates(torch.cat([state, goal], dim=1), candidates).squeeze(2)
 
     def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
@@ -151,6 +133,7 @@ class Fear:
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "fitted": self.fitted,
+            "share": self.share,
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -158,7 +141,7 @@ class Fear:
         self.network.load_state_dict(state["network"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
-        self.fitted = state["fitted"]
+        self.fitted, self.share = state["fitted"], state["share"]
 
 
 def auroc(score: Tensor, positive: Tensor) -> float:

@@ -8,9 +8,12 @@ from deimos.interactions import Interactions
 from deimos.selector import GoalSelector, Spaces
 
 
-def spaces(env: Env) -> Spaces:
-    """What a selector needs to know about ``env``."""
-    return Spaces(env.num_envs, env.state_dim, env.goal_dim, env.goal_period, env.device)
+def spaces(env: Env, total_steps: int = 0) -> Spaces:
+    """What a selector needs to know about ``env`` and, where it is known, how long the training is."""
+    return Spaces(
+        num_envs=env.num_envs, state_dim=env.state_dim, goal_dim=env.goal_dim, goal_period=env.goal_period,
+        device=env.device, groups=env.goal_groups, goal_start=env.goal_slice.start, total_steps=total_steps,
+    )  # fmt: skip
 
 
 class GoalLoop:
@@ -26,8 +29,9 @@ class GoalLoop:
         self.env = env
         self.selector = selector
         self.interactions = Interactions(
-            env.num_envs, env.state_dim, env.goal_dim, env.goal_period, window or 2 * env.goal_period, env.device
-        )
+            env.num_envs, env.state_dim, env.goal_dim, env.goal_period, window or 2 * env.goal_period, env.device,
+            groups=0 if env.goal_groups == (slice(None),) else len(env.goal_groups),
+        )  # fmt: skip
         self.learn = torch.ones(env.num_envs, device=env.device)
         """1 where the learner may use the transitions under the goal in force, else 0, shape (num_envs,)."""
         if selector.first_goals_scaled:  # the goals that the environment was built with are not
@@ -62,8 +66,10 @@ class GoalLoop:
         state, goal = env.state(obs), obs[:, env.goal_slice]
         candidates = env.sample_goals(rows, selector.num_candidates, selector.goal_range())
         proposal = selector.propose(rows, state, goal, candidates, env.draw(rows))
-        self.interactions.open(rows, state, goal, proposal.goal, proposal.score)
-        self.learn[rows] = proposal.learn.float()
+        self.interactions.open(
+            rows, state, goal, proposal.goal, proposal.score, probe=proposal.probe, note=proposal.note
+        )
+        self.learn[rows] = 1.0 if proposal.learn is None else proposal.learn.float()
         env.set_goals(rows, proposal.goal)
 
     def _reset(self, mask: Tensor) -> None:

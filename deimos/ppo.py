@@ -18,6 +18,7 @@ from deimos.env import Env
 from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
+from deimos.seeds import generator, weights_from
 from deimos.selector import Critic
 
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # what the adaptive schedule may reach; rsl_rl's
@@ -126,6 +127,38 @@ def advantages(
     return advantage
 
 
+def value_gradient(
+    value: Tensor, old_value: Tensor, returns: Tensor, weight: Tensor, *, clip: float, coef: float
+) -> tuple[Tensor, Tensor]:
+    """The clipped value loss and its gradient by the value.
+
+    Where the value has moved too far and clipping makes the loss larger, the clipped loss counts,
+    and that one is flat. Inside the clip both are the same but for rounding, which must not decide.
+
+    Args:
+        value: Values, shape (..., n).
+        old_value: Values before the update, same shape.
+        returns: Their targets, same shape.
+        weight: Share of every row in the average, same shape.
+        clip: How far a value may move, positive; infinite for the plain squared error.
+        coef: What the gradient is multiplied by.
+
+    Returns:
+        The loss, shape (...), without ``coef``; and its gradient, shape (..., n), with it.
+    """
+    error = value - returns
+    loss = error.square()
+    grad = error * weight * (2.0 * coef)
+    if not math.isinf(clip):
+        step = value - old_value
+        inside = step.abs() <= clip
+        step.clamp_(-clip, clip)
+        clipped = (old_value + step).sub_(returns).square_()
+        grad *= inside | (loss >= clipped)
+        loss = torch.maximum(loss, clipped)
+    return (loss * weight).sum(-1), grad
+
+
 @dataclass(frozen=True)
 class Batch:
     """Transitions to learn from, one per row; small vectors lie along the first axis (see ``_policy_gradient``)."""
@@ -175,14 +208,12 @@ class PPO:
             )
         self.config = config
         self._size = rows // config.minibatches
-        with torch.random.fork_rng(devices=[]):  # weights depend on the seed alone
-            torch.manual_seed(seed)
+        with weights_from(seed, "policy weights"):
             self.actor = Actor(env.obs_dim, config.hidden, env.action_dim, config.activation, config.init_std)
             self.critic = mlp(env.obs_dim, config.hidden, 1, config.activation)
         self.actor.to(env.device)
         self.critic.to(env.device)
-        self.generator = torch.Generator(env.device)
-        self.generator.manual_seed(seed)
+        self.generator = generator(seed, "policy noise", env.device)
         self._parameters, self._grads = flatten_parameters(self.actor, self.critic)
         self.learning_rate = torch.tensor(config.learning_rate, device=env.device)
         self.optimizer = Adam(self._parameters, self.learning_rate)
@@ -265,6 +296,7 @@ class PPO:
             rollout.reward * config.reward_scale, value[:-1], next_value, rollout.terminated, rollout.truncated,
             discount=config.discount, gae_lambda=config.gae_lambda,
         )  # fmt: skip
+        rollout.advantage.copy_(advantage)
         returns = advantage + value[:-1]
         weight = rollout.weight
         total = weight.sum()
@@ -306,7 +338,10 @@ class PPO:
             losses[1] += surrogate_loss
             if learn_value:
                 value = self._critic_pass.forward(piece.obs).squeeze(1)
-                value_loss, grad_value = self._value_gradient(piece, value)
+                value_loss, grad_value = value_gradient(
+                    value, piece.value, piece.returns, piece.weight,
+                    clip=config.clip if config.clip_value else math.inf, coef=config.value_coef,
+                )  # fmt: skip
                 self._critic_pass.backward(grad_value.unsqueeze(1))
                 losses[0] += value_loss
             moved += (mean - piece.mean).square_() @ piece.weight
@@ -342,24 +377,6 @@ class PPO:
         grad_mean = z.mul_(slope).div_(std)
         grad_std = (squares.sub_(1.0) @ slope) / self.actor.std
         return torch.maximum(plain, clipped) @ batch.weight, grad_mean, grad_std
-
-    def _value_gradient(self, batch: Batch, value: Tensor) -> tuple[Tensor, Tensor]:
-        """The value loss and its gradient by the value.
-
-        Where the value has moved too far and clipping makes the loss larger, the clipped loss counts,
-        and that one is flat. Inside the clip both are the same but for rounding, which must not decide.
-        """
-        error = value - batch.returns
-        loss = error.square()
-        grad = error * batch.weight * (2.0 * self.config.value_coef)
-        if self.config.clip_value:
-            step = value - batch.value
-            inside = step.abs() <= self.config.clip
-            step.clamp_(-self.config.clip, self.config.clip)
-            clipped = (batch.value + step).sub_(batch.returns).square_()
-            grad *= inside | (loss >= clipped)
-            loss = torch.maximum(loss, clipped)
-        return loss @ batch.weight, grad
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Divide by 1.5 above twice the desired divergence, multiply below half of it; no host round trip."""

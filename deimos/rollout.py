@@ -13,9 +13,13 @@ class Rollout:
     that the next rollout starts from. Where an episode ended, ``obs[t + 1]`` is the one after the reset.
     """
 
-    def __init__(self, env: Env, num_steps: int) -> None:
+    def __init__(
+        self, env: Env, num_steps: int, *, discount: float = 0.99, gae_lambda: float = 0.95, reward_scale: float = 1.0
+    ) -> None:
         n, device = env.num_envs, env.device
         self.num_steps = num_steps
+        self.discount, self.gae_lambda, self.reward_scale = discount, gae_lambda, reward_scale
+        # The learner's: whoever estimates values beside it must mean the same by them.
         self.obs = torch.zeros(num_steps + 1, n, env.obs_dim, device=device)
         self.action = torch.zeros(num_steps, n, env.action_dim, device=device)
         self.mean = torch.zeros(num_steps, n, env.action_dim, device=device)
@@ -27,6 +31,8 @@ class Rollout:
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.final_obs = torch.zeros(num_steps if env.time_limit else 0, n, env.obs_dim, device=device)
         """Observations that the steps ended in, before any reset; kept only where episodes can be truncated."""
+        self.advantage = torch.zeros(num_steps, n, device=device)
+        """Advantages in units of scaled rewards, before they are normalised; the learner fills them in."""
         self.weight = torch.ones(num_steps, n, device=device)
         """Weight of the transition in everything learnt: 0 leaves it out."""
 

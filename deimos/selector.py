@@ -25,6 +25,29 @@ class Spaces:
     """T: steps that a goal is in force."""
     device: torch.device
     """Where the tensors lie."""
+    groups: tuple[slice, ...] = (slice(None),)
+    """Components of a goal that are met or missed together; ``Resolved.tracking`` has one column for each."""
+    goal_start: int | None = None
+    """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
+    total_steps: int = 0
+    """Steps of the whole training; 0 where nobody knows."""
+
+    def state_then_goal(self, obs: Tensor) -> Tensor:
+        """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""
+        if self.goal_start is None or self.goal_start == self.state_dim:
+            return obs
+        start, stop = self.goal_start, self.goal_start + self.goal_dim
+        return torch.cat([obs[..., :start], obs[..., stop:], obs[..., start:stop]], dim=-1)
+
+    def require_total_steps(self, who: str) -> int:
+        """``total_steps``, for those who cannot do without.
+
+        Raises:
+            ValueError: If nobody knows it; ``who`` names the selector.
+        """
+        if self.total_steps < 1:
+            raise ValueError(f"{who} changes over the training, so Spaces.total_steps must be its steps, got 0.")
+        return self.total_steps
 
 
 @dataclass(frozen=True)
@@ -35,8 +58,12 @@ class Proposal:
     """Shape (B, goal_dim)."""
     score: Tensor
     """What the selector thinks of each, NaN where it has no opinion, shape (B,)."""
-    learn: Tensor
-    """Whether the learner may use what follows, bool, shape (B,)."""
+    learn: Tensor | None = None
+    """Whether the learner may use what follows, bool, shape (B,); ``None`` for everywhere."""
+    probe: Tensor | None = None
+    """True where the goal was drawn uniformly, whatever its score, bool, shape (B,); ``None`` for nowhere."""
+    note: Tensor | None = None
+    """A whole number that comes back with the interaction, int64 below 2^24, shape (B,); ``None`` for 0."""
 
 
 class Critic(Protocol):
@@ -65,6 +92,8 @@ class GoalSelector(abc.ABC):
 
     num_candidates: int = 1
     """Candidates that it wants to choose from at every decision."""
+    needs_rollout: bool = False
+    """Whether ``learn`` needs the learner's transitions."""
     first_goals_scaled: bool = False
     """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
 
@@ -94,7 +123,8 @@ class GoalSelector(abc.ABC):
 
         Args:
             interactions: The pending and the recently resolved ones.
-            rollout: The transitions since the last call; ``None`` in a loop that keeps none.
+            rollout: The transitions since the last call; ``None`` in a loop that keeps none, where
+                selectors that learn from transitions raise ``ValueError``.
 
         Returns:
             Numbers for the log, the same keys every time.

@@ -41,8 +41,8 @@ class TrainConfig:
     env: EnvConfig = field(default_factory=particle.Config)
     """The environment."""
     method: str | None = None
-    """Who chooses the goals, by name: uniform, coop, p10, p25, p50, p75, p90, antagonist. By default p25;
-    or leave it out and set up a selector."""
+    """Who chooses the goals, by name (docs/selectors.md explains them all): uniform, coop, p10, p25, p50, p75, p90,
+    antagonist, rnd, vds, cl, vds+p75, ... By default p25; or leave it out and set up a selector."""
     selector: SelectorConfig | None = None
     """Who chooses the goals, in detail."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -144,9 +144,13 @@ class Trainer:
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.config = config
         self.env = config.env.build(config.num_envs, device, config.seed)
-        self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env), config.seed))
+        total_steps = config.iterations * config.ppo.num_steps
+        self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
         self.ppo = PPO(config.ppo, self.env, config.seed)
-        self.rollout = Rollout(self.env, config.ppo.num_steps)
+        self.rollout = Rollout(
+            self.env, config.ppo.num_steps, discount=config.ppo.discount, gae_lambda=config.ppo.gae_lambda,
+            reward_scale=config.ppo.reward_scale,
+        )  # fmt: skip
         self.iteration = 0
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
         """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""

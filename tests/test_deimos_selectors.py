@@ -3,16 +3,15 @@
 import pytest
 import torch
 
-from deimos import plugins, selectors
+from deimos import picks, plugins, selectors
 from deimos.envs import particle
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.interactions import Interactions
 from deimos.methods import METHODS, method
 from deimos.selector import Spaces
 from deimos.selectors import director, uniform
-from deimos.selectors.director import pick_by_rule
 
-SPACES = Spaces(num_envs=40, state_dim=9, goal_dim=3, goal_period=5, device=torch.device("cpu"))
+SPACES = Spaces(num_envs=40, state_dim=9, goal_dim=3, goal_period=5, device=torch.device("cpu"), total_steps=96)
 ALL = {name: plugins.load(selectors, name).Config() for name in plugins.names(selectors)} | METHODS
 
 
@@ -35,7 +34,7 @@ def fitted(config, seed=0):
         interactions.open(rows, torch.randn(40, 9, generator=generator), goal, goal, torch.zeros(40))
         interactions.now += 4
         interactions._marks[rows, interactions._cursor % interactions._slots] = torch.stack(
-            [(goal[:, 0] > 0).long(), interactions._issued, torch.full((40,), interactions.now)], dim=1
+            [(goal[:, 0] > 0).long(), interactions.issued_at, torch.full((40,), interactions.now)], dim=1
         )
         interactions._ring[rows, interactions._cursor % interactions._slots] = interactions._pending
         interactions._cursor += 1
@@ -112,7 +111,7 @@ def test_the_bucket_holds_k_of_n(percentile, kept):
     """Over all draws exactly the k = max(1, N - floor(p N / 100)) highest scores are picked, each equally often."""
     score = torch.randn(1, 100, generator=torch.Generator().manual_seed(0)).expand(1000, -1)
     draw = (torch.arange(1000) + 0.5) / 1000
-    pick = pick_by_rule(score, draw, "percentile", percentile)
+    pick = picks.by_rule(score, draw, "percentile", percentile)
     assert set(pick.tolist()) == set(score[0].topk(kept).indices.tolist())
     counts = torch.bincount(pick, minlength=100)
     assert counts.max() - counts[counts > 0].min() <= 1
@@ -123,10 +122,10 @@ def test_ties_at_the_edge_keep_the_bucket_exact():
     score = torch.zeros(1, 100)
     score[0, [3, 60]] = 1.0
     draw = (torch.arange(1000) + 0.5) / 1000
-    picked = set(pick_by_rule(score.expand(1000, -1), draw, "percentile", 90).tolist())
+    picked = set(picks.by_rule(score.expand(1000, -1), draw, "percentile", 90).tolist())
     assert len(picked) == 10
     assert {3, 60} <= picked
-    assert len(set(pick_by_rule(torch.zeros(1000, 100), draw, "percentile", 25).tolist())) == 75
+    assert len(set(picks.by_rule(torch.zeros(1000, 100), draw, "percentile", 25).tolist())) == 75
 
 
 def test_coop_and_antagonist_take_the_ends():
@@ -139,7 +138,7 @@ def test_coop_and_antagonist_take_the_ends():
         assert torch.equal(chosen.goal, arguments[3][torch.arange(40), pick(score, 1)])
         torch.testing.assert_close(chosen.score, score.amin(1) if name == "coop" else score.amax(1))
     score = torch.randn(20, 100)
-    assert torch.equal(pick_by_rule(score, torch.rand(20), "percentile", 100), score.argmax(1))
+    assert torch.equal(picks.by_rule(score, torch.rand(20), "percentile", 100), score.argmax(1))
 
 
 def test_a_higher_percentile_is_more_frightening():
@@ -155,7 +154,7 @@ def test_a_large_logit_still_ranks():
     """Scores where a float32 sigmoid is exactly 1 are still told apart."""
     score = torch.tensor([[18.0, 25.0, 21.0]])
     assert (torch.sigmoid(score) == 1.0).all()
-    assert pick_by_rule(score, torch.tensor([0.5]), "argmax", 0).item() == 1
+    assert picks.by_rule(score, torch.tensor([0.5]), "argmax", 0).item() == 1
 
 
 @pytest.mark.parametrize(

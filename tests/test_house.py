@@ -50,7 +50,7 @@ class Longest(GoalSelector):
         score = candidates.norm(dim=2)
         best = score.argmax(dim=1)
         every = torch.arange(len(rows), device=rows.device)
-        return Proposal(candidates[every, best], score[every, best], torch.ones_like(rows, dtype=torch.bool))
+        return Proposal(candidates[every, best], score[every, best])
 '''
 
 

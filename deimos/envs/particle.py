@@ -184,7 +184,7 @@ class Particle(Env):
         self.episode_step = self.tensors["episode_step"]
         self._fault = out["fault"].tensor
         self._clear_faults()
-        self._step = Step(**{name: out[name].tensor for name in Step.__dataclass_fields__})
+        self._step = Step(**{name: out[name].tensor for name in Step.__dataclass_fields__ if name in out})
         self.action = Shared.zeros(n, wp.vec3, device)
         self._mask = Shared.zeros(n, wp.bool, device)
         self._row = Shared.zeros(n, wp.int32, device)

@@ -37,4 +37,4 @@ class Uniform(GoalSelector):
         pick = (draws[:, 0] * count).long().clamp(max=count - 1)
         chosen = candidates.gather(1, pick.view(-1, 1, 1).expand(-1, 1, candidates.shape[2])).squeeze(1)
         no_opinion = torch.full_like(draws[:, 0], torch.nan)
-        return Proposal(chosen, no_opinion, torch.ones_like(pick, dtype=torch.bool))
+        return Proposal(chosen, no_opinion)

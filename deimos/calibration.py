@@ -1,0 +1,148 @@
+"""From a fear network's logits to probabilities, and how good probabilities are."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+TEMPERATURES = (0.1, 10.0)  # range of a temperature; outside, the scores are not logits of anything
+BINS = 15
+
+
+class Calibration:
+    """Turns logits of a class-balanced classifier into probabilities.
+
+    Class weights n / (2 n_class) multiply the odds that a classifier learns by (1 - pi) / pi, with pi the
+    share of crashes; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What is left is a
+    matter of over- and underfitting, which one temperature on held-out data repairs [2]_.
+
+    Attributes:
+        prior: log(pi / (1 - pi)).
+        temperature: What corrected logits are divided by, in ``TEMPERATURES``.
+
+    References:
+        .. [1] Elkan, *The Foundations of Cost-Sensitive Learning*, IJCAI 2001, theorem 2.
+        .. [2] Guo et al., *On Calibration of Modern Neural Networks*, ICML 2017, section 4.2. arXiv:1706.04599
+    """
+
+    def __init__(self) -> None:
+        self.prior = 0.0
+        self.temperature = 1.0
+
+    def logit(self, score: Tensor) -> Tensor:
+        """Log odds of a crash, same shape.
+
+        Args:
+            score: Logits of the class-balanced classifier, any shape.
+        """
+        return (score + self.prior) / self.temperature
+
+    def probability(self, score: Tensor) -> Tensor:
+        """Probability of a crash, in (0, 1); the arguments are those of ``logit``."""
+        return torch.sigmoid(self.logit(score))
+
+    def set_share(self, share: float) -> None:
+        """Take over the share of crashes, in (0, 1), that the class weights were made from."""
+        self.prior = math.log(share / (1.0 - share))
+
+    def fit(self, score: Tensor, crashed: Tensor, steps: int = 3) -> None:
+        """Move the temperature towards the least log-loss on interactions that the network has not learnt from.
+
+        The loss is convex in 1 / temperature, so Newton's method from the last one tracks it.
+
+        Args:
+            score: Logits as they were at issue, shape (n,).
+            crashed: What became of them, bool, shape (n,); both classes.
+            steps: Newton steps, at least 1.
+        """
+        z, y = (score + self.prior).double(), crashed.double()
+        inverse = torch.tensor(1.0 / self.temperature, dtype=torch.float64, device=score.device)
+        for _ in range(steps):
+            p = torch.sigmoid(inverse * z)
+            slope = ((p - y) * z).mean()
+            curvature = (p * (1 - p) * z * z).mean() + 1e-6
+            # Far from the optimum the loss is flat: no step may change the temperature more than twofold.
+            inverse = (inverse - slope / curvature).clamp(min=0.5 * inverse, max=2.0 * inverse)
+        low, high = TEMPERATURES
+        self.temperature = min(max(1.0 / inverse.item(), low), high)
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs."""
+        return {"prior": self.prior, "temperature": self.temperature}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from ``state_dict()``."""
+        self.prior, self.temperature = state["prior"], state["temperature"]
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """A reliability curve: equally many predictions per bin, in rising order."""
+
+    predicted: Tensor
+    """Mean prediction of every bin, shape (bins,)."""
+    observed: Tensor
+    """Share of crashes in every bin, shape (bins,)."""
+    count: Tensor
+    """Predictions in every bin, int64, shape (bins,)."""
+
+
+def reliability(probability: Tensor, crashed: Tensor, bins: int = BINS) -> Reliability:
+    """Predicted against observed crash rates.
+
+    Equal-mass bins: where crashes are rare nearly all predictions share one of the bins of equal width.
+
+    Args:
+        probability: Predictions in [0, 1], shape (n,), n at least 1.
+        crashed: What became of them, bool, shape (n,).
+        bins: Bins; fewer where there are fewer predictions.
+    """
+    n = len(probability)
+    bins = min(bins, n)
+    order = probability.argsort()
+    index = torch.arange(n, device=order.device) * bins // n
+    count = torch.bincount(index, minlength=bins)
+    predicted = torch.bincount(index, probability[order].double(), minlength=bins) / count
+    observed = torch.bincount(index, crashed[order].double(), minlength=bins) / count
+    return Reliability(predicted, observed, count)
+
+
+def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
+    """How good predicted probabilities are.
+
+    Args:
+        probability: Predictions in [0, 1], shape (n,).
+        crashed: What became of them, bool, shape (n,).
+
+    Returns:
+        ``brier``, the mean squared error, and its parts over equal-mass bins [1]_: ``reliability`` (0 is
+        perfect), ``resolution`` (more is better) and ``uncertainty``; brier = reliability - resolution +
+        uncertainty up to the spread within bins. ``ece``, the expected calibration error over the same bins;
+        ``log_loss_skill``, 1 - loss / (loss of predicting the base rate): 0 knows nothing, 1 everything.
+        ``top_decile_gap``: predicted minus observed rate where the predictions are highest, which is what a
+        gate at run time sees. NaN where there is nothing to judge, for the skill also where a class is empty.
+
+    References:
+        .. [1] Murphy, *A New Vector Partition of the Probability Score*, J. Appl. Meteorology 12, 1973.
+    """
+    names = ("brier", "reliability", "resolution", "uncertainty", "ece", "log_loss_skill", "top_decile_gap")
+    if len(probability) == 0:
+        return dict.fromkeys(names, math.nan)
+    p, y = probability.double(), crashed.double()
+    rate = y.mean()
+    curve = reliability(p, crashed)
+    share = curve.count / len(p)
+    base = nn.functional.binary_cross_entropy(rate.expand_as(y), y)
+    loss = nn.functional.binary_cross_entropy(p, y)
+    top = p.topk(max(1, len(p) // 10)).indices
+    values = torch.stack([
+        (p - y).square().mean(),
+        (share * (curve.predicted - curve.observed).square()).sum(),
+        (share * (curve.observed - rate).square()).sum(),
+        rate * (1 - rate),
+        (share * (curve.predicted - curve.observed).abs()).sum(),
+        torch.where(base > 0, 1 - loss / base, torch.nan),
+        p[top].mean() - y[top].mean(),
+    ])  # fmt: skip
+    return dict(zip(names, values.tolist(), strict=True))

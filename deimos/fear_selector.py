@@ -1,0 +1,138 @@
+"""What every selector that ranks candidates by fear has in common."""
+
+import abc
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from deimos import picks
+from deimos.calibration import Calibration, judge
+from deimos.checks import check_at_least, check_choice, check_range
+from deimos.fear import Fear, FearConfig, auroc
+from deimos.interactions import Interactions, Resolved
+from deimos.rollout import Rollout
+from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
+
+
+@dataclass(frozen=True, kw_only=True)
+class FearSelectorConfig(SelectorConfig):
+    """A fear network scores uniform candidates; a rule picks one."""
+
+    candidates: int = 100
+    """N: uniform candidates per decision, at least 1."""
+    probe: float = 0.0
+    """Share of goals that are drawn uniformly whatever their fear, in [0, 1]: what unbiased calibration needs."""
+    control: Literal["none", "shuffled", "state-blind"] = "none"
+    """``shuffled`` hands every score to another candidate, which must equal Uniform; ``state-blind`` lets the
+    network see goals only."""
+    fear: FearConfig = field(default_factory=FearConfig)
+    """The fear network."""
+
+    def __post_init__(self) -> None:
+        check_at_least("candidates", self.candidates, 1)
+        check_range("probe", self.probe, 0.0, 1.0)
+        check_choice("control", self.control, ["none", "shuffled", "state-blind"])
+
+
+class FearSelector(GoalSelector):
+    """Learns fear online and leaves the choice to ``choose``. Until it has seen both classes it is uniform."""
+
+    config: FearSelectorConfig
+
+    def __init__(self, config: FearSelectorConfig, spaces: Spaces, seed: int) -> None:
+        self.config = config
+        self.num_candidates = config.candidates
+        self._learnt_at = 0  # step of the last call of learn
+        self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
+        self.calibration = Calibration()
+
+    @abc.abstractmethod
+    def choose(self, score: Tensor, draw: Tensor) -> Tensor:
+        """Pick a candidate in every row.
+
+        Args:
+            score: Logits of the fear network, shape (B, N). Ranked as they are: sigmoids would tie at 1.
+            draw: Uniform numbers in [0, 1), shape (B,).
+
+        Returns:
+            Indices in [0, N), int64, shape (B,).
+        """
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``; scores are logits."""
+        free = picks.uniformly(draws[:, 0], candidates.shape[1])
+        if not self.fear.fitted:
+            return Proposal(picks.take(candidates, free), torch.full_like(draws[:, 0], torch.nan))
+        score = self.fear.score(self._seen(state), goal, candidates)
+        if self.config.control == "shuffled":
+            score = _rolled(score, draws[:, 2])
+        pick, probe = self.choose(score, draws[:, 0]), None
+        if self.config.probe:
+            probe = draws[:, 1] < self.config.probe
+            pick = torch.where(probe, free, pick)
+        return Proposal(picks.take(candidates, pick), picks.take(score, pick), probe=probe)
+
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """Fit the fear network to the window; what has resolved since the last time judges it first."""
+        window = interactions.resolved()
+        recent = window.where(window.resolved > self._learnt_at)
+        self._learnt_at = interactions.now
+        row = self._judge(window, recent)
+        self._calibrate(window)
+        row["fear/loss"] = self.fear.fit(replace(window, state=self._seen(window.state)))
+        if self.fear.fitted:
+            self.calibration.set_share(self.fear.share)
+        return row
+
+    def _judge(self, window: Resolved, recent: Resolved) -> dict[str, float]:
+        """Scores of the predictions as they were at issue, before anything is learnt from their outcomes."""
+        known = window.score.isfinite()
+        row = {
+            "fear/auroc": auroc(window.score[known], window.crashed[known]),
+            "fear/crash_share": recent.crashed.float().mean().item(),
+            "fear/resolved": float(len(recent)),
+            "fear/score": recent.score.nanmean().item(),
+            "fear/temperature": self.calibration.temperature,
+        }
+        if self.config.probe:
+            recent = recent.where(recent.probe)  # the others are a biased sample
+        judged = recent.where(recent.score.isfinite())
+        quality = judge(self.calibration.probability(judged.score), judged.crashed)
+        return row | {f"calibration/{name}": value for name, value in quality.items()}
+
+    def _calibrate(self, window: Resolved) -> None:
+        """Fit the temperature to scores from before the network learnt from their outcomes."""
+        held_out = window.where(window.score.isfinite())
+        crashes = int(held_out.crashed.sum())
+        if min(crashes, len(held_out) - crashes) >= self.config.fear.min_per_class:
+            self.calibration.fit(held_out.score, held_out.crashed)
+
+    def _seen(self, state: Tensor) -> Tensor:
+        return torch.zeros_like(state) if self.config.control == "state-blind" else state
+
+    def check(self) -> None:
+        """See ``GoalSelector.check``."""
+        self.fear.check()
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        calibration = self.calibration.state_dict()
+        return {"fear": self.fear.state_dict(), "calibration": calibration, "learnt_at": self._learnt_at}
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        self.fear.load_state_dict(state["fear"])
+        self.calibration.load_state_dict(state["calibration"])
+        self._learnt_at = state["learnt_at"]
+
+
+def _rolled(score: Tensor, draw: Tensor) -> Tensor:
+    """Every row rolled by 1 to N - 1 places at random: no candidate keeps its score or one that depends on it."""
+    count = score.shape[1]
+    if count == 1:
+        return score
+    shift = 1 + picks.uniformly(draw, count - 1)
+    places = torch.arange(count, device=score.device)
+    return score.gather(1, (places + shift.unsqueeze(1)) % count)

@@ -1,0 +1,183 @@
+"""A goal selector in other people's loops: one object, and torch is all that it imports."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from deimos.checks import check_at_least
+from deimos.env import Step
+from deimos.fear_selector import FearSelector
+from deimos.interactions import Interactions
+from deimos.selector import GoalSelector, SelectorConfig, Spaces
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What every world pursues next."""
+
+    goal: Tensor
+    """Goals, shape (num_envs, goal_dim): the given ones but where ``changed``."""
+    changed: Tensor
+    """True where the goal is a new one, bool, shape (num_envs,)."""
+
+
+class GoalDirector:
+    """Chooses the goals of any vectorised environment, and learns from what becomes of them.
+
+    It keeps the goal clocks and the interactions, and lets the selector learn. Call ``step`` once after
+    every step of the worlds, and put the goals that it returns into force.
+
+    Selectors that learn from the learner's transitions (``vds``, ``plr``) need Deimos' own loop.
+
+    Args:
+        selector: Who chooses: a selector's ``Config``, or the name of a method such as ``p25``.
+        goal_period: T: steps that a goal is in force, at least 1.
+        learn_every: Steps between two lessons of the selector, at least 1; a rollout of the learner is a good choice.
+        total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
+        seed: Seed of the selector's networks and of every choice.
+    """
+
+    def __init__(
+        self, selector: SelectorConfig | str, goal_period: int, *, learn_every: int = 24, total_steps: int = 0,
+        seed: int = 0,
+    ) -> None:  # fmt: skip
+        check_at_least("goal_period", goal_period, 1)
+        check_at_least("learn_every", learn_every, 1)
+        check_at_least("total_steps", total_steps, 0)
+        if isinstance(selector, str):
+            from deimos.methods import method
+
+            selector = method(selector)
+        self.goal_period, self.learn_every = goal_period, learn_every
+        self.metrics: dict[str, float] = {}
+        """What the selector's last lesson had to say."""
+        self._config, self._total_steps, self._seed = selector, total_steps, seed
+        self._selector: GoalSelector | None = None
+
+    @property
+    def selector(self) -> GoalSelector:
+        """Who chooses.
+
+        Raises:
+            RuntimeError: Before the first step, which tells how many worlds and components there are.
+        """
+        if self._selector is None:
+            raise RuntimeError("The GoalDirector knows its worlds only after the first call of step().")
+        return self._selector
+
+    def step(
+        self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor,
+        tracking: Tensor | None = None,
+    ) -> Assignment:  # fmt: skip
+        """Resolve what the last step decided, and choose the goals that are due.
+
+        Worlds that are done get a uniform first goal, their first candidate.
+
+        Args:
+            state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be
+                that of before or after its reset: nothing is chosen for it.
+            goal: Goals that were in force during the step, shape (num_envs, goal_dim).
+            terminated: True where the world crashed, bool, shape (num_envs,).
+            truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
+            candidates: Independent uniform valid goals, shape (num_envs, N, goal_dim), N at least 1.
+            tracking: How well the goal is met, in [0, 1], shape (num_envs,), for curricula; ``None`` for 0.
+
+        Raises:
+            ValueError: If a shape does not fit the others or those of the first call, or, on the first call, if
+                the selector needs the learner's rollout.
+        """
+        self._check(state, goal, terminated, truncated, candidates)
+        if self._selector is None:
+            self._begin(state, goal)
+        done = terminated | truncated
+        self._clock += 1
+        due = self._clock >= self.goal_period
+        reward = torch.zeros_like(self._clock, dtype=torch.float32) if tracking is None else tracking.float()
+        result = Step(state, reward, terminated, truncated, due, torch.zeros_like(done), self._clock[:2])
+        self._interactions.advance(result)
+        self._interactions.resolve(result, torch.nonzero(due | done).squeeze(1))
+        goals = goal.clone()
+        goals[done] = candidates[done, 0]
+        rows = torch.nonzero(due & ~done).squeeze(1)
+        if len(rows):
+            self._propose(rows, state[rows], goal[rows], candidates[rows], goals)
+        self._clock[due | done] = 0
+        if self._interactions.now % self.learn_every == 0:
+            self.metrics = self.selector.learn(self._interactions, None)
+        return Assignment(goals, due | done)
+
+    def _begin(self, state: Tensor, goal: Tensor) -> None:
+        spaces = Spaces(
+            len(state), state.shape[1], goal.shape[1], self.goal_period, state.device, total_steps=self._total_steps
+        )
+        self._selector = self._config.build(spaces, self._seed)
+        if self._selector.needs_rollout:
+            raise ValueError("selector must be one that needs no rollout of the learner; vds and plr do.")
+        self._interactions = Interactions(
+            len(state), state.shape[1], goal.shape[1], self.goal_period, 2 * self.goal_period, state.device
+        )
+        self._clock = torch.zeros(len(state), dtype=torch.int64, device=state.device)
+        self._generator = torch.Generator(state.device).manual_seed(self._seed)
+
+    def _propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, goals: Tensor) -> None:
+        draws = torch.rand(len(rows), 4, generator=self._generator, device=rows.device)
+        with torch.no_grad():
+            proposal = self.selector.propose(rows, state, goal, candidates, draws)
+        self._interactions.open(
+            rows, state, goal, proposal.goal, proposal.score, probe=proposal.probe, note=proposal.note
+        )
+        goals[rows] = proposal.goal
+
+    def _check(self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor) -> None:
+        n = len(self._clock) if self._selector is not None else len(state)
+        sizes = {"state": (n, state.shape[-1]), "goal": (n, goal.shape[-1]), "terminated": (n,), "truncated": (n,)}
+        given = {"state": state, "goal": goal, "terminated": terminated, "truncated": truncated}
+        for name, shape in sizes.items():
+            if given[name].shape != shape:
+                raise ValueError(f"{name} must have the shape {shape}, got {tuple(given[name].shape)}.")
+        if candidates.dim() != 3 or candidates.shape[::2] != goal.shape or candidates.shape[1] < 1:
+            expected = f"({n}, N, {goal.shape[1]}) with N at least 1"
+            raise ValueError(f"candidates must have the shape {expected}, got {tuple(candidates.shape)}.")
+
+    def fear(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> Tensor:
+        """Calibrated probability that the policy crashes within T steps of getting ``new_goal``, shape (B,).
+
+        Args:
+            state: States, shape (B, state_dim).
+            goal: Goals in force, shape (B, goal_dim).
+            new_goal: Goals to judge, shape (B, goal_dim).
+
+        Raises:
+            ValueError: If the selector has no fear network.
+            RuntimeError: If it has not learnt anything yet.
+        """
+        selector = self.selector
+        if not isinstance(selector, FearSelector):
+            raise ValueError(f"fear needs a selector with a fear network, such as a Director, got {type(selector)}.")
+        if not selector.fear.fitted:
+            raise RuntimeError("The fear network has learnt nothing yet: it must see crashes and survivals first.")
+        return selector.calibration.probability(selector.fear.score(state, goal, new_goal.unsqueeze(1)).squeeze(1))
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs; see ``load_state_dict``."""
+        return {
+            "selector": self.selector.state_dict(),
+            "interactions": self._interactions.state_dict(),
+            "clock": self._clock.clone(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict, observed: Tensor, goal: Tensor) -> None:
+        """Go on from ``state_dict()``.
+
+        Args:
+            state: What it returned.
+            observed: Any states, shape (num_envs, state_dim), to tell the sizes.
+            goal: Any goals, shape (num_envs, goal_dim).
+        """
+        self._begin(observed, goal)
+        self.selector.load_state_dict(state["selector"])
+        self._interactions.load_state_dict(state["interactions"])
+        self._clock.copy_(state["clock"])
+        self._generator.set_state(state["generator"])

@@ -1,0 +1,124 @@
+"""One method first, another later (thesis: VDS, then Director p75 from half of the training on)."""
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from deimos.checks import SimulationError
+from deimos.interactions import Interactions
+from deimos.rollout import Rollout
+from deimos.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(SelectorConfig):
+    """The first method chooses the goals up to a share of the training, the second one from there on.
+
+    The second learns from the start, so that it knows something when its time comes; the first goes on
+    learning only as long as it chooses.
+    """
+
+    first: str = "vds"
+    """Name of the first method."""
+    second: str = "p75"
+    """Name of the second method."""
+    at: float = 0.5
+    """Share of the training after which it switches, in (0, 1)."""
+
+    def __post_init__(self) -> None:
+        from deimos.methods import method
+
+        for name in (self.first, self.second):
+            method(name)
+        if not 0.0 < self.at < 1.0:
+            raise ValueError(f"at must be in (0, 1), or the schedule never switches; got {self.at}.")
+
+    def build(self, spaces: Spaces, seed: int) -> "Schedule":
+        """See ``SelectorConfig.build``."""
+        return Schedule(self, spaces, seed)
+
+
+class Schedule(GoalSelector):
+    """See ``Config``."""
+
+    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
+        from deimos.methods import method
+
+        self.config = config
+        self._parts = [method(name).build(spaces, seed) for name in (config.first, config.second)]
+        self._switch = config.at * spaces.require_total_steps("schedule")
+        self.switched = False
+        """Whether the second method chooses."""
+        self._keys: list[str] = []  # what the first method logs: every row of a run has the same columns
+
+    @property
+    def now(self) -> GoalSelector:
+        """Who chooses."""
+        return self._parts[self.switched]
+
+    @property
+    def num_candidates(self) -> int:  # type: ignore[override]
+        """See ``GoalSelector.num_candidates``."""
+        return self.now.num_candidates
+
+    @property
+    def needs_rollout(self) -> bool:  # type: ignore[override]
+        """See ``GoalSelector.needs_rollout``."""
+        return any(part.needs_rollout for part in self._parts)
+
+    @property
+    def first_goals_scaled(self) -> bool:  # type: ignore[override]
+        """See ``GoalSelector.first_goals_scaled``."""
+        return self.now.first_goals_scaled
+
+    @property
+    def fear(self) -> object:
+        """The fear network of whoever chooses, or of the other; ``None`` where neither has one."""
+        return next((part.fear for part in (self.now, *self._parts) if hasattr(part, "fear")), None)
+
+    def goal_range(self) -> Tensor | None:
+        """See ``GoalSelector.goal_range``."""
+        return self.now.goal_range()
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``."""
+        return self.now.propose(rows, state, goal, candidates, draws)
+
+    def critic(self) -> Critic | None:
+        """See ``GoalSelector.critic``."""
+        return self.now.critic()
+
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """See ``GoalSelector.learn``."""
+        row = {"schedule/switched": float(self.switched)}
+        first, second = self._parts
+        if self.switched:
+            row |= dict.fromkeys(self._keys, math.nan) | second.learn(interactions, rollout)
+        else:
+            learnt = first.learn(interactions, rollout)
+            self._keys = list(learnt)
+            # The scores at issue are the first method's: the second must not judge itself by them.
+            row |= learnt | second.learn(interactions.without_scores(), rollout)
+        self.switched = self.switched or interactions.now >= self._switch
+        return row
+
+    def check(self) -> None:
+        """See ``GoalSelector.check``."""
+        for name, part in zip((self.config.first, self.config.second), self._parts, strict=True):
+            try:
+                part.check()
+            except SimulationError as error:
+                raise SimulationError(f"{name}: {error}") from error
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        parts = [part.state_dict() for part in self._parts]
+        return {"parts": parts, "switched": self.switched, "switch": self._switch, "keys": self._keys}
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        for part, saved in zip(self._parts, state["parts"], strict=True):
+            part.load_state_dict(saved)
+        # A run that goes on with a larger budget keeps the schedule that it began with.
+        self.switched, self._switch, self._keys = state["switched"], state["switch"], state["keys"]

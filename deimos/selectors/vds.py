@@ -1,0 +1,253 @@
+"""Value disagreement sampling (Zhang, Abbeel and Pinto, NeurIPS 2020, arXiv:2006.09641), on PPO as in the thesis, 4.3.
+
+Where critics that saw the same task disagree about a goal, there is something to learn. Each has returns of
+its own, bootstrapped from its own values: regressed on one shared target they would soon agree.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from deimos import picks
+from deimos.adam import Adam
+from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
+from deimos.ensemble import CandidateValues, Stack
+from deimos.interactions import Interactions
+from deimos.networks import Activation, mlp, rows_in_cache
+from deimos.ppo import advantages, value_gradient
+from deimos.ranks import mean_over_ranks
+from deimos.rollout import Rollout
+from deimos.seeds import generator, weights_from
+from deimos.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(SelectorConfig):
+    """Goals by the standard deviation of an ensemble's values."""
+
+    rule: Literal["proportional", "argmax", "percentile"] = "proportional"
+    """Draw in proportion to the deviation, take its largest, or draw from above its percentile."""
+    percentile: float = 75.0
+    """Share of candidates that ``percentile`` discards, in [0, 100] [%]."""
+    role: Literal["replace", "auxiliary"] = "replace"
+    """Whether the ensemble's mean is the learner's baseline too (the thesis), or the learner keeps its own critic
+    (the comparison of goal selection alone)."""
+    data: Literal["all", "share"] = "all"
+    """Whether every critic learns from all transitions, or from those of its own part of the worlds, drawn anew
+    for every rollout: K times cheaper."""
+    critics: int = 10
+    """K, at least 2 where they are to disagree; 1 is a plain critic."""
+    candidates: int = 100
+    """N: uniform candidates per decision, at least 1."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the hidden layers of every critic."""
+    activation: Activation = "relu"
+    """Between the layers."""
+    learning_rate: float = 1e-3
+    """Step size of Adam, positive."""
+    epochs: int = 5
+    """Passes over every critic's data, at least 1."""
+    minibatches: int = 4
+    """Parts that its data are split into, in an order of its own, at least 1."""
+    clip: float = 0.2
+    """How far a value may move in one update, positive; infinite for no clipping."""
+    max_grad_norm: float = 1.0
+    """Norm that every critic's gradient is clipped to, positive."""
+
+    def __post_init__(self) -> None:
+        check_choice("rule", self.rule, ["proportional", "argmax", "percentile"])
+        check_choice("role", self.role, ["replace", "auxiliary"])
+        check_choice("data", self.data, ["all", "share"])
+        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_range("percentile", self.percentile, 0.0, 100.0)
+        check_hidden("hidden", self.hidden)
+        for name in ("critics", "candidates", "epochs", "minibatches"):
+            check_at_least(name, getattr(self, name), 1)
+        check_positive("learning_rate", self.learning_rate, finite=True)
+        check_positive("clip", self.clip)
+        check_positive("max_grad_norm", self.max_grad_norm, finite=True)
+
+    def build(self, spaces: Spaces, seed: int) -> "VDS":
+        """See ``SelectorConfig.build``.
+
+        Raises:
+            ValueError: If there are fewer worlds than critics that share them.
+        """
+        if self.data == "share" and spaces.num_envs < self.critics:
+            raise ValueError(
+                f"critics must be at most the {spaces.num_envs} worlds that they share, got {self.critics}; "
+                "use data 'all'."
+            )
+        return VDS(self, spaces, seed)
+
+
+class VDS(GoalSelector):
+    """See ``Config``."""
+
+    needs_rollout = True
+
+    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
+        self.config, self._spaces = config, spaces
+        self.num_candidates = config.candidates
+        inputs, device = spaces.state_dim + spaces.goal_dim, spaces.device
+        nets = []
+        for k in range(config.critics):
+            with weights_from(seed, f"vds critic {k}"):
+                nets.append(mlp(inputs, config.hidden, 1, config.activation).to(device))
+        self.stack = Stack(nets)
+        self._of_candidates = CandidateValues(self.stack, spaces.goal_dim)
+        self.optimizer = Adam(self.stack.parameters, torch.tensor(config.learning_rate, device=device))
+        self.generator = generator(seed, "vds minibatches", device)
+        self._known: tuple[Tensor, Tensor] | None = None  # observations and their values, as asked for last
+        self._piece = rows_in_cache(max(config.hidden))
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
+        score = self._of_candidates(state, candidates).std(dim=0, correction=0)
+        pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
+        return Proposal(picks.take(candidates, pick), picks.take(score, pick))
+
+    def critic(self) -> Critic | None:
+        """See ``GoalSelector.critic``."""
+        return self if self.config.role == "replace" else None
+
+    def value(self, obs: Tensor) -> Tensor:
+        """Mean value over the ensemble, shape (...,), of observations of shape (..., obs_dim)."""
+        values = self.values(obs)
+        self._known = obs, values
+        return values.mean(0)
+
+    def values(self, obs: Tensor) -> Tensor:
+        """Values by every critic, shape (K, ...), of observations of shape (..., obs_dim)."""
+        inputs = self._spaces.state_then_goal(obs).flatten(0, -2)
+        return self.stack.values(inputs).view(-1, *obs.shape[:-1])
+
+    @torch.no_grad()
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """Move every critic towards the lambda-returns that it sees itself."""
+        if rollout is None:
+            raise ValueError("vds learns values, so it needs the learner's rollout, got None.")
+        worlds = self._worlds(rollout.obs.shape[1], rollout.obs.device)
+        old, returns = self._targets(rollout, worlds)
+        spread = old.std(dim=0, correction=0).mean().item() if self.config.data == "all" else float("nan")
+        loss = self._fit(rollout, worlds, old, returns)
+        self._known = None
+        return {"vds/loss": loss, "vds/deviation": spread, "vds/value": old.mean().item()}
+
+    def _worlds(self, num_envs: int, device: torch.device) -> Tensor:
+        """The worlds that every critic learns from, int64, shape (K, worlds of each)."""
+        count = self.config.critics
+        if self.config.data == "all":
+            return torch.arange(num_envs, device=device).expand(count, -1)
+        size = num_envs // count  # what does not divide evenly is left out, another part every time
+        return torch.randperm(num_envs, generator=self.generator, device=device)[: count * size].view(count, size)
+
+    def _targets(self, rollout: Rollout, worlds: Tensor) -> tuple[Tensor, Tensor]:
+        """Values before the update and lambda-returns, shape (K, num_steps, worlds of each)."""
+        shared = self.config.data == "all"
+        if shared and self._known is not None and self._known[0] is rollout.obs:
+            value = self._known[1]
+        elif shared:
+            value = self.values(rollout.obs)
+        else:
+            value = self._own_values(rollout.obs, worlds)
+        next_value = value[:, 1:]
+        if len(rollout.final_obs):
+            final = self.values(rollout.final_obs) if shared else self._own_values(rollout.final_obs, worlds)
+            next_value = torch.where(_of_worlds(rollout.truncated, worlds), final, next_value)
+        old = value[:, :-1]
+
+        def along_time(tensor: Tensor) -> Tensor:  # (K, num_steps, m) -> (num_steps, K * m)
+            return tensor.transpose(0, 1).flatten(1)
+
+        advantage = advantages(
+            along_time(_of_worlds(rollout.reward, worlds)) * rollout.reward_scale, along_time(old),
+            along_time(next_value), along_time(_of_worlds(rollout.terminated, worlds)),
+            along_time(_of_worlds(rollout.truncated, worlds)),
+            discount=rollout.discount, gae_lambda=rollout.gae_lambda,
+        )  # fmt: skip
+        return old, advantage.view(rollout.num_steps, len(worlds), -1).transpose(0, 1) + old
+
+    def _own_values(self, obs: Tensor, worlds: Tensor) -> Tensor:
+        """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
+        inputs = self._spaces.state_then_goal(obs)
+        return torch.stack(self.stack.each(
+            lambda k: self.stack.members[k].forward(inputs[:, worlds[k]].flatten(0, 1)).view(len(obs), -1)
+        ))  # fmt: skip
+
+    def _fit(self, rollout: Rollout, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
+        """Adam on the clipped value loss; returns its mean over critics and minibatches."""
+        rows = rollout.num_steps * worlds.shape[1]
+        minibatches = min(self.config.minibatches, rows)
+        size = rows // minibatches
+        inputs = self._spaces.state_then_goal(rollout.obs[:-1])
+        order = [torch.randperm(rows, generator=self.generator, device=old.device) for _ in worlds]
+
+        def data_of(k: int) -> tuple[Tensor, ...]:
+            step, world = order[k] // worlds.shape[1], worlds[k][order[k] % worlds.shape[1]]
+            own = (old[k].flatten()[order[k]], returns[k].flatten()[order[k]], rollout.weight[step, world])
+            return inputs[step, world], *own
+
+        data = self.stack.each(data_of)
+        losses = torch.zeros(len(worlds), device=old.device)
+        assert self.stack.parameters.grad is not None
+        for _ in range(self.config.epochs):
+            for start in range(0, minibatches * size, size):
+                self.stack.parameters.grad.zero_()
+                losses += self._gradient([[part[start : start + size] for part in own] for own in data])
+                mean_over_ranks(self.stack.parameters.grad)
+                self.stack.clip_gradients(self.config.max_grad_norm)
+                self.optimizer.step()
+        return losses.mean().item() / (self.config.epochs * minibatches)
+
+    def _gradient(self, data: list[list[Tensor]]) -> Tensor:
+        """Add every critic's gradient on its own (input, old value, return, weight); returns the losses, shape (K,)."""
+        if self.stack.batched:
+            x, before, target, weight = (torch.stack(tensors) for tensors in zip(*data, strict=True))
+            weight = weight / weight.sum(1, keepdim=True).clamp(min=1.0)
+            value = self.stack.forward(x).squeeze(2)
+            loss, slope = value_gradient(value, before, target, weight, clip=self.config.clip, coef=1.0)
+            self.stack.backward(slope.unsqueeze(2))
+            return loss
+
+        def work(k: int) -> Tensor:
+            x, before, target, weight = data[k]
+            weight = weight / weight.sum().clamp(min=1.0)
+            loss = torch.zeros(())
+            for start in range(0, len(x), self._piece):
+                rows = slice(start, start + self._piece)
+                value = self.stack.members[k].forward(x[rows]).squeeze(1)
+                gained, slope = value_gradient(
+                    value, before[rows], target[rows], weight[rows], clip=self.config.clip, coef=1.0
+                )
+                self.stack.members[k].backward(slope.unsqueeze(1))
+                loss += gained
+            return loss
+
+        return torch.stack(self.stack.each(work))
+
+    def check(self) -> None:
+        """See ``GoalSelector.check``."""
+        if not bool(self.stack.parameters.isfinite().all()):
+            raise SimulationError("A weight of the VDS ensemble is not finite after a fit.")
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        return {
+            "parameters": self.stack.parameters.detach().clone(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        self.stack.parameters.data.copy_(state["parameters"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+
+
+def _of_worlds(tensor: Tensor, worlds: Tensor) -> Tensor:
+    """The columns of ``tensor``, shape (steps, num_envs), that each critic has, shape (K, steps, worlds of each)."""
+    return tensor[:, worlds].transpose(0, 1)
