@@ -14,9 +14,15 @@ import torch
 from torch import Tensor
 
 from deimos import seeds
-from deimos.env import Env
-from deimos.fear import Fear, auroc
+from deimos.calibration import judge
+from deimos.fear import auroc
+from deimos.fear_selector import fear_selector
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.interactions import Resolved
+from deimos.oracle import Clones
 from deimos.run_folder import RunError
+from deimos.selector import GoalSelector
+from deimos.selectors import uniform
 
 if TYPE_CHECKING:
     from deimos.training import Trainer
@@ -45,17 +51,18 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
     Raises:
         RunError: If there is no fear network, or no context with both outcomes.
     """
-    fear = getattr(trainer.loop.selector, "fear", None)
-    if not isinstance(fear, Fear) or not fear.fitted:
+    afraid = fear_selector(trainer.loop.selector)
+    if afraid is None or not afraid.fear.fitted:
         raise RunError("This run's selector has no fear network that has learnt anything.")
     generator = seeds.generator(trainer.config.seed, "audit", trainer.env.device)
     probe = trainer.config.env.build(BATCH * CANDIDATES, trainer.env.device, trainer.config.seed)
+    clones = Clones(probe, lambda obs: _act(trainer, obs, generator))
     ranks: list[float] = []
     crashes = tried = 0
     while len(ranks) < contexts and tried < PATIENCE * contexts:
-        state, goal, candidates = _next_contexts(trainer, probe, generator)
-        logit = fear.score(state, goal, candidates)
-        crashed = _crashes_within_period(trainer, probe, logit.numel(), generator).view_as(logit)
+        state, goal, candidates, survived = _next_contexts(trainer, clones, generator)
+        logit = afraid.score(state, goal, candidates)
+        crashed = survived < probe.goal_period
         tried += len(logit)
         crashes += int(crashed.sum())
         ranks += [
@@ -80,16 +87,71 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
     }
 
 
-@torch.no_grad()
-def _next_contexts(trainer: "Trainer", probe: Env, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Go on until goals are due, and clone up to ``BATCH`` of those worlds into ``probe``, once per candidate.
+def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[Tensor, Tensor, dict[str, float]]]:
+    """Judge the calibrated probabilities of a training run's fear network, on goals that it did not learn from.
+
+    The run's own worlds go on as in training, without learning: first under the goals of its selector, which
+    are a biased sample of all goals, then under uniform goals, which are not.
+
+    Args:
+        trainer: A run whose selector has a fear network that has learnt. Its worlds move on.
+        interactions: Interactions to judge under either, at least 1.
 
     Returns:
-        States (n, state_dim), goals in force (n, goal_dim) and candidates (n, CANDIDATES, goal_dim).
+        For ``selected`` and ``uniform`` goals: probabilities, shape (n,), what became of them, bool, shape (n,),
+        and the dictionary of ``calibration.judge``, with ``interactions``, ``crash_share`` and ``auroc``.
+
+    Raises:
+        RunError: If there is no fear network.
+    """
+    afraid = fear_selector(trainer.loop.selector)
+    if afraid is None or not afraid.fear.fitted:
+        raise RunError("This run's selector has no fear network that has learnt anything.")
+    generator = seeds.generator(trainer.config.seed, "calibration", trainer.env.device)
+    choosers = {"selected": trainer.loop.selector, "uniform": uniform.Config().build(spaces(trainer.env), 0)}
+    results = {}
+    for name, chooser in choosers.items():
+        done = _watch(trainer, chooser, interactions, generator)
+        score = afraid.score(done.state, done.goal, done.next_goal.unsqueeze(1)).squeeze(1)
+        probability = afraid.calibration.probability(score)
+        counts = {"interactions": float(len(done)), "crash_share": done.crashed.float().mean().item()}
+        quality = counts | {"auroc": auroc(score, done.crashed)} | judge(probability, done.crashed)
+        results[name] = probability, done.crashed, quality
+    return results
+
+
+@torch.no_grad()
+def _watch(trainer: "Trainer", chooser: GoalSelector, count: int, generator: torch.Generator) -> Resolved:
+    """Let the policy go on under a selector's goals until ``count`` interactions have ended, in whole periods."""
+    env = trainer.env
+    periods = -(-count // env.num_envs)
+    loop = GoalLoop(env, chooser, window=(periods + 1) * env.goal_period)
+    begin = periods * env.goal_period
+    for _ in range((periods + 1) * env.goal_period):
+        loop.advance(env.step(_act(trainer, env.obs, generator)))
+    done = loop.interactions.resolved()
+    return done.where(done.issued <= begin)  # of the later ones only the crashes are known yet
+
+
+def _act(trainer: "Trainer", obs: Tensor, generator: torch.Generator) -> Tensor:
+    """Actions as in training: drawn, not the mean."""
+    mean = trainer.ppo.actor(obs)
+    return mean + trainer.ppo.actor.std * torch.randn(mean.shape, generator=generator, device=mean.device)
+
+
+@torch.no_grad()
+def _next_contexts(
+    trainer: "Trainer", clones: Clones, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Go on until goals are due, and try candidates in up to ``BATCH`` of those worlds.
+
+    Returns:
+        States (n, state_dim), goals in force (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the steps
+        survived under each (n, CANDIDATES).
     """
     env = trainer.env
     while True:
-        step = env.step(_act(trainer, env.obs, generator))
+        step = env.step(clones.act(env.obs))
         rows = (step.goal_due & ~step.terminated & ~step.truncated).nonzero().squeeze(1)
         if len(rows) == 0:
             trainer.loop.advance(step)
@@ -97,23 +159,6 @@ def _next_contexts(trainer: "Trainer", probe: Env, generator: torch.Generator) -
         rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)[:BATCH]]
         obs = env.obs[rows]
         candidates = env.sample_goals(rows, CANDIDATES).clone()
-        clones = torch.arange(len(rows) * CANDIDATES, device=rows.device)
-        probe.copy_worlds(rows.repeat_interleave(CANDIDATES), clones, origin=env)
-        probe.set_goals(clones, candidates.flatten(0, 1))
+        survived = clones.try_out(env, rows, candidates)
         trainer.loop.advance(step)
-        return env.state(obs), obs[:, env.goal_slice], candidates
-
-
-@torch.no_grad()
-def _crashes_within_period(trainer: "Trainer", probe: Env, count: int, generator: torch.Generator) -> Tensor:
-    """Roll the policy out for T steps in the first ``count`` worlds of ``probe``; which crashed, shape (count,)."""
-    crashed = torch.zeros(probe.num_envs, dtype=torch.bool, device=probe.device)
-    for _ in range(probe.goal_period):
-        crashed |= probe.step(_act(trainer, probe.obs, generator)).terminated
-    return crashed[:count]
-
-
-def _act(trainer: "Trainer", obs: Tensor, generator: torch.Generator) -> Tensor:
-    """Actions as in training: drawn, not the mean."""
-    mean = trainer.ppo.actor(obs)
-    return mean + trainer.ppo.actor.std * torch.randn(mean.shape, generator=generator, device=mean.device)
+        return env.state(obs), obs[:, env.goal_slice], candidates, survived

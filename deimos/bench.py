@@ -1,4 +1,4 @@
-"""``deimos bench particle``: how fast everything is, beside what else there is.
+"""``deimos bench``: how fast everything is, beside what else there is.
 
 The machine may be shared and noisy. What is compared is therefore measured in turn, round after round,
 and a ratio is the median of the rounds' ratios.
@@ -43,7 +43,7 @@ OPERATIONS_PER_STEP = 52
 class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
-    what: tyro.conf.Positional[Literal["particle"]]
+    what: tyro.conf.Positional[Literal["particle", "terrain"]]
     """What to measure."""
     json: Path | None = None
     """Write all numbers to this file too."""
@@ -67,6 +67,12 @@ def run(options: BenchOptions) -> dict[str, Any]:
         raise RunError(f"The folder of {options.json} does not exist.")
     device = resolve_device(options.device)
     torch.set_num_threads(options.threads or cores())
+    if options.what == "terrain":
+        from terrain import bench as terrain_bench
+
+        return terrain_bench.run(
+            terrain_bench.BenchOptions(rounds=options.rounds, device=str(device), json=options.json)
+        )
     with one_stream(device):
         results = {
             "versions": provenance(),

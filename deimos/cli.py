@@ -1,4 +1,4 @@
-"""The command line: ``deimos train``, ``deimos evaluate``, ``deimos bench``.
+"""The command line: ``deimos train``, ``deimos evaluate``, ``deimos terrain``, ``deimos bench``.
 
 Whatever the user can mend (a flag, a folder, a disk) ends in one line on stderr and exit code 2.
 """
@@ -29,6 +29,7 @@ usage: deimos COMMAND [OPTIONS]
 commands:
   train      train a policy and evaluate it (also: python train.py)
   evaluate   evaluate the policy of a run folder
+  terrain    make ground for legged robots (also: python -m terrain)
   bench      measure the speed of everything
 
 Every command explains its options with --help."""
@@ -37,7 +38,9 @@ Every command explains its options with --help."""
 def main(arguments: list[str] | None = None) -> int:
     """Run ``deimos``; returns the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    commands: dict[str, Callable[[list[str]], int]] = {"train": train, "evaluate": evaluate, "bench": bench}
+    commands: dict[str, Callable[[list[str]], int]] = {
+        "train": train, "evaluate": evaluate, "terrain": terrain, "bench": bench,
+    }  # fmt: skip
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0
@@ -80,6 +83,13 @@ def evaluate(arguments: list[str]) -> int:
     return outcome.code
 
 
+def terrain(arguments: list[str]) -> int:
+    """Run ``deimos terrain``; returns the exit code."""
+    from terrain import cli as generator
+
+    return generator.main(arguments, "deimos terrain")
+
+
 def bench(arguments: list[str]) -> int:
     """Run ``deimos bench``; returns the exit code."""
     with _one_line_errors() as outcome:
@@ -119,15 +129,24 @@ class EvaluateOptions:
     """T: steps that a goal is in force. By default as in training."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate; auto takes the GPU where there is one."""
+    oracle_worlds: int | None = None
+    """Worlds that meet the oracle Adversary too; 200 is plenty. By default as the run was set up."""
+    calibration: int = 0
+    """Instead of the evaluation, judge the fear network's probabilities on this many interactions, and draw
+    calibration.png. 0 for no such thing."""
     contexts: int = 0
     """Instead of the evaluation, audit the fear network on this many contexts: its AUROC within each,
     against the exact outcomes of cloned worlds. 0 for no audit."""
 
     def __post_init__(self) -> None:
-        check_at_least("contexts", self.contexts, 0)
-        given = [name for name in ("worlds", "steps", "seed", "goal_period") if getattr(self, name) is not None]
-        if self.contexts and given:
-            raise ValueError(f"contexts audits the run as it was trained and excludes {', '.join(given)}.")
+        asked = [name for name in ("contexts", "calibration") if getattr(self, name)]
+        for name in ("contexts", "calibration"):
+            check_at_least(name, getattr(self, name), 0)
+        names = ("worlds", "steps", "seed", "goal_period", "oracle_worlds")
+        given = [name for name in names if getattr(self, name) is not None]
+        if asked and given + asked[1:]:
+            others = ", ".join(given + asked[1:])
+            raise ValueError(f"{asked[0]} judges the fear network of the run as it was trained and excludes {others}.")
 
 
 def _train_options() -> type:
@@ -205,23 +224,19 @@ def _run(trainer: Any, folder: Any) -> None:
 def _evaluate(options: EvaluateOptions) -> None:
     import torch
 
-    from deimos import console, figures, training
+    from deimos import figures, training
 
     folder = training.RunFolder.open(options.run)
     config = training.read_config(folder)
     torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
     _quiet_warp()
     device = training.resolve_device(options.device)
-    if options.contexts:
-        from deimos.audit import audit_fear
-
+    if options.contexts or options.calibration:
         with training.one_stream(device):
             trainer = training.load(folder, dataclasses.replace(config, device=options.device))
-            audit = audit_fear(trainer, options.contexts)
-        folder.write_json("audit.json", audit)
-        console.print_audit(audit)
+            _judge_fear(trainer, folder, options)
         return
-    changes = {name: getattr(options, name) for name in ("worlds", "steps", "seed")}
+    changes = {name: getattr(options, name) for name in ("worlds", "steps", "seed", "oracle_worlds")}
     try:
         eval_config = dataclasses.replace(config.eval, **{k: v for k, v in changes.items() if v is not None})
         period = config.env.goal_period if options.goal_period is None else options.goal_period
@@ -234,6 +249,21 @@ def _evaluate(options: EvaluateOptions) -> None:
         rows = _evaluate_policy(folder, env_config, eval_config, device)
     figures.draw_summary(folder, _title(config), rows)
     print(folder.path)
+
+
+def _judge_fear(trainer: Any, folder: Any, options: EvaluateOptions) -> None:
+    """Audit the fear network within contexts, or its probabilities."""
+    from deimos import audit, console, figures
+
+    if options.contexts:
+        found = audit.audit_fear(trainer, options.contexts)
+        folder.write_json("audit.json", found)
+        console.print_audit(found)
+        return
+    judged = audit.audit_calibration(trainer, options.calibration)
+    folder.write_json("calibration.json", {name: quality for name, (_, _, quality) in judged.items()})
+    console.print_calibration({name: quality for name, (_, _, quality) in judged.items()})
+    print(figures.draw_calibration(folder, {name: (p, crashed) for name, (p, crashed, _) in judged.items()}))
 
 
 def _title(config: Any) -> str:

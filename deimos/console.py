@@ -96,6 +96,18 @@ def print_audit(audit: dict) -> None:
     Console().print(table)
 
 
+def print_calibration(judged: dict[str, dict[str, float]]) -> None:
+    """Print how good the fear network's probabilities are, under each kind of goals."""
+    table = Table(title="Fear network's probabilities", title_justify="left")
+    table.add_column("goals")
+    for name in judged:
+        table.add_column(name, justify="right")
+    for name in next(iter(judged.values())):
+        form = ".0f" if name == "interactions" else ".4f"
+        table.add_row(name.replace("_", " "), *[_cell(quality[name], form) for quality in judged.values()])
+    Console().print(table)
+
+
 def print_timing(trainer: "Trainer") -> None:
     """Print where the time of the iterations went."""
     total = sum(trainer.seconds.values())

@@ -18,6 +18,7 @@ from deimos.env import Env, EnvConfig
 from deimos.fear import Fear, FearConfig, auroc
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.interactions import Interactions, Resolved
+from deimos.oracle import Clones, Oracle
 from deimos.selector import GoalSelector, Proposal
 from deimos.selectors import director, uniform
 
@@ -26,6 +27,7 @@ Policy = Callable[[Tensor], Tensor]
 
 WEAK_CRASHES, WEAK_AUROC = 100, 0.6  # below either, resisting the Adversary proves nothing
 FITS = 15  # fits of the Adversary's network during its ``adversary_steps``
+ORACLE_CLONES = 10_000  # clones that the oracle tries candidates in at a time
 HELD_OUT = 5  # every fifth world of the collection is kept for the Adversary's AUROC
 
 
@@ -49,11 +51,14 @@ class EvalConfig:
     """It gives up collecting after this many times ``adversary_steps``, at least 1."""
     fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32, min_per_class=8))
     """The Adversary's fear network."""
+    oracle_worlds: int = 0
+    """Worlds that also meet an oracle Adversary, which tries every candidate in clones of the world and asks for
+    the one that crashes the policy soonest; 200 is plenty, 0 leaves it out. It costs N T steps per goal."""
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "adversary_patience"):
             check_at_least(name, getattr(self, name), 1)
-        for name in ("adversary_interactions", "adversary_crashes"):
+        for name in ("adversary_interactions", "adversary_crashes", "oracle_worlds"):
             check_at_least(name, getattr(self, name), 0)
         check_range("seed", self.seed, 0, 2**32 - 2)
 
@@ -84,12 +89,13 @@ def evaluate(
         progress: Called now and then with the stage's name and the share of it that is done.
 
     Returns:
-        One row for ``naive`` and one for ``adversary``. In each: ``reward`` per transition, ``crashes``,
-        ``crashes_per_1000`` transitions, ``interactions`` (issued early enough to end in time),
-        ``crash_rate`` (share of those that crashed), steps and crashes under first goals apart,
-        ``return_per_step`` (see ``play``) and ``score``: its place between the policy that does
-        nothing (0) and the environment's reference policy (1), both under the Naive goals; and for
-        the Adversary the size of its collection and its AUROC on worlds that it did not learn from.
+        One row for ``naive`` and one for ``adversary``, and one for ``oracle`` if asked for. In each:
+        ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions``
+        (issued early enough to end in time), ``crash_rate`` (share of those that crashed), steps and
+        crashes under first goals apart, ``return_per_step`` (see ``play``) and ``score``: its place
+        between the policy that does nothing (0) and the environment's reference policy (1), both
+        under the Naive goals; and for the Adversary the size of its collection and its AUROC on
+        worlds that it did not learn from.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -112,10 +118,15 @@ def evaluate(
     adversary.fear = fear
     attacked = play(env, policy, adversary, config.steps, lambda x: progress("adversary", x))
     rows.append({"goals": "adversary"} | attacked | collection)
+    if config.oracle_worlds:
+        env, probe = (env_config.build(n, device, config.seed) for n in (config.oracle_worlds, ORACLE_CLONES))
+        oracle = Oracle(env, Clones(probe, policy))
+        rows.append({"goals": "oracle"} | play(env, policy, oracle, config.steps, lambda x: progress("oracle", x)))
     for row in rows:
         row["score"] = (row["return_per_step"] - scale[0]) / (scale[1] - scale[0]) if scale else math.nan
         row |= {"goal_period": env_config.goal_period, "seed": config.seed}
-        row |= {"worlds": config.worlds, "steps": config.steps}
+        worlds = config.oracle_worlds if row["goals"] == "oracle" else config.worlds
+        row |= {"worlds": worlds, "steps": config.steps}
     return rows
 
 

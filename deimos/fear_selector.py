@@ -65,14 +65,17 @@ class FearSelector(GoalSelector):
         free = picks.uniformly(draws[:, 0], candidates.shape[1])
         if not self.fear.fitted:
             return Proposal(picks.take(candidates, free), torch.full_like(draws[:, 0], torch.nan))
-        score = self.fear.score(self._seen(state), goal, candidates)
-        if self.config.control == "shuffled":
-            score = _rolled(score, draws[:, 2])
-        pick, probe = self.choose(score, draws[:, 0]), None
+        score = self.score(state, goal, candidates)
+        ranked = _rolled(score, draws[:, 2]) if self.config.control == "shuffled" else score
+        pick, probe = self.choose(ranked, draws[:, 0]), None
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, free, pick)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick), probe=probe)
+
+    def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
+        """Logits of the fear network for all candidates; see ``Fear.score``."""
+        return self.fear.score(self._seen(state), goal, candidates)
 
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time judges it first."""
@@ -128,11 +131,20 @@ class FearSelector(GoalSelector):
         self._learnt_at = state["learnt_at"]
 
 
+def fear_selector(selector: GoalSelector) -> FearSelector | None:
+    """The selector with a fear network in ``selector``: itself, or the first of its parts that is one."""
+    if isinstance(selector, FearSelector):
+        return selector
+    found = (fear_selector(part) for part in selector.parts)
+    return next((part for part in found if part is not None), None)
+
+
 def _rolled(score: Tensor, draw: Tensor) -> Tensor:
-    """Every row rolled by 1 to N - 1 places at random: no candidate keeps its score or one that depends on it."""
+    """Every row rolled by 0 to N - 1 places at random: whatever place is picked, any candidate may be there.
+
+    With one place less, the most frightening candidate would never be the one that is picked for it.
+    """
     count = score.shape[1]
-    if count == 1:
-        return score
-    shift = 1 + picks.uniformly(draw, count - 1)
+    shift = picks.uniformly(draw, count)
     places = torch.arange(count, device=score.device)
     return score.gather(1, (places + shift.unsqueeze(1)) % count)

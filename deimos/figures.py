@@ -1,14 +1,17 @@
-"""The figure that a run ends with."""
+"""The figures of a run."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from deimos.calibration import reliability
 from deimos.run_folder import RunError, RunFolder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from torch import Tensor
 
-BLUE, ORANGE = "#0072B2", "#D55E00"  # of Okabe and Ito's palette, told apart by the colour-blind
+BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"  # of Okabe and Ito's palette, told apart by the colour-blind
 
 
 def draw_summary(folder: RunFolder, title: str, evaluated: list[dict]) -> Path:
@@ -39,7 +42,55 @@ def draw_summary(folder: RunFolder, title: str, evaluated: list[dict]) -> Path:
         _curve(axes[1, 0], rows, "explained_variance", "explained variance of the values", BLUE)
     _bars(axes[1, 1], evaluated)
     figure.suptitle(title)
-    path = folder.path / "summary.png"
+    return _save(figure, folder.path / "summary.png")
+
+
+def draw_calibration(folder: RunFolder, judged: "dict[str, tuple[Tensor, Tensor]]") -> Path:
+    """Draw ``calibration.png``: predicted against observed crash rates, with the predictions' histogram below.
+
+    Args:
+        folder: The run.
+        judged: By kind of goals: probabilities, shape (n,), and what became of them, bool, shape (n,).
+
+    Raises:
+        RunError: If it cannot be written.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from scipy.stats import binomtest
+
+    figure, (curves, histogram) = plt.subplots(
+        2, 1, figsize=(6, 7), height_ratios=[3, 1], sharex=True, layout="constrained"
+    )
+    curves.plot([0, 1], [0, 1], color="grey", linewidth=0.8, linestyle=":")
+    for (name, (probability, crashed)), colour, marker in zip(judged.items(), (ORANGE, BLUE), "so", strict=False):
+        bins = reliability(probability, crashed)
+        crashes = (bins.observed * bins.count).round().long().tolist()
+        spans = [
+            binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(crashes, bins.count.tolist(), strict=True)
+        ]
+        error = [
+            [max(0.0, y - span.low) for y, span in zip(bins.observed.tolist(), spans, strict=True)],
+            [max(0.0, span.high - y) for y, span in zip(bins.observed.tolist(), spans, strict=True)],
+        ]
+        curves.errorbar(
+            bins.predicted.tolist(), bins.observed.tolist(), error, color=colour, marker=marker, markersize=4,
+            linewidth=1.2, capsize=2, label=f"{name} goals, {len(probability)} interactions",
+        )  # fmt: skip
+        histogram.hist(probability.tolist(), bins=40, range=(0, 1), color=colour, histtype="step", linewidth=1.4)
+    curves.set_ylabel("observed crash rate, 95 % interval")
+    curves.legend(frameon=False)
+    histogram.set_yscale("log")
+    histogram.set_ylabel("interactions")
+    histogram.set_xlabel("predicted probability of a crash")
+    return _save(figure, folder.path / "calibration.png")
+
+
+def _save(figure: "Figure", path: Path) -> Path:
+    import matplotlib.pyplot as plt
+
     try:
         figure.savefig(path, dpi=120)
     except OSError as error:
@@ -66,7 +117,7 @@ def _bars(axes: "Axes", evaluated: list[dict]) -> None:
         return
     bars = axes.bar(
         [row["goals"].capitalize() for row in evaluated], [row["crashes_per_1000"] for row in evaluated],
-        color=[BLUE, ORANGE], width=0.5,
+        color=[BLUE, ORANGE, GREEN][: len(evaluated)], width=0.5,
     )  # fmt: skip
     notes = [f"{row['crashes_per_1000']:.3g}" + _score_note(row) for row in evaluated]
     axes.bar_label(bars, notes, padding=3)

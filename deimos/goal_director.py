@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deimos.checks import check_at_least
 from deimos.env import Step
-from deimos.fear_selector import FearSelector
+from deimos.fear_selector import fear_selector
 from deimos.interactions import Interactions
 from deimos.selector import GoalSelector, SelectorConfig, Spaces
 
@@ -152,12 +152,12 @@ class GoalDirector:
             ValueError: If the selector has no fear network.
             RuntimeError: If it has not learnt anything yet.
         """
-        selector = self.selector
-        if not isinstance(selector, FearSelector):
-            raise ValueError(f"fear needs a selector with a fear network, such as a Director, got {type(selector)}.")
-        if not selector.fear.fitted:
+        afraid = fear_selector(self.selector)
+        if afraid is None:
+            raise ValueError(f"The selector must have a fear network, as a Director has; got {self._config}.")
+        if not afraid.fear.fitted:
             raise RuntimeError("The fear network has learnt nothing yet: it must see crashes and survivals first.")
-        return selector.calibration.probability(selector.fear.score(state, goal, new_goal.unsqueeze(1)).squeeze(1))
+        return afraid.calibration.probability(afraid.score(state, goal, new_goal.unsqueeze(1)).squeeze(1))
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs; see ``load_state_dict``."""

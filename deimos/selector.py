@@ -92,6 +92,8 @@ class GoalSelector(abc.ABC):
 
     num_candidates: int = 1
     """Candidates that it wants to choose from at every decision."""
+    parts: "tuple[GoalSelector, ...]" = ()
+    """The selectors that it is made of."""
     needs_rollout: bool = False
     """Whether ``learn`` needs the learner's transitions."""
     first_goals_scaled: bool = False

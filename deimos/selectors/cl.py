@@ -70,7 +70,7 @@ class Curriculum(GoalSelector):
         self._counted_at = interactions.now
         row: dict[str, float] = {}
         for i, group in enumerate(self._groups):
-            own = done.issued >= self._since[i]
+            own = done.issued > self._since[i]  # goals of the very step were issued before the range grew
             self._count[i] += int(own.sum())
             self._sum[i] += done.tracking[own, i].double().sum().item()
             tracking = self._sum[i] / self._count[i] if self._count[i] else float("nan")
@@ -84,8 +84,9 @@ class Curriculum(GoalSelector):
 
     def state_dict(self) -> dict:
         """See ``GoalSelector.state_dict``."""
-        counts = {"since": self._since, "counted_at": self._counted_at, "sum": self._sum, "count": self._count}
-        return {"range": self._range.clone(), "share": self.share} | counts
+        lists = {"share": self.share, "since": self._since, "sum": self._sum, "count": self._count}
+        copies = {name: list(values) for name, values in lists.items()}
+        return {"range": self._range.clone(), "counted_at": self._counted_at} | copies
 
     def load_state_dict(self, state: dict) -> None:
         """See ``GoalSelector.load_state_dict``."""

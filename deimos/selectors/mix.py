@@ -40,6 +40,7 @@ class Mix(GoalSelector):
 
         self.config = config
         self.base = method(config.base).build(spaces, seed)
+        self.parts = (self.base,)
 
     @property
     def num_candidates(self) -> int:  # type: ignore[override]
@@ -56,11 +57,6 @@ class Mix(GoalSelector):
         """See ``GoalSelector.first_goals_scaled``."""
         return self.base.first_goals_scaled
 
-    @property
-    def fear(self) -> object:
-        """The method's fear network; ``None`` where it has none."""
-        return getattr(self.base, "fear", None)
-
     def goal_range(self) -> Tensor | None:
         """See ``GoalSelector.goal_range``."""
         return self.base.goal_range()
@@ -75,6 +71,7 @@ class Mix(GoalSelector):
             goal=torch.where(free.unsqueeze(1), anything, own.goal),
             score=own.score.masked_fill(free, torch.nan),
             probe=free if own.probe is None else free | own.probe,
+            note=None if own.note is None else own.note * ~free,
         )
 
     def critic(self) -> Critic | None:

@@ -79,7 +79,8 @@ class PLR(GoalSelector):
         if self.replaying:
             replayed = draws[:, 1] < self.config.replay
             place = torch.searchsorted(self._upto, draws[:, 2] * self._upto[-1], right=True)
-            place = place.clamp(max=self.config.capacity - 1)
+            # Rounding may put the number beyond the last level that there is.
+            place = torch.minimum(place, (self._upto < self._upto[-1]).sum())
             distance = (candidates - self._level[place].unsqueeze(1)).square().sum(2)
             pick = torch.where(replayed, distance.argmin(1), pick)
             score = torch.where(replayed, self._score[place], score)
@@ -121,11 +122,16 @@ class PLR(GoalSelector):
         return loss
 
     def _refresh(self, done: Resolved, loss: Tensor) -> None:
-        """Write the new scores of replayed levels, unless another one has taken their place meanwhile."""
+        """Write the new scores of replayed levels, unless another one has taken their place meanwhile.
+
+        Many worlds replay the same level at once: its score is the mean over them.
+        """
         place = (done.note - 1).clamp(min=0)
-        valid = (done.note > 0) & (self._made[place] <= done.issued)
-        self._score[place[valid]] = loss[valid]
-        self._seen[place[valid]] = done.resolved[valid]
+        # What was issued on the step of a lesson was issued before it, from the levels of before.
+        valid = (done.note > 0) & (self._made[place] < done.issued)
+        place = place[valid]
+        self._score.scatter_reduce_(0, place, loss[valid], "mean", include_self=False)
+        self._seen.scatter_reduce_(0, place, done.resolved[valid], "amax")
 
     def _insert(self, new: Resolved, loss: Tensor, now: int) -> None:
         """Let the best new levels take the places of the worst old ones."""

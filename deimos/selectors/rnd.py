@@ -11,6 +11,7 @@ from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Interactions
 from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
+from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 from deimos.seeds import generator, weights_from
 from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
@@ -65,9 +66,9 @@ class RND(GoalSelector):
         with weights_from(seed, "rnd weights"):
             self.target = mlp(inputs, config.target, config.features, config.activation)
             self.predictor = mlp(inputs, config.predictor, config.features, config.activation)
-        for layer in (*self.target, *self.predictor):
-            if isinstance(layer, nn.Linear):
-                nn.init.orthogonal_(layer.weight, 2**0.5)
+            for layer in (*self.target, *self.predictor):
+                if isinstance(layer, nn.Linear):
+                    nn.init.orthogonal_(layer.weight, 2**0.5)
         self.target.to(spaces.device)
         self.predictor.to(spaces.device)
         self._parameters, _ = flatten_parameters(self.predictor)
@@ -144,6 +145,7 @@ class RND(GoalSelector):
                 self._parameters.grad.zero_()
                 error = self._pass.forward(minibatch) - self._target_pass.forward(minibatch)
                 self._pass.backward(error * (2.0 / error.numel()))
+                mean_over_ranks(self._parameters.grad)
                 self.optimizer.step()
                 total += error.square().sum()
         return (total / (len(inputs) * self.config.features)).item()

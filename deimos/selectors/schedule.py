@@ -46,7 +46,7 @@ class Schedule(GoalSelector):
         from deimos.methods import method
 
         self.config = config
-        self._parts = [method(name).build(spaces, seed) for name in (config.first, config.second)]
+        self.parts = tuple(method(name).build(spaces, seed) for name in (config.first, config.second))
         self._switch = config.at * spaces.require_total_steps("schedule")
         self.switched = False
         """Whether the second method chooses."""
@@ -55,7 +55,7 @@ class Schedule(GoalSelector):
     @property
     def now(self) -> GoalSelector:
         """Who chooses."""
-        return self._parts[self.switched]
+        return self.parts[self.switched]
 
     @property
     def num_candidates(self) -> int:  # type: ignore[override]
@@ -65,17 +65,12 @@ class Schedule(GoalSelector):
     @property
     def needs_rollout(self) -> bool:  # type: ignore[override]
         """See ``GoalSelector.needs_rollout``."""
-        return any(part.needs_rollout for part in self._parts)
+        return any(part.needs_rollout for part in self.parts)
 
     @property
     def first_goals_scaled(self) -> bool:  # type: ignore[override]
         """See ``GoalSelector.first_goals_scaled``."""
         return self.now.first_goals_scaled
-
-    @property
-    def fear(self) -> object:
-        """The fear network of whoever chooses, or of the other; ``None`` where neither has one."""
-        return next((part.fear for part in (self.now, *self._parts) if hasattr(part, "fear")), None)
 
     def goal_range(self) -> Tensor | None:
         """See ``GoalSelector.goal_range``."""
@@ -92,7 +87,7 @@ class Schedule(GoalSelector):
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
         """See ``GoalSelector.learn``."""
         row = {"schedule/switched": float(self.switched)}
-        first, second = self._parts
+        first, second = self.parts
         if self.switched:
             row |= dict.fromkeys(self._keys, math.nan) | second.learn(interactions, rollout)
         else:
@@ -105,7 +100,7 @@ class Schedule(GoalSelector):
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
-        for name, part in zip((self.config.first, self.config.second), self._parts, strict=True):
+        for name, part in zip((self.config.first, self.config.second), self.parts, strict=True):
             try:
                 part.check()
             except SimulationError as error:
@@ -113,12 +108,12 @@ class Schedule(GoalSelector):
 
     def state_dict(self) -> dict:
         """See ``GoalSelector.state_dict``."""
-        parts = [part.state_dict() for part in self._parts]
+        parts = [part.state_dict() for part in self.parts]
         return {"parts": parts, "switched": self.switched, "switch": self._switch, "keys": self._keys}
 
     def load_state_dict(self, state: dict) -> None:
         """See ``GoalSelector.load_state_dict``."""
-        for part, saved in zip(self._parts, state["parts"], strict=True):
+        for part, saved in zip(self.parts, state["parts"], strict=True):
             part.load_state_dict(saved)
         # A run that goes on with a larger budget keeps the schedule that it began with.
         self.switched, self._switch, self._keys = state["switched"], state["switch"], state["keys"]

@@ -1,0 +1,103 @@
+"""One world of ground: tiles of rising level along x, a column for each shape along y, as one height grid."""
+
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrain.checks import cells, check_positive
+from terrain.files import write_whole
+
+SCHEMA = 1  # of the file that ``Terrain.save`` writes
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """The ground of a world. Between the samples of ``heights`` it is interpolated."""
+
+    heights: np.ndarray
+    """Ground at x = corner[0] + i * cell and y = corner[1] + j * cell [m], float32, shape (nx, ny)."""
+    cell: float
+    """Distance of two samples [m]."""
+    corner: tuple[float, float]
+    """World x and y of ``heights[0, 0]`` [m]."""
+    origins: np.ndarray
+    """Where robots start on each tile [m], z being the ground there, float32, shape (levels, columns, 3)."""
+    shapes: tuple[str, ...]
+    """Name of each column's shape, with its direction, such as ``stairs-up``."""
+    tile: float
+    """Side of a tile [m]."""
+    difficulty: np.ndarray
+    """Difficulty of each level, in [0, 1], float32, shape (levels,)."""
+
+    def __post_init__(self) -> None:
+        check_positive("cell", self.cell)
+        check_positive("tile", self.tile)
+        levels, columns = len(self.difficulty), len(self.shapes)
+        for name, shape in (("origins", (levels, columns, 3)), ("difficulty", (levels,)), ("heights", None)):
+            array = getattr(self, name)
+            if array.dtype != np.float32 or array.shape != (shape or array.shape):
+                raise ValueError(f"{name} must be float32 of shape {shape}, got {array.dtype} of shape {array.shape}.")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} must be finite everywhere.")
+        if self.heights.ndim != 2 or min(self.heights.shape) < 2:
+            raise ValueError(f"heights must have at least 2 x 2 samples, got the shape {self.heights.shape}.")
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Extent along x and y [m]."""
+        nx, ny = self.heights.shape
+        return (nx - 1) * self.cell, (ny - 1) * self.cell
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to one ``.npz`` file, whole or not at all; equal terrains give equal bytes.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        data = {field.name: getattr(self, field.name) for field in fields(self)}
+        write_whole(Path(path), lambda file: np.savez_compressed(file, schema=SCHEMA, **data))
+
+    @staticmethod
+    def load(path: str | Path) -> "Terrain":
+        """Read a file that ``save`` has written.
+
+        Raises:
+            OSError: If it cannot be read.
+            ValueError: If it is not such a file.
+        """
+        try:
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+                data: dict[str, Any] = {name: file[name] for name in file.files}
+            if data.pop("schema") != SCHEMA:
+                raise ValueError("it is of another version")
+            data["shapes"] = tuple(str(name) for name in data["shapes"])
+            data["corner"] = tuple(float(value) for value in data["corner"])
+            return Terrain(**data | {name: float(data[name]) for name in ("cell", "tile")})
+        except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({error}).") from error
+
+
+def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
+    """A plain of one tile around the origin, at height 0.
+
+    Args:
+        size: Side [m], positive.
+        cell: Distance of two samples [m]; must divide ``size``.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+    """
+    check_positive("size", size)
+    samples = cells("size", size, cell) + 1
+    return Terrain(
+        heights=np.zeros((samples, samples), np.float32),
+        cell=cell,
+        corner=(-size / 2, -size / 2),
+        origins=np.zeros((1, 1, 3), np.float32),
+        shapes=("flat",),
+        tile=size,
+        difficulty=np.zeros(1, np.float32),
+    )

@@ -1,0 +1,141 @@
+"""What shapes are made of: triangle meshes from heights. Faces are seen from above counter-clockwise."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+UPRIGHT = 1e-6  # a face whose unit normal has a smaller vertical part is a riser
+
+
+def from_quads(corners: np.ndarray) -> "Trimesh":
+    """Two triangles for every quadrilateral; nothing is shared, so that edges stay sharp when they are drawn.
+
+    Args:
+        corners: Corners in counter-clockwise order [m], shape (n, 4, 3).
+    """
+    first = 4 * np.arange(len(corners))[:, None]
+    faces = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
+    return from_triangles(corners.reshape(-1, 3), faces)
+
+
+def from_triangles(vertices: np.ndarray, faces: np.ndarray) -> "Trimesh":
+    """A mesh of these vertices [m], shape (n, 3), and faces, shape (m, 3), as they are."""
+    from trimesh import Trimesh
+
+    return Trimesh(vertices, faces, process=False, validate=False)
+
+
+def sheet(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> "Trimesh":
+    """A surface through a lattice of points.
+
+    Each cell is split along the diagonal that points to the middle of the sheet, as the edges of a pyramid do.
+
+    Args:
+        x: Coordinates of the lattice [m], rising, shape (n,).
+        y: The same along y, shape (m,).
+        height: Heights [m], shape (n, m).
+    """
+    n, m = height.shape
+    vertices = np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), height], axis=-1).reshape(-1, 3)
+    a = (m * np.arange(n - 1)[:, None] + np.arange(m - 1)).reshape(-1)  # d c
+    b, c, d = a + m, a + m + 1, a + 1  #                                  a b
+    middle_x, middle_y = (x[:-1] + x[1:] - x[0] - x[-1])[:, None], (y[:-1] + y[1:] - y[0] - y[-1])[None, :]
+    rising = (middle_x * middle_y >= 0).reshape(-1, 1)
+    faces = np.where(rising, np.stack([a, b, c, a, c, d], axis=1), np.stack([a, b, d, b, c, d], axis=1))
+    return from_triangles(vertices, faces.reshape(-1, 3))
+
+
+def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> "Trimesh":
+    """Level rectangles with vertical risers between those of different height.
+
+    Args:
+        x: Where a rectangle ends and the next begins [m], rising, shape (n + 1,).
+        y: The same along y, shape (m + 1,).
+        height: Height of each rectangle [m], shape (n, m).
+    """
+    n, m = height.shape
+    i, j = (index.reshape(-1) for index in np.indices((n, m)))
+    h = height[i, j]
+    quads = [_quads((x[i], y[j], h), (x[i + 1], y[j], h), (x[i + 1], y[j + 1], h), (x[i], y[j + 1], h))]
+
+    i, j = np.nonzero(height[:-1] != height[1:])  # risers across x: from (i, j) to (i + 1, j), facing the lower one
+    here, there, at = height[i, j], height[i + 1, j], x[i + 1]
+    right, left = np.where(here > there, (y[j], y[j + 1]), (y[j + 1], y[j]))
+    low, high = np.minimum(here, there), np.maximum(here, there)
+    quads.append(_quads((at, right, low), (at, left, low), (at, left, high), (at, right, high)))
+
+    i, j = np.nonzero(height[:, :-1] != height[:, 1:])
+    here, there, at = height[i, j], height[i, j + 1], y[j + 1]
+    right, left = np.where(here > there, (x[i + 1], x[i]), (x[i], x[i + 1]))
+    low, high = np.minimum(here, there), np.maximum(here, there)
+    quads.append(_quads((right, at, low), (left, at, low), (left, at, high), (right, at, high)))
+    return from_quads(np.concatenate(quads))
+
+
+def rings(half_sides: np.ndarray, heights: np.ndarray) -> "Trimesh":
+    """Nested level squares around the origin, with vertical risers.
+
+    Args:
+        half_sides: Half side of each square [m], falling, shape (n,). A square as large as the one before hides it.
+        heights: Height of each square [m], shape (n,).
+    """
+    lines = np.unique(np.concatenate([-half_sides, half_sides]).round(9))  # [nm]: what differs by less is one line
+    middle = np.abs((lines[:-1] + lines[1:]) / 2)
+    distance = np.maximum(middle[:, None], middle[None, :])
+    innermost = (distance[..., None] < half_sides).sum(axis=-1) - 1
+    return terraces(lines, lines, heights[innermost])
+
+
+def blocks(x: np.ndarray, y: np.ndarray, bottom: float, top: float) -> "Trimesh":
+    """Upright blocks without an underside.
+
+    Args:
+        x: Where each block begins and ends along x [m], shape (n, 2).
+        y: The same along y, shape (n, 2).
+        bottom: Height of their foot [m].
+        top: Height of their top [m].
+    """
+    low, high = np.full(len(x), bottom), np.full(len(x), top)
+    (left, right), (front, back) = x.T, y.T
+    around = [(left, front), (right, front), (right, back), (left, back)]
+    quads = [_quads(*[(px, py, high) for px, py in around])]
+    for (ax, ay), (bx, by) in zip(around, around[1:] + around[:1], strict=True):
+        quads.append(_quads((ax, ay, low), (bx, by, low), (bx, by, high), (ax, ay, high)))
+    return from_quads(np.concatenate(quads))
+
+
+def join(meshes: "list[Trimesh]", offsets: np.ndarray | None = None) -> "Trimesh":
+    """One mesh of several, each moved by its row of ``offsets`` [m], shape (n, 3)."""
+    moves = np.zeros((len(meshes), 3)) if offsets is None else offsets
+    starts = np.cumsum([0, *[len(mesh.vertices) for mesh in meshes[:-1]]])
+    vertices = np.concatenate([mesh.vertices + move for mesh, move in zip(meshes, moves, strict=True)])
+    return from_triangles(vertices, np.concatenate([m.faces + k for m, k in zip(meshes, starts, strict=True)]))
+
+
+def normals(mesh: "Trimesh") -> np.ndarray:
+    """Unit normals of the faces, shape (m, 3); NaN where a face has no area."""
+    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[mesh.faces], 1, 0)
+    normal = np.cross(b - a, c - a)
+    with np.errstate(invalid="ignore"):
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def steepest_slope(mesh: "Trimesh") -> float:
+    """Rise over run of the steepest face that is not a riser."""
+    up = normals(mesh)[:, 2]
+    up = up[up > UPRIGHT]
+    return float(np.sqrt(1 / up.min() ** 2 - 1)) if len(up) else 0.0
+
+
+def highest_riser(mesh: "Trimesh") -> float:
+    """Height of the highest vertical face [m]; 0 without any."""
+    upright = np.abs(normals(mesh)[:, 2]) <= UPRIGHT
+    z = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[upright], 2]
+    return float(np.ptp(z, axis=1).max()) if len(z) else 0.0
+
+
+def _quads(*corners: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    return np.stack([np.stack(corner, axis=-1) for corner in corners], axis=1)

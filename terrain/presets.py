@@ -1,0 +1,109 @@
+"""Ready-made grids, and grids from TOML files."""
+
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from terrain.catalog import convert, make
+from terrain.world import Grid, Share
+
+Recipe = tuple[tuple[str, float, dict[str, Any]], ...]
+"""Name, share and parameters of each shape."""
+
+# Proportions of Legged Gym: smooth slopes (half of them up), rough slopes, stairs up, stairs down, discrete.
+_LEGGED_GYM: Recipe = (
+    ("slope-up", 0.05, {}),
+    ("slope-down", 0.05, {}),
+    ("rough-slope-down", 0.1, {}),
+    ("stairs-up", 0.35, {}),
+    ("stairs-down", 0.25, {}),
+    ("discrete", 0.2, {}),
+)
+# The Go1's legs are 0.43 m long, so its steps end at 0.18 m. A sunk rectangle beside a raised one makes 2 h.
+_GO1: Recipe = (
+    ("slope-up", 0.05, {}),
+    ("slope-down", 0.05, {}),
+    ("rough-slope-down", 0.1, {"amplitude": (0.01, 0.05)}),
+    ("stairs-up", 0.35, {"height": (0.05, 0.18)}),
+    ("stairs-down", 0.25, {"height": (0.05, 0.18)}),
+    ("discrete", 0.2, {"height": (0.03, 0.09)}),
+)
+_PRESETS: dict[str, tuple[Recipe, dict[str, Any]]] = {
+    "legged-gym": (_LEGGED_GYM, {}),
+    "go1": (_GO1, {"border": 5.0, "max_step": 0.18}),
+}
+_GRID_KEYS = tuple(field.name for field in fields(Grid) if field.name != "shapes")
+
+
+def preset_names() -> list[str]:
+    """Names of the presets, sorted."""
+    return sorted(_PRESETS)
+
+
+def preset(name: str, **changes: Any) -> Grid:
+    """A ready-made grid.
+
+    Args:
+        name: One of ``preset_names()``.
+        changes: Fields of ``Grid`` that are to be otherwise.
+
+    Raises:
+        ValueError: If there is no such preset, or a value is out of its range.
+    """
+    recipe, values = _look_up(name)
+    return _grid(recipe, values | changes)
+
+
+def read_grid(path: str | Path, **changes: Any) -> Grid:
+    """A grid from a TOML file: fields of ``Grid``, and a table ``[[shape]]`` for each shape.
+
+    A shape's table has its ``name``, its ``share`` and any of its parameters. A file without shapes
+    takes those of the preset that it names: ``preset = "go1"``.
+
+    Args:
+        path: The file.
+        changes: Fields of ``Grid`` that are to be otherwise.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: If it is not such a file, or a value is out of its range.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        base, entries = table.pop("preset", None), table.pop("shape", [])
+        if base is None and not entries:
+            raise ValueError(f"it needs a [[shape]], or preset = one of {', '.join(preset_names())}")
+        if unknown := sorted(set(table) - set(_GRID_KEYS)):
+            raise ValueError(f"it has '{unknown[0]}', but may have only preset, shape, {', '.join(_GRID_KEYS)}")
+        recipe, values = ((), {}) if base is None else _look_up(base)
+        shapes = tuple(_entry(entry) for entry in entries) or recipe
+        return _grid(shapes, values | _numbers(table) | changes)
+    except ValueError as error:  # of TOML too
+        raise ValueError(f"{path}: {str(error).rstrip('.')}.") from error
+
+
+def _look_up(name: str) -> tuple[Recipe, dict[str, Any]]:
+    if name not in _PRESETS:
+        raise ValueError(f"There is no preset '{name}'; there are: {', '.join(preset_names())}.")
+    return _PRESETS[name]
+
+
+def _entry(table: Any) -> tuple[str, float, dict[str, Any]]:
+    """One ``[[shape]]`` of a file."""
+    if not isinstance(table, dict) or not isinstance(table.get("name"), str):
+        raise ValueError("every [[shape]] needs a name")
+    parameters = dict(table)
+    name, share = parameters.pop("name"), parameters.pop("share", 1.0)
+    if "tile" in parameters:
+        raise ValueError(f"the tile of '{name}' is that of the grid; write it above the first [[shape]]")
+    return name, convert("share", share, float), parameters
+
+
+def _numbers(table: dict[str, Any]) -> dict[str, Any]:
+    hints = get_type_hints(Grid)
+    return {name: convert(name, value, hints[name]) for name, value in table.items()}
+
+
+def _grid(recipe: Recipe, values: dict[str, Any]) -> Grid:
+    return Grid(shapes=tuple(Share(shape=make(name, p), share=share) for name, share, p in recipe), **values)

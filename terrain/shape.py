@@ -1,0 +1,79 @@
+"""What every shape of ground promises."""
+
+import abc
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from terrain.checks import check_positive, check_range
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+Ramp = tuple[float, float]
+"""A number at difficulty 0 and at difficulty 1, linear in between."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TileShape(abc.ABC):
+    """A square of ground around the origin, at height 0 along its edge, with a level middle to stand on.
+
+    A file of ``terrain.shapes`` holds one, named ``Shape``; its fields are its parameters. A field ``direction``
+    makes two shapes of it. It is seen by the robot, which starts in the middle: ``up`` is the way out of a
+    hollow, ``down`` the way off a hill.
+    """
+
+    tile: float = 8.0
+    """Side of the square [m], positive."""
+    platform: float = 3.0
+    """Side of the level middle [m], positive and smaller than the tile."""
+
+    def __post_init__(self) -> None:
+        check_positive("tile", self.tile)
+        check_positive("platform", self.platform)
+        if self.platform >= self.tile:
+            raise ValueError(f"platform must be smaller than tile = {self.tile:g} m, got {self.platform:g} m.")
+
+    @abc.abstractmethod
+    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+        """Make the mesh; use ``build``, which checks its arguments.
+
+        Args:
+            difficulty: From 0, the easiest, to 1.
+            generator: The only source of randomness.
+
+        Returns:
+            A mesh [m] that covers the square and nothing else, normals up or, on risers, outwards.
+        """
+
+    def build(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+        """The mesh of this shape.
+
+        Args:
+            difficulty: From 0, the easiest, to 1.
+            generator: The only source of randomness: its state decides the mesh, to the bit.
+
+        Returns:
+            A mesh [m] that covers the square and nothing else, normals up or, on risers, outwards.
+
+        Raises:
+            ValueError: If ``difficulty`` is out of its range.
+        """
+        check_range("difficulty", difficulty, 0, 1)
+        return self.surface(difficulty, generator)
+
+    def step(self, difficulty: float) -> float:
+        """Highest step that a robot may have to take up or down [m]; gaps are crossed, not stepped into."""
+        return 0.0
+
+    @property
+    def standing_room(self) -> float:
+        """Side of the square around the middle that is level [m]."""
+        return self.platform
+
+
+def at(ramp: Ramp, difficulty: float) -> float:
+    """Value of a ramp at a difficulty in [0, 1]."""
+    easiest, hardest = ramp
+    return (1.0 - difficulty) * easiest + difficulty * hardest

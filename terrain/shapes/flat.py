@@ -1,0 +1,26 @@
+"""Level ground."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from terrain.mesh import rings
+from terrain.shape import TileShape
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape(TileShape):
+    """Level ground at every difficulty."""
+
+    @property
+    def standing_room(self) -> float:
+        """All of it."""
+        return self.tile
+
+    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+        """See ``TileShape.surface``."""
+        return rings(np.array([self.tile / 2]), np.zeros(1))

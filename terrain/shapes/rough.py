@@ -1,0 +1,41 @@
+"""Uniformly noised ground."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from terrain.checks import check_positive, check_ramp, check_range
+from terrain.mesh import sheet
+from terrain.noise import draw_noise
+from terrain.shape import Ramp, TileShape, at
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape(TileShape):
+    """Independent uniform heights on a lattice, with planes in between."""
+
+    platform: float = 1.0
+    """Side of the middle without noise [m], positive and smaller than the tile."""
+    amplitude: Ramp = (0.01, 0.05)
+    """Heights are in [-amplitude, amplitude], at difficulty 0 and at 1 [m], each at least 0.
+    Legged Gym's 0.05 m is reached at difficulty 1."""
+    quantum: float = 0.005
+    """Heights are multiples of this [m], positive."""
+    spacing: float = 0.2
+    """Distance of two heights [m], positive, at most a quarter of the tile."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ramp("amplitude", self.amplitude)
+        check_positive("quantum", self.quantum)
+        check_range("spacing", self.spacing, 0.01, self.tile / 4)
+
+    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+        """See ``TileShape.surface``."""
+        amplitude = at(self.amplitude, difficulty)
+        line, height = draw_noise(generator, self.tile, self.spacing, amplitude, self.quantum, self.platform)
+        return sheet(line, line, height)

@@ -1,0 +1,58 @@
+"""Slopes with uniform noise on them."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from terrain.checks import check_positive, check_ramp, check_range
+from terrain.mesh import sheet
+from terrain.noise import draw_noise, interpolate
+from terrain.shape import Ramp, TileShape, at
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape(TileShape):
+    """A pyramid with a flat top, or a hollow, roughened by noise; formulas of Legged Gym."""
+
+    direction: Literal["up", "down"] = "up"
+    """Way out of the middle: up out of a hollow, or down a hill."""
+    gradient: Ramp = (0.0, 0.4)
+    """Rise over run of the slopes at difficulty 0 and at 1, each at least 0."""
+    amplitude: Ramp = (0.05, 0.05)
+    """Noise is in [-amplitude, amplitude], at difficulty 0 and at 1 [m], each at least 0."""
+    quantum: float = 0.005
+    """Noise is a multiple of this [m], positive."""
+    spacing: float = 0.2
+    """Distance of two noise values [m], bilinear in between; positive, at most a quarter of the tile."""
+    room: float = 1.0
+    """Side of the square in the middle without noise [m], positive, at most the platform."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ramp("gradient", self.gradient)
+        check_ramp("amplitude", self.amplitude)
+        check_positive("quantum", self.quantum)
+        check_range("spacing", self.spacing, 0.01, self.tile / 4)
+        check_positive("room", self.room)
+        if self.room > self.platform:
+            raise ValueError(f"room must be at most platform = {self.platform:g} m, got {self.room:g} m.")
+
+    @property
+    def standing_room(self) -> float:
+        """The square without noise."""
+        return self.room
+
+    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+        """See ``TileShape.surface``."""
+        amplitude = at(self.amplitude, difficulty)
+        coarse, noise = draw_noise(generator, self.tile, self.spacing, amplitude, self.quantum, self.room)
+        edge = self.platform / 2
+        line = np.unique(np.concatenate([coarse, (coarse[:-1] + coarse[1:]) / 2, [-edge, edge]]).round(9))
+        out = np.maximum(np.abs(line)[:, None], np.abs(line)[None, :])  # distance from the middle, by the larger axis
+        rise = at(self.gradient, difficulty) * (self.tile / 2 - np.maximum(out, edge))
+        slope = -rise if self.direction == "up" else rise
+        return sheet(line, line, slope + interpolate(coarse, noise, line))

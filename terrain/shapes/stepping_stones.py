@@ -1,0 +1,58 @@
+"""Stepping stones."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from terrain.checks import check_positive, check_ramp
+from terrain.mesh import blocks, join, rings
+from terrain.shape import Ramp, TileShape, at
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape(TileShape):
+    """Rows of square stones over a deep floor, each row shifted at random, around a level middle."""
+
+    side: Ramp = (1.575, 0.075)
+    """Side of a stone at difficulty 0 and at 1 [m], each positive; Legged Gym's 1.5 (1.05 - d). Changed as little
+    as needed for whole rows to fill the tile."""
+    gap: Ramp = (0.05, 0.1)
+    """Distance of two stones at difficulty 0 and at 1 [m], each positive. Legged Gym's is 0.05 m at 0, else 0.1 m."""
+    depth: float = 1.0
+    """Depth of the floor [m], positive."""
+    rim: float = 0.5
+    """Width of the level rim along the edge [m], positive."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("side", "gap"):
+            check_ramp(name, getattr(self, name), least=0.01)
+        check_positive("depth", self.depth)
+        check_positive("rim", self.rim)
+        if self.platform + 2 * self.rim + 4 * max(self.gap) >= self.tile:
+            raise ValueError(
+                f"tile must be larger than platform + 2 rim + 4 gap = "
+                f"{self.platform + 2 * self.rim + 4 * max(self.gap):g} m, got {self.tile:g} m."
+            )
+
+    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+        """See ``TileShape.surface``."""
+        gap = at(self.gap, difficulty)
+        bed = self.tile / 2 - self.rim  # half side of what the stones stand in
+        count = max(1, round((2 * bed - gap) / (at(self.side, difficulty) + gap)))
+        pitch = (2 * bed - gap) / count
+        first = -bed + gap + pitch * np.arange(count)
+        x, y = [], []
+        for front in first:
+            left = (np.arange(-1, count) + generator.uniform(1 / 3, 2 / 3)) * pitch - bed + gap
+            ends = np.stack([np.maximum(left, -bed + gap), np.minimum(left + pitch - gap, bed - gap)], axis=1)
+            ends = ends[ends[:, 1] - ends[:, 0] > (pitch - gap) / 4]  # a foot finds no hold on less
+            x.append(ends)
+            y.append(np.broadcast_to([front, front + pitch - gap], ends.shape))
+        middle = np.array([[-self.platform / 2, self.platform / 2]])
+        stones = blocks(np.concatenate([*x, middle]), np.concatenate([*y, middle]), -self.depth, 0.0)
+        return join([rings(np.array([self.tile / 2, bed]), np.array([0.0, -self.depth])), stones])

@@ -1,0 +1,208 @@
+"""The layout of a world and its making: shapes, tiles, one mesh, one height grid."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kernels.ray_cast import LARGEST
+from terrain import catalog
+from terrain.checks import cells, check_at_least, check_positive, check_range
+from terrain.grid import Terrain
+from terrain.heightfield import rasterise
+from terrain.mesh import from_quads, join
+from terrain.shape import TileShape
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share of it that is done, in [0, 1]."""
+
+BYTES_PER_SAMPLE = 12  # measured: 5 while a terrain is made, checked and saved, 9 while its files are written
+BYTES_PER_TILE = 5 * 2**20  # measured: 4.5 MiB for the finest stepping stones, less for all else
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """A shape and how much of the world it gets."""
+
+    shape: TileShape
+    """The ground of the columns; its ``tile`` is that of the grid."""
+    share: float = 1.0
+    """Part of the columns, positive; in relation to the sum of all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Tiles of rising difficulty along x (levels), a column for each shape along y, and a level border around."""
+
+    shapes: tuple[Share, ...]
+    """What the columns are made of, in order, at least one."""
+    levels: int = 10
+    """Tiles along x, at least 1."""
+    columns: int = 20
+    """Tiles along y, at least 1."""
+    tile: float = 8.0
+    """Side of a tile [m], positive."""
+    border: float = 25.0
+    """Width of the level border [m], at least 0."""
+    cell: float = 0.05
+    """Distance of two samples of the height grid [m]; must divide tile and border."""
+    easiest: float = 0.0
+    """Difficulty of the first level, in [0, 1]."""
+    hardest: float = 0.9
+    """Difficulty of the last level, in [0, 1]."""
+    max_step: float = np.inf
+    """Highest step that any shape may have at any level [m]."""
+    seed: int = 0
+    """Seed of every tile, at least 0."""
+
+    def __post_init__(self) -> None:
+        check_at_least("levels", self.levels, 1)
+        check_at_least("columns", self.columns, 1)
+        check_at_least("seed", self.seed, 0)
+        check_positive("tile", self.tile)
+        check_range("border", self.border, 0, 1e6)
+        check_range("easiest", self.easiest, 0, 1)
+        check_range("hardest", self.hardest, 0, 1)
+        cells("tile", self.tile, self.cell)
+        cells("border", self.border, self.cell)
+        if not self.shapes:
+            raise ValueError("shapes must have at least one entry.")
+        for part in self.shapes:
+            check_positive("share", part.share)
+        for shape in self.column_shapes:
+            highest = max(shape.step(self.easiest), shape.step(self.hardest))
+            if highest > self.max_step + 1e-9:
+                raise ValueError(
+                    f"max_step is {self.max_step:g} m, but {catalog.name_of(shape)} at difficulty "
+                    f"{max(self.easiest, self.hardest):g} has steps of {highest:g} m; lower them or raise max_step."
+                )
+
+    @property
+    def column_shapes(self) -> tuple[TileShape, ...]:
+        """The shape of each column: column j has the shape at j / columns + 0.001 of the summed shares."""
+        ends = np.cumsum([part.share for part in self.shapes])
+        # The small shift is Legged Gym's: sums of shares such as 0.1 + 0.2 are not what they seem.
+        choice = np.arange(self.columns) / self.columns + 0.001
+        which = np.minimum(np.searchsorted(ends / ends[-1], choice, side="right"), len(ends) - 1)
+        return tuple(replace(self.shapes[k].shape, tile=self.tile) for k in which)
+
+    @property
+    def difficulty(self) -> np.ndarray:
+        """Difficulty of each level, float32, shape (levels,)."""
+        return np.linspace(self.easiest, self.hardest, self.levels, dtype=np.float32)
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """World x and y of the first sample [m]; the tiles lie around the origin."""
+        return -self.levels * self.tile / 2 - self.border, -self.columns * self.tile / 2 - self.border
+
+    @property
+    def num_samples(self) -> tuple[int, int]:
+        """Samples of the height grid along x and y."""
+        tile, border = cells("tile", self.tile, self.cell), cells("border", self.border, self.cell)
+        return self.levels * tile + 2 * border + 1, self.columns * tile + 2 * border + 1
+
+    @property
+    def centres(self) -> np.ndarray:
+        """Middle of each tile at height 0 [m], shape (levels, columns, 3)."""
+        level, column = np.indices((self.levels, self.columns))
+        x = (level + 0.5 - self.levels / 2) * self.tile
+        y = (column + 0.5 - self.columns / 2) * self.tile
+        return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+    @property
+    def memory(self) -> int:
+        """About how much memory the making takes [B]."""
+        nx, ny = self.num_samples
+        return BYTES_PER_SAMPLE * nx * ny + BYTES_PER_TILE * self.levels * self.columns
+
+
+def build(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> Terrain:
+    """Make a world; see ``build_with_mesh``."""
+    return build_with_mesh(grid, device=device, progress=progress)[0]
+
+
+def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> "tuple[Terrain, Trimesh]":
+    """Make a world and the mesh that it is the height grid of.
+
+    The same grid gives the same bytes, on any number of threads.
+
+    Args:
+        grid: The layout.
+        device: Warp device that rasterises the mesh.
+        progress: Called with the stage and the share of it that is done.
+
+    Raises:
+        ValueError: If it would not fit into memory.
+    """
+    require_memory(grid)
+    mesh = build_mesh(grid, progress)
+    report = progress or (lambda stage, share: None)
+    heights = rasterise(
+        mesh, grid.corner, grid.cell, grid.num_samples, device=device, progress=lambda share: report("rays", share)
+    )
+    origins = grid.centres
+    i, j = np.moveaxis(np.rint((origins[..., :2] - grid.corner) / grid.cell).astype(int), -1, 0)
+    origins[..., 2] = heights[i, j]
+    names = tuple(catalog.name_of(shape) for shape in grid.column_shapes)
+    terrain = Terrain(heights, grid.cell, grid.corner, origins.astype(np.float32), names, grid.tile, grid.difficulty)
+    return terrain, mesh
+
+
+def build_mesh(grid: Grid, progress: Progress | None = None) -> "Trimesh":
+    """The mesh of a world [m]: all tiles and the border.
+
+    Every tile has a generator of its own, seeded by (seed, level, column): none depends on another.
+    """
+    tiles = []
+    for level, difficulty in enumerate(grid.difficulty):
+        for column, shape in enumerate(grid.column_shapes):
+            seed = np.random.SeedSequence(grid.seed, spawn_key=(level, column))
+            tiles.append(shape.build(float(difficulty), np.random.default_rng(seed)))
+        if progress is not None:
+            progress("tiles", (level + 1) / grid.levels)
+    offsets = grid.centres.reshape(-1, 3)
+    if grid.border > 0:
+        tiles.append(_border(grid))
+        offsets = np.concatenate([offsets, np.zeros((1, 3))])
+    return join(tiles, offsets)
+
+
+def require_memory(grid: Grid) -> None:
+    """Raise ``ValueError`` if a grid has too many samples, or its making would not fit into memory."""
+    most = max(grid.num_samples) - 1
+    if most > LARGEST:
+        raise ValueError(
+            f"cell must be at least {grid.cell * most / LARGEST:.3g} m for {LARGEST} cells along an axis at most, "
+            f"got {grid.cell:g} m, which makes {most}."
+        )
+    free = _free_memory()
+    if grid.memory > free:
+        nx, ny = grid.num_samples
+        raise ValueError(
+            f"The grid of {nx} x {ny} samples needs about {grid.memory / 2**30:.1f} GiB of memory and "
+            f"{free / 2**30:.1f} GiB are free; enlarge cell, or ask for fewer levels or columns."
+        )
+
+
+def _free_memory() -> int:
+    """Memory that a program can still get [B]."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            return next(1024 * int(line.split()[1]) for line in file if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):  # not Linux
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _border(grid: Grid) -> "Trimesh":
+    outer = -np.asarray(grid.corner)
+    inner = outer - grid.border
+    ring = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
+    far, near = ring * [*outer, 0], ring * [*inner, 0]
+    following = [1, 2, 3, 0]
+    return from_quads(np.stack([far, far[following], near[following], near], axis=1))

@@ -1,0 +1,281 @@
+"""The generator: what it writes, what it says, and what it refuses."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import terrain
+from terrain import catalog, cli, console, export, presets
+from terrain.world import build_with_mesh
+
+ENDINGS = (".stl", ".obj", ".ply", ".glb", ".npz", ".png")
+SMALL = ["--levels", "2", "--columns", "3", "--cell", "0.2", "--border", "1"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A small grid, its terrain and its mesh."""
+    grid = presets.preset("go1", levels=2, columns=3, cell=0.2, border=1.0)
+    return (grid, *build_with_mesh(grid))
+
+
+def run(*arguments):
+    """The tool's exit code."""
+    return cli.main([str(argument) for argument in arguments])
+
+
+def test_list_names_everything(capsys):
+    """Every shape, every parameter with its meaning, and every preset is listed."""
+    assert run("list") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for name in catalog.names():
+        assert name in said
+        for field, text in console.field_docs(catalog.shape_class(name)).items():
+            if field != "direction":
+                assert f"--{field}" in said
+                assert text.split()[0] in said
+    for name in presets.preset_names():
+        assert f"preset {name}" in said
+
+
+def test_everything_is_written_at_once(folder, small, capsys):
+    """One call writes the mesh in four formats, the terrain, its grey values, a MuJoCo model and a picture."""
+    files = [f"ground{ending}" for ending in ENDINGS]
+    assert run("grid", *SMALL, "--out", *files, "--mjcf", "model", "--preview", "view.png") == 0
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*files, "model", "view.png"])
+    said = capsys.readouterr().out
+    for word in ("extents", "steepest slope", "highest riser", "vertices", "samples", "time", *files, "model"):
+        assert word in said
+    _, ground, mesh = small
+    assert terrain.load("ground.npz").heights.tobytes() == ground.heights.tobytes()
+    for ending in (".stl", ".obj", ".ply", ".glb"):
+        loaded = trimesh.load(f"ground{ending}", force="mesh", process=False)
+        assert len(loaded.faces) == len(mesh.faces)
+        bounds = np.array(mesh.bounds)
+        if ending == ".glb":  # y is up in glTF, and z points to the viewer
+            bounds = np.stack([bounds[:, 0], bounds[:, 2], -bounds[::-1, 1]], axis=1)
+        np.testing.assert_allclose(loaded.bounds, bounds, rtol=1e-6, atol=1e-6)
+    with Image.open("view.png") as picture:
+        assert min(picture.size) > 300
+        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 100
+
+
+def test_mujoco_model_stands_by_itself(folder, small):
+    """MuJoCo loads the folder from anywhere, and its height field is the grid to a micrometre."""
+    assert run("grid", *SMALL, "--mjcf", "model") == 0
+    model = mujoco.MjModel.from_xml_path(str(folder / "model" / "terrain.xml"))
+    ground = small[1]
+    shares = model.hfield_data.reshape(model.hfield_nrow[0], model.hfield_ncol[0]).T
+    heights = model.geom_pos[0, 2] + model.hfield_size[0, 2] * shares.astype(np.float64)
+    np.testing.assert_allclose(heights, ground.heights, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(model.geom_pos[0, :2] - model.hfield_size[0, :2], ground.corner, atol=1e-6)
+    np.testing.assert_allclose(2 * model.hfield_size[0, :2], ground.size, rtol=1e-6)
+
+
+def test_mujoco_model_of_level_ground_loads(folder):
+    """A terrain without any relief is a model too."""
+    assert run("shape", "flat", "--cell", "0.5", "--mjcf", "model") == 0
+    model = mujoco.MjModel.from_xml_path("model/terrain.xml")
+    assert not model.hfield_data.any()
+    assert model.geom_pos[0, 2] == 0
+
+
+def test_grey_values_give_the_heights_back(folder, small):
+    """The 16-bit picture is a map, x to the right and y up, and its note tells heights to half a grey value."""
+    assert run("grid", *SMALL, "--out", "ground.png") == 0
+    ground = small[1]
+    _, low, unit = export.grey(ground)
+    with Image.open("ground.png") as picture:
+        note, grey = picture.info["Description"], np.asarray(picture)
+    assert grey.dtype == np.uint16
+    assert note.startswith(f"height [m] = {low!r} + {unit!r} * grey; 0.2 m per pixel")
+    heights = low + unit * grey[::-1].T.astype(np.float64)
+    np.testing.assert_allclose(heights, ground.heights, rtol=0, atol=0.5001 * unit + 1e-7)
+
+
+def test_same_call_gives_the_same_bytes(folder):
+    """Running the tool twice gives the same files, pictures included."""
+    for name in ("a", "b"):
+        (folder / name).mkdir()
+        outputs = ["--out", *(f"{name}/ground{ending}" for ending in ENDINGS), "--preview", f"{name}/view.png"]
+        assert run("shape", "rough", "--seed", 3, "--cell", "0.2", *outputs) == 0
+    for path in (folder / "a").iterdir():
+        assert path.read_bytes() == (folder / "b" / path.name).read_bytes(), path.name
+
+
+def test_shape_takes_its_parameters(folder, capsys):
+    """A tile is built with the parameters, the seed and the difficulty that are given."""
+    assert run("shape", "stairs-down", "--difficulty", "0.5", "--height", "0.1", "0.2", "--tread", "0.5",
+               "--tile", "6", "--platform", "2", "--border", "1", "--cell", "0.1", "--out", "s.npz") == 0  # fmt: skip
+    ground = terrain.load("s.npz")
+    assert ground.shapes == ("stairs-down",)
+    assert ground.size == pytest.approx((8.0, 8.0))
+    np.testing.assert_allclose(np.unique(ground.heights), 0.15 * np.arange(5), atol=1e-6)
+    assert "0.150" in capsys.readouterr().out
+
+
+def test_grid_takes_a_file_or_a_list(folder):
+    """A grid is built from a TOML file, or from shapes that share the columns evenly."""
+    (folder / "my.toml").write_text('levels = 1\ncolumns = 2\ncell = 0.4\nborder = 0\n[[shape]]\nname = "gap"\n')
+    assert run("grid", "--file", "my.toml", "--levels", "2", "--out", "a.npz") == 0
+    assert terrain.load("a.npz").origins.shape == (2, 2, 3)
+    assert run("grid", "--shapes", "gap", "pit", "--difficulty", "0.2", "0.4", "--cell", "0.2", "--levels", "3",
+               "--out", "b.npz") == 0  # fmt: skip
+    ground = terrain.load("b.npz")
+    assert ground.shapes == ("gap", "pit")
+    np.testing.assert_allclose(ground.difficulty, [0.2, 0.3, 0.4], rtol=1e-6)
+
+
+def test_force_overwrites_and_nothing_else_does(folder, capsys):
+    """An output that exists is kept, and with --force replaced; other files in a model's folder stay."""
+    (folder / "model").mkdir()
+    for name in ("flat.npz", "model/terrain.xml", "model/mine.txt"):
+        (folder / name).write_text("before")
+    for output in (["--out", "flat.npz"], ["--mjcf", "model"]):
+        assert run("shape", "flat", "--cell", "0.5", *output) == 2
+        assert "exists and is not overwritten; choose another name, or add --force" in capsys.readouterr().err
+    assert (folder / "flat.npz").read_text() == "before"
+    assert run("shape", "flat", "--cell", "0.5", "--out", "flat.npz", "--mjcf", "model", "--force") == 0
+    assert terrain.load("flat.npz").shapes == ("flat",)
+    assert sorted(path.name for path in (folder / "model").iterdir()) == ["heights.bin", "mine.txt", "terrain.xml"]
+    assert (folder / "model" / "mine.txt").read_text() == "before"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("shape flat --difficulty 1.5", "difficulty must be in [0, 1], got 1.5"),
+        ("shape flat --difficulty nan", "difficulty must be in [0, 1], got nan"),
+        ("grid --difficulty 0 2", "hardest must be in [0, 1], got 2.0"),
+        ("shape stairs", "There is no shape 'stairs'; there are: discrete, flat, gap"),
+        ("shape", "shape needs a name first, one of: discrete, flat"),
+        ("grid --shapes flat stair", "There is no shape 'stair'; there are: discrete, flat, gap"),
+        ("grid --preset go2", "There is no preset 'go2'; there are: go1, legged-gym"),
+        ("shape pit --tile 3", "platform must be smaller than tile = 3 m, got 4 m"),
+        ("grid --tile 2", "platform must be smaller than tile = 2 m, got 3 m"),
+        ("shape stairs-up --max-step 0.1", "max_step is 0.1 m, but stairs-up at difficulty 0.5 has steps of 0.14 m"),
+        ("grid --preset legged-gym --max-step 0.2", "has steps of 0.212 m; lower them or raise max_step"),
+        ("shape flat --cell 0.3", "cell must divide tile = 8 m, got 0.3 m"),
+        ("shape flat --cell 0", "cell must be finite and positive, got 0.0"),
+        ("shape flat --cell 0.0001", "cell must be at least 0.000488 m for 16384 cells along an axis at most"),
+        ("shape flat --out here.npz", "here.npz exists and is not overwritten; choose another name, or add --force"),
+        ("shape flat --out a.stl b.xyz", "out must end in one of .glb, .obj, .ply, .stl, .npz, .png, got b.xyz"),
+        ("shape flat --out noending", "out must end in one of .glb, .obj, .ply, .stl, .npz, .png, got noending"),
+        ("shape flat --preview a.jpg", "preview must end in .png, got a.jpg"),
+        ("shape flat --out a.png --preview a.png", "a.png is named twice"),
+        ("shape flat --out no/a.npz", "The folder no does not exist; make it first"),
+        ("shape flat --mjcf no/model", "The folder no does not exist; make it first"),
+        ("shape flat --mjcf here.npz", "mjcf must be a folder, but here.npz is a file"),
+        ("shape flat --steps 3", "Unrecognized options: --steps"),
+        ("shape flat --seed one", "seed"),
+        ("shape flat --seed -1", "seed must be a whole number of at least 0, got -1"),
+        ("shape waves --count 0", "waves: count must be a whole number of at least 1, got 0"),
+        ("grid --file no.toml", "no.toml could not be read or written (No such file or directory)"),
+        ("grid --file here.npz", "here.npz: "),
+        ("grid --file a.toml --preset go1", "file excludes preset and shapes"),
+        ("grid --shapes flat --preset go1", "shapes excludes preset"),
+        ("bench --robots 0", "robots must be a whole number of at least 1, got 0"),
+        ("bench --json no/a.json", "json must be in a folder that exists, got no/a.json"),
+        ("shapes", "There is no command 'shapes'; there are: list, shape, grid, bench"),
+    ],
+)
+def test_mistakes_give_one_line(folder, capsys, arguments, message):
+    """Whatever the user can mend ends in one line on stderr and exit code 2, and no file is written or changed."""
+    (folder / "here.npz").write_text("before")
+    assert run(*arguments.split()) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("python -m terrain: ")
+    assert said.err.count("\n") == 1
+    assert message in said.err
+    assert [path.name for path in folder.iterdir()] == ["here.npz"]
+    assert (folder / "here.npz").read_text() == "before"
+
+
+def test_grid_that_does_not_fit_is_refused(folder, capsys, monkeypatch):
+    """A grid beyond the free memory says how much it needs, and writes nothing."""
+    monkeypatch.setattr("terrain.world._free_memory", lambda: 2**27)
+    assert run("grid", "--out", "a.npz") == 2
+    assert "needs about 1.0 GiB of memory and 0.1 GiB are free; enlarge cell" in capsys.readouterr().err
+    assert not list(folder.iterdir())
+
+
+def test_full_disk_leaves_no_half_file(folder, capsys, monkeypatch):
+    """When a file cannot be written to its end, the one of before stays and no other remains."""
+
+    def fail(number):
+        raise OSError(28, "No space left on device")
+
+    (folder / "a.npz").write_text("before")
+    monkeypatch.setattr("os.fsync", fail)
+    assert run("shape", "flat", "--cell", "0.5", "--out", "a.npz", "--force") == 2
+    said = capsys.readouterr().err
+    assert "No space left on device" in said
+    assert said.count("\n") == 1
+    assert [path.read_text() for path in folder.iterdir()] == ["before"]
+
+
+def test_interrupt_ends_quietly(folder, capsys, monkeypatch):
+    """Ctrl-C ends with one line and exit code 130, and leaves no half-written file."""
+
+    def interrupt(*arguments, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.fsync", interrupt)
+    assert run("shape", "flat", "--cell", "0.5", "--out", "a.npz") == 130
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["shape", "--help"], ["shape", "pit", "--help"],
+                                       ["grid", "--help"], ["list", "--help"], ["bench", "--help"]])  # fmt: skip
+def test_help_is_there(capsys, arguments):
+    """Every command explains itself and ends with exit code 0."""
+    assert run(*arguments) == 0
+    assert len(capsys.readouterr().out) > 100
+
+
+def test_bench_prints_a_ratio(folder, capsys, monkeypatch):
+    """The benchmark measures both subjects, here on small grids, prints its tables and writes its numbers."""
+    preset, little = presets.preset, {"levels": 2, "columns": 3, "cell": 0.2}
+    monkeypatch.setattr(presets, "preset", lambda name, **changes: preset(name, **(little | changes)))
+    assert run("bench", "--robots", "64", "--rounds", "1", "--json", "numbers.json") == 0
+    said = capsys.readouterr().out
+    for word in ("legged-gym", "M rays/s", "bilinear", "NumPy", "times as fast as NumPy"):
+        assert word in said
+    numbers = json.loads((folder / "numbers.json").read_text())
+    assert [row["preset"] for row in numbers["making"]] == presets.preset_names()
+    assert numbers["scan"]["bilinear / NumPy"] > 0
+
+
+def test_bench_compares_the_same_thing(small):
+    """NumPy's height scan in the benchmark gives the heights of the kernel's."""
+    import warp as wp
+
+    from kernels.height_scan import scan_heights, scan_points
+    from terrain.bench import scan_by_numpy
+
+    ground, points = small[1], scan_points()
+    rng = np.random.default_rng(0)
+    place = np.insert(rng.uniform(-8, 8, (50, 2)), 2, 0.0, axis=1).astype(np.float32)
+    pose = rng.normal(size=(50, 4))
+    pose = (pose / np.linalg.norm(pose, axis=1, keepdims=True)).astype(np.float32)
+    out = wp.zeros((50, 187), dtype=wp.float32, device="cpu")
+    scan_heights(
+        wp.array(ground.heights, dtype=wp.float32, device="cpu"), ground.cell, ground.corner,
+        wp.array(place, dtype=wp.vec3, device="cpu"), wp.array(pose, dtype=wp.vec4, device="cpu"),
+        wp.array(points, dtype=wp.vec2, device="cpu"), out,
+    )  # fmt: skip
+    # Both round coordinates of 10 m a few times; the ground rises 2 m per metre at most.
+    np.testing.assert_allclose(scan_by_numpy(ground, place, pose, points), out.numpy(), rtol=0, atol=1e-4)
