@@ -55,14 +55,17 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
     if afraid is None or not afraid.fear.fitted:
         raise RunError("This run's selector has no fear network that has learnt anything.")
     generator = seeds.generator(trainer.config.seed, "audit", trainer.env.device)
-    probe = trainer.config.env.build(BATCH * CANDIDATES, trainer.env.device, trainer.config.seed)
-    clones = Clones(probe, lambda obs: _act(trainer, obs, generator))
+    config = trainer.config
+    clones = Clones(
+        lambda count: config.env.build(count, trainer.env.device, config.seed),
+        lambda obs: _act(trainer, obs, generator), limit=BATCH * CANDIDATES,
+    )  # fmt: skip
     ranks: list[float] = []
     crashes = tried = 0
     while len(ranks) < contexts and tried < PATIENCE * contexts:
         state, goal, candidates, survived = _next_contexts(trainer, clones, generator)
         logit = afraid.score(state, goal, candidates)
-        crashed = survived < probe.goal_period
+        crashed = survived < trainer.env.goal_period
         tried += len(logit)
         crashes += int(crashed.sum())
         ranks += [

@@ -132,7 +132,7 @@ def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     p, y = probability.double(), crashed.double()
     rate = y.mean()
     curve = reliability(p, crashed)
-    share = curve.count / len(p)
+    share = curve.count.double() / len(p)
     base = nn.functional.binary_cross_entropy(rate.expand_as(y), y)
     loss = nn.functional.binary_cross_entropy(p, y)
     top = p.topk(max(1, len(p) // 10)).indices

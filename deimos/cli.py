@@ -3,6 +3,7 @@
 Whatever the user can mend (a flag, a folder, a disk) ends in one line on stderr and exit code 2.
 """
 
+import argparse
 import contextlib
 import dataclasses
 import io
@@ -60,11 +61,31 @@ def train(arguments: list[str] | None = None) -> int:
             _resume(_parse(ResumeOptions, arguments, "deimos train"))
         else:
             _check_names(arguments)
-            only = plugins.names(envs)
-            if len(only) == 1:  # one choice is no sub-command to tyro; its name is still good to say
-                arguments = [argument for argument in arguments if argument != f"env:{only[0]}"]
-            _train(_parse(_train_options(), arguments, "deimos train"))
+            arguments, config = _take_preset(arguments)
+            options = _train_options()
+            fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+            _train(_parse(options, arguments, "deimos train", default=options(**fields)))
     return outcome.code
+
+
+def _take_preset(arguments: list[str]) -> tuple[list[str], Any]:
+    """The arguments without ``--preset NAME``, and what they start from: that preset, or the environment's own."""
+    from deimos import presets
+
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--preset")
+    try:
+        found, rest = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise RunError(f"--preset needs a name; there are: {', '.join(presets.names())}.") from error
+    env = next((argument.removeprefix("env:") for argument in rest if argument.startswith("env:")), None)
+    name = found.preset or env or "particle"
+    try:
+        if env is not None and presets.environment(name) != env:
+            raise RunError(f"The preset '{name}' is for env:{presets.environment(name)}, not for env:{env}.")
+        return rest, presets.preset(name)
+    except ValueError as error:
+        raise RunError(str(error)) from error
 
 
 def _check_names(arguments: list[str]) -> None:
@@ -151,6 +172,7 @@ class EvaluateOptions:
 
 def _train_options() -> type:
     """``TrainConfig`` with every environment and selector that there is, and what belongs to the folder."""
+    from deimos import presets
     from deimos.training import TrainConfig
 
     field = dataclasses.field
@@ -171,7 +193,10 @@ def _train_options() -> type:
             )], field(default=None)),
         ],
         bases=(TrainConfig,), frozen=True, kw_only=True,
-        namespace={"__doc__": "Train a policy under a goal selector, then evaluate it against Naive and Adversary."},
+        namespace={"__doc__": (
+            "Train a policy under a goal selector, then evaluate it against Naive and Adversary. "
+            f"--preset NAME starts from a ready configuration: {', '.join(presets.names())}."
+        )},
     )  # fmt: skip
 
 
@@ -291,12 +316,12 @@ def _evaluate_policy(folder: Any, env_config: Any, eval_config: Any, device: Any
     return rows
 
 
-def _parse(options: Any, arguments: list[str], program: str) -> Any:
+def _parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
     """Parse by tyro, whose framed complaints become one line."""
     stderr = io.StringIO()
     try:
         with contextlib.redirect_stderr(stderr):
-            return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,))
+            return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise

@@ -134,6 +134,10 @@ class CandidateValues:
         share = max(1, workspace // len(stack.nets)) if stack.batched else workspace
         self._members = [ManyCandidates(net, goal_dim, share) for net in stack.nets]
 
+    def operations(self, contexts: float, count: int) -> float:
+        """Multiplications and additions of the products; see ``ManyCandidates.operations``."""
+        return sum(member.operations(contexts, count) for member in self._members)
+
     def __call__(self, context: Tensor, candidates: Tensor) -> Tensor:
         """Shape (K, B, N) for members with one output; the arguments are those of ``ManyCandidates``."""
         return torch.stack(self._stack.each(lambda k: self._members[k](context, candidates).squeeze(2)))

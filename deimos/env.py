@@ -37,9 +37,10 @@ class Step:
     truncated: Tensor
     """True where the episode was cut off without a crash, bool, shape (num_envs,)."""
     goal_due: Tensor
-    """True where the goal has been in force for its whole period, bool, shape (num_envs,)."""
+    """True where the goal has been in force for its whole period and the state is valid, bool, shape (num_envs,)."""
     invalid: Tensor
-    """True where the state is not physical any more, bool, shape (num_envs,)."""
+    """True where the state is not physical any more, bool, shape (num_envs,). Such a world is truncated too, unless
+    it crashed, or the run stops (see ``Env.may_go_on_invalid``)."""
     count: Tensor
     """Worlds with a goal due that are not done, and worlds that are done, int32, shape (2,)."""
     tracking: Tensor | None = None
@@ -93,6 +94,8 @@ class Env(abc.ABC):
     """Steps after which an episode is truncated; 0 for never."""
     obs: Tensor
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
+    may_go_on_invalid: bool = False
+    """Whether the run goes on where a world becomes invalid; else ``check`` stops it."""
     goal_groups: tuple[slice, ...] = (slice(None),)
     """Components of a goal that are met or missed together."""
     episode_step: Tensor
@@ -152,6 +155,10 @@ class Env(abc.ABC):
     @abc.abstractmethod
     def check(self) -> None:
         """Raise ``SimulationError`` if a world has become invalid; reads the device once."""
+
+    def report(self) -> dict[str, float]:
+        """What a log wants to know of the steps since the last call, the same keys every time; reads the device."""
+        return {}
 
     @abc.abstractmethod
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:

@@ -27,7 +27,6 @@ Policy = Callable[[Tensor], Tensor]
 
 WEAK_CRASHES, WEAK_AUROC = 100, 0.6  # below either, resisting the Adversary proves nothing
 FITS = 15  # fits of the Adversary's network during its ``adversary_steps``
-ORACLE_CLONES = 10_000  # clones that the oracle tries candidates in at a time
 HELD_OUT = 5  # every fifth world of the collection is kept for the Adversary's AUROC
 
 
@@ -53,7 +52,8 @@ class EvalConfig:
     """The Adversary's fear network."""
     oracle_worlds: int = 0
     """Worlds that also meet an oracle Adversary, which tries every candidate in clones of the world and asks for
-    the one that crashes the policy soonest; 200 is plenty, 0 leaves it out. It costs N T steps per goal."""
+    the one that crashes the policy soonest, or else for the one that the Adversary's network fears most; 200 is
+    plenty, 0 leaves it out. It costs N T steps per goal."""
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "adversary_patience"):
@@ -119,8 +119,9 @@ def evaluate(
     attacked = play(env, policy, adversary, config.steps, lambda x: progress("adversary", x))
     rows.append({"goals": "adversary"} | attacked | collection)
     if config.oracle_worlds:
-        env, probe = (env_config.build(n, device, config.seed) for n in (config.oracle_worlds, ORACLE_CLONES))
-        oracle = Oracle(env, Clones(probe, policy))
+        env = env_config.build(config.oracle_worlds, device, config.seed)
+        clones = Clones(lambda count: env_config.build(count, device, config.seed), policy)
+        oracle = Oracle(env, clones, fear=fear)
         rows.append({"goals": "oracle"} | play(env, policy, oracle, config.steps, lambda x: progress("oracle", x)))
     for row in rows:
         row["score"] = (row["return_per_step"] - scale[0]) / (scale[1] - scale[0]) if scale else math.nan

@@ -121,6 +121,10 @@ class Fear:
         """
         return self._candidates(torch.cat([state, goal], dim=1), candidates).squeeze(2)
 
+    def operations(self, decisions: float, count: int) -> float:
+        """Multiplications and additions of scoring ``count`` candidates in each of ``decisions``."""
+        return self._candidates.operations(decisions, count)
+
     def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
         if not bool(self._parameters.isfinite().all()):

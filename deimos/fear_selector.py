@@ -12,6 +12,7 @@ from deimos.calibration import Calibration, judge
 from deimos.checks import check_at_least, check_choice, check_range
 from deimos.fear import Fear, FearConfig, auroc
 from deimos.interactions import Interactions, Resolved
+from deimos.networks import operations
 from deimos.rollout import Rollout
 from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
 
@@ -44,6 +45,7 @@ class FearSelector(GoalSelector):
     def __init__(self, config: FearSelectorConfig, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
+        self._num_envs = spaces.num_envs
         self._learnt_at = 0  # step of the last call of learn
         self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
         self.calibration = Calibration()
@@ -111,6 +113,12 @@ class FearSelector(GoalSelector):
         crashes = int(held_out.crashed.sum())
         if min(crashes, len(held_out) - crashes) >= self.config.fear.min_per_class:
             self.calibration.fit(held_out.score, held_out.crashed)
+
+    def operations(self, decisions: float, transitions: int) -> float:
+        """See ``GoalSelector.operations``."""
+        window = 2 * self._num_envs  # interactions: the resolved ones of 2 T steps, about one per world and T
+        fit = 3.0 * operations(self.fear.network) * window * self.config.fear.epochs
+        return self.fear.operations(decisions, self.num_candidates) + fit
 
     def _seen(self, state: Tensor) -> Tensor:
         return torch.zeros_like(state) if self.config.control == "state-blind" else state

@@ -21,6 +21,11 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int, activation: Activation
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
 
+def operations(net: nn.Module) -> int:
+    """Multiplications and additions of the linear layers of a network for one row, forward."""
+    return sum(2 * layer.weight.numel() for layer in net.modules() if isinstance(layer, nn.Linear))
+
+
 def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]:
     """Lay the parameters and the gradients of every module end to end in memory.
 
@@ -192,6 +197,12 @@ class ManyCandidates:
         widest = max(layer.in_features for layer in self._others)
         rows = workspace * 2**20 // (8 * widest)  # a layer's input and output
         self._rows = min(rows, rows_in_cache(widest)) if weight.device.type == "cpu" else rows
+
+    def operations(self, contexts: float, count: int) -> float:
+        """Multiplications and additions of the products for ``count`` candidates in each of ``contexts``."""
+        shared, own = 2 * self._of_context.numel(), 2 * self._of_candidate.numel()
+        rest = sum(2 * layer.weight.numel() for layer in self._others)
+        return contexts * (shared + count * (own + rest))
 
     @torch.no_grad()
     def __call__(self, context: Tensor, candidates: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ class Rollout:
         """Observations that the steps ended in, before any reset; kept only where episodes can be truncated."""
         self.advantage = torch.zeros(num_steps, n, device=device)
         """Advantages in units of scaled rewards, before they are normalised; the learner fills them in."""
+        self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.weight = torch.ones(num_steps, n, device=device)
         """Weight of the transition in everything learnt: 0 leaves it out."""
 
@@ -46,7 +47,16 @@ class Rollout:
         """
         self.reward[t] = step.reward
         self.terminated[t] = step.terminated
+        self.invalid[t] = step.invalid
         self.weight[t] = weight
         if len(self.final_obs):
             self.truncated[t] = step.truncated
             self.final_obs[t] = step.obs
+
+    def exclude_invalid(self) -> None:
+        """Give weight 0 to what led to an invalid state: every transition of that world since its last reset."""
+        spoilt = torch.zeros_like(self.invalid[0])
+        for t in reversed(range(self.num_steps)):
+            spoilt &= ~(self.terminated[t] | self.truncated[t])
+            spoilt |= self.invalid[t]
+            self.weight[t].masked_fill_(spoilt, 0.0)

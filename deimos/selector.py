@@ -133,6 +133,15 @@ class GoalSelector(abc.ABC):
         """
         return {}
 
+    def operations(self, decisions: float, transitions: int) -> float:
+        """Multiplications and additions of its matrix products in an iteration: what it cannot cost less than.
+
+        Args:
+            decisions: Goals that it chooses in an iteration.
+            transitions: Transitions of an iteration.
+        """
+        return sum(part.operations(decisions, transitions) for part in self.parts)
+
     def check(self) -> None:  # noqa: B027 (a selector without weights has nothing to check)
         """Raise ``SimulationError`` if a weight is not finite."""
 

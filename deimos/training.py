@@ -32,6 +32,7 @@ from deimos.selector import SelectorConfig
 
 SCHEMA = 1  # of config.json and checkpoint.pt
 CHECKPOINT_SECONDS = 30.0
+LEAST_BYTES = 100  # of any transition, and of any world
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,6 +191,8 @@ class Trainer:
         try:
             self.collect()
             self.env.check()
+            if self.env.may_go_on_invalid:
+                self.rollout.exclude_invalid()
             _check_obs(self.rollout.obs[-1])
             clock = _Clock(self)
             learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
@@ -214,6 +217,7 @@ class Trainer:
             "selected_share": self.loop.interactions.active.float().mean().item(),
             **learner,
             **selector,
+            **self.env.report(),
         }
 
     def state_dict(self) -> dict:
@@ -321,13 +325,32 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
     """Make a trainer.
 
     Raises:
-        RunError: If its worlds do not fit in memory.
+        RunError: If its worlds do not fit in memory, or what the configuration names is not there or does not fit.
     """
+    _check_memory(config)
     try:
         return Trainer(config, device)
     except (MemoryError, RuntimeError, ValueError) as error:  # Warp, torch and NumPy each have their own
         reason = " ".join(str(error).split())
+        if isinstance(error, ValueError) and "allowed dimension" not in reason and "too big" not in reason:
+            raise RunError(reason) from error
         raise RunError(f"{config.num_envs} worlds could not be allocated ({reason}); use fewer (num_envs).") from error
+
+
+def _check_memory(config: TrainConfig) -> None:
+    """Raise ``RunError`` for what this machine cannot hold.
+
+    Systems promise more memory than they have, and would kill the process halfway.
+    """
+    if not hasattr(os, "sysconf"):
+        return
+    need = config.num_envs * (config.ppo.num_steps * LEAST_BYTES + LEAST_BYTES)
+    has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if need > has:
+        raise RunError(
+            f"{config.num_envs} worlds need more than {need / 2**30:.0f} GiB of memory, this machine has "
+            f"{has / 2**30:.0f} GiB; use fewer (num_envs)."
+        )
 
 
 def _load_weights(trainer: Trainer, origin: RunFolder) -> None:

@@ -5,13 +5,14 @@ import math
 import pytest
 import torch
 
-from deimos.audit import CANDIDATES, _crashes_within_period, _next_contexts, audit_fear
+from deimos.audit import CANDIDATES, _next_contexts, audit_fear
 from deimos.checks import SimulationError
 from deimos.envs import particle
 from deimos.evaluation import EvalConfig, evaluate, play, train_adversary, weights_hash
 from deimos.fear import FearConfig, auroc
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.networks import mlp
+from deimos.oracle import Clones
 from deimos.run_folder import RunError
 from deimos.selectors import uniform
 from deimos.training import TrainConfig, Trainer
@@ -182,10 +183,9 @@ def test_the_audit_is_exact():
     follow = trainer.env.reference_policy(brake=False)
     trainer.ppo.actor.forward = follow  # a deterministic policy whose outcome can be worked out
     trainer.ppo.actor.std.data.fill_(0.0)
-    probe = config.env.build(256 * CANDIDATES, CPU, 0)
-    generator = torch.Generator().manual_seed(0)
-    state, _, candidates = _next_contexts(trainer, probe, generator)
-    crashed = _crashes_within_period(trainer, probe, candidates.shape[0] * CANDIDATES, generator).view(-1, CANDIDATES)
+    clones = Clones(lambda count: config.env.build(count, CPU, 0), trainer.ppo.actor)
+    state, _, candidates, survived = _next_contexts(trainer, clones, torch.Generator().manual_seed(0))
+    crashed = survived < config.env.goal_period
     velocity, position = state[:, None, 0:3] * 20.0, state[:, None, 3:6] * 1000.0
     velocity = velocity.expand(-1, CANDIDATES, -1).clone()
     position = position.expand(-1, CANDIDATES, -1).clone()

@@ -16,15 +16,16 @@ import pytest
 import torch
 
 import deimos
-from deimos import cli, training
+from deimos import cli, envs, plugins, presets, training
 from deimos.checks import SimulationError
-from deimos.config import from_dict, to_dict
+from deimos.config import from_dict, kind, to_dict
 from deimos.env import EnvConfig
 from deimos.envs import particle
 from deimos.evaluation import EvalConfig
 from deimos.fear import FearConfig
 from deimos.methods import METHODS
 from deimos.ppo import PPOConfig
+from deimos.rollout import Rollout
 from deimos.run_folder import RunError, RunFolder, load_tensors
 from deimos.selector import SelectorConfig
 from deimos.selectors import director, uniform
@@ -494,7 +495,7 @@ CONFIGS = {
             obs_scale="raw",
         ),
         selector=director.Config(
-            percentile=33.3, rule="argmin", candidates=17,
+            percentile=33.3, rule="argmin", candidates=17, probe=0.05, control="shuffled",
             fear=FearConfig(
                 hidden=(5,), activation="tanh", learning_rate=0.1, epochs=3, minibatches=2, min_per_class=1, workspace=3
             ),
@@ -506,7 +507,7 @@ CONFIGS = {
         ),
         eval=EvalConfig(
             worlds=3, steps=99, seed=0, adversary_steps=4, adversary_interactions=0, adversary_crashes=0,
-            adversary_patience=1,
+            adversary_patience=1, oracle_worlds=2,
             fear=FearConfig(
                 hidden=(9, 9, 9), activation="elu", learning_rate=1.0, epochs=1, minibatches=1, min_per_class=9,
                 workspace=1,
@@ -568,6 +569,10 @@ def test_policy_acts_as_the_actor_in_physical_units(tmp_path, variant, obs_scale
     )
     trainer = training.Trainer(config, torch.device("cpu"))
     trainer.collect()
+    with torch.no_grad():  # so that about half of the actions are cut
+        size = trainer.ppo.actor(trainer.env.obs).abs().median()
+        for parameter in trainer.ppo.actor.mean[-1].parameters():
+            parameter *= 0.3 / size
     training.save(trainer, RunFolder.create(tmp_path / "run"))
     policy = deimos.load_policy(tmp_path / "run")
 
@@ -610,3 +615,31 @@ def test_missing_or_foreign_policy_is_refused(tmp_path):
     torch.save({"schema": 1, "layout": [], "actor": {}}, tmp_path / "policy.pt")
     with pytest.raises(RunError, match="is not a policy of this version"):
         deimos.load_policy(tmp_path)
+
+
+def test_what_led_to_an_invalid_state_is_left_out():
+    """Every transition of a world since its last reset gets weight 0 when the world breaks, and no other one."""
+    env = particle.Config(time_limit=50).build(3, torch.device("cpu"), 0)
+    rollout = Rollout(env, 5)
+    rollout.terminated[1, 0] = True  # world 0 is reset after step 1 and breaks at step 3
+    rollout.invalid[3, 0] = rollout.truncated[3, 0] = True
+    rollout.invalid[0, 1] = rollout.truncated[0, 1] = True  # world 1 breaks at once
+    rollout.exclude_invalid()
+    expected = torch.tensor([[1, 1, 0, 0, 1], [0, 1, 1, 1, 1], [1, 1, 1, 1, 1]], dtype=torch.float32)
+    assert torch.equal(rollout.weight.t(), expected)
+
+
+def test_too_many_worlds_are_refused_before_memory_is_taken():
+    """The message says how much would be needed; nothing is allocated first, or the system would kill the process."""
+    with pytest.raises(RunError, match=r"2000000000 worlds need more than \d+ GiB.*use fewer"):
+        training.build(TrainConfig(num_envs=2_000_000_000), torch.device("cpu"))
+
+
+def test_a_preset_is_a_training_configuration():
+    """Every environment has a preset of its own name, and every preset builds a configuration for its environment."""
+    for name in plugins.names(envs):
+        assert presets.environment(name) == name
+    for name in presets.names():
+        assert kind(presets.preset(name).env) == presets.environment(name)
+    with pytest.raises(ValueError, match=r"no preset 'nonsense'; there are: .*particle"):
+        presets.preset("nonsense")

@@ -10,7 +10,7 @@ from deimos import picks
 from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Interactions
-from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
+from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, operations
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 from deimos.seeds import generator, weights_from
@@ -79,7 +79,7 @@ class RND(GoalSelector):
         self.generator = generator(seed, "rnd minibatches", spaces.device)
         # Inputs are whitened by the moments of states, goals in force and *uniform* candidates; those of the
         # chosen goals would drift with what is chosen.
-        self._uniform = torch.zeros(spaces.num_envs, spaces.goal_dim, device=spaces.device)
+        self._uniform = torch.full((spaces.num_envs, spaces.goal_dim), torch.nan, device=spaces.device)
         self._moments = torch.zeros(3, inputs, dtype=torch.float64, device=spaces.device)  # count, sum, of squares
         self._mean, self._scale = torch.zeros(inputs, device=spaces.device), torch.ones(inputs, device=spaces.device)
         self._context = slice(0, inputs - spaces.goal_dim)
@@ -113,10 +113,13 @@ class RND(GoalSelector):
         """Whiten by, and learn from, what was issued since the last time; no outcome is needed."""
         env, state, goal, next_goal = interactions.issued(self._learnt_at)
         self._learnt_at = interactions.now
-        if len(env) == 0:
+        uniform = self._uniform[env]
+        known = uniform.isfinite().all(1)  # in a world whose goals somebody else chose so far, it has seen none
+        state, goal, next_goal, uniform = state[known], goal[known], next_goal[known], uniform[known]
+        if len(uniform) == 0:
             return {"rnd/surprise": float("nan"), "rnd/loss": float("nan")}
         context = torch.cat([state, goal], dim=1)
-        self._observe(torch.cat([context, self._uniform[env]], dim=1).double())
+        self._observe(torch.cat([context, uniform], dim=1).double())
         surprise = self.surprise(state, goal, next_goal.unsqueeze(1)).mean().item()
         everything = slice(0, len(self._mean))
         inputs = self._whiten(torch.cat([context, next_goal], dim=1), everything)
@@ -149,6 +152,11 @@ class RND(GoalSelector):
                 self.optimizer.step()
                 total += error.square().sum()
         return (total / (len(inputs) * self.config.features)).item()
+
+    def operations(self, decisions: float, transitions: int) -> float:
+        """See ``GoalSelector.operations``."""
+        score = sum(net.operations(decisions, self.num_candidates) for net in (self._of_predictor, self._of_target))
+        return score + decisions * (operations(self.target) + 3 * operations(self.predictor)) * self.config.epochs
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""

@@ -15,7 +15,7 @@ from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.ensemble import CandidateValues, Stack
 from deimos.interactions import Interactions
-from deimos.networks import Activation, mlp, rows_in_cache
+from deimos.networks import Activation, mlp, operations, rows_in_cache
 from deimos.ppo import advantages, value_gradient
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
@@ -227,6 +227,12 @@ class VDS(GoalSelector):
             return loss
 
         return torch.stack(self.stack.each(work))
+
+    def operations(self, decisions: float, transitions: int) -> float:
+        """See ``GoalSelector.operations``."""
+        rows = transitions * (self.config.critics if self.config.data == "all" else 1)
+        learning = rows * operations(self.stack.nets[0]) * (1 + 3 * self.config.epochs)  # values, then the passes
+        return learning + self._of_candidates.operations(decisions, self.num_candidates)
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""

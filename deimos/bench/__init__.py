@@ -1,0 +1,81 @@
+"""``deimos bench``: how fast everything is, beside what else there is."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from rich.console import Console
+
+from deimos.checks import check_at_least
+from deimos.run_folder import RunError
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions:
+    """Measure speed; everything that is compared is measured in the same run."""
+
+    what: tyro.conf.Positional[Literal["particle", "terrain"]]
+    """What to measure."""
+    json: Path | None = None
+    """Write all numbers to this file too."""
+    rounds: int = 7
+    """Rounds that a ratio is the median of, at least 1."""
+    threads: int = 0
+    """CPU threads, at least 0; 0 takes one per core."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to measure; auto takes the GPU where there is one."""
+
+    def __post_init__(self) -> None:
+        check_at_least("rounds", self.rounds, 1)
+        check_at_least("threads", self.threads, 0)
+
+
+def run(options: BenchOptions) -> dict[str, Any]:
+    """Measure, print one table per subject, and write the JSON file if asked for."""
+    from deimos.training import cores, one_stream, provenance, resolve_device
+
+    if options.json is not None and not options.json.parent.is_dir():
+        raise RunError(f"The folder of {options.json} does not exist.")
+    device = resolve_device(options.device)
+    torch.set_num_threads(options.threads or cores())
+    if options.what == "terrain":
+        from terrain import bench as terrain_bench
+
+        return terrain_bench.run(
+            terrain_bench.BenchOptions(rounds=options.rounds, device=str(device), json=options.json)
+        )
+    results: dict[str, Any] = {
+        "versions": provenance(), "threads": torch.get_num_threads(), "device": str(device),
+    }  # fmt: skip
+    with one_stream(device):
+        results |= _particle(options.rounds, device)
+    if options.json is not None:
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    return results
+
+
+def _particle(rounds: int, device: torch.device) -> dict[str, Any]:
+    """The step of Particle Gym, and Table 4.1 of the thesis for its three variants."""
+    from deimos.bench import particle, training
+    from deimos.envs.particle import Config
+    from deimos.training import TrainConfig
+
+    results: dict[str, Any] = {"env": [particle.measure_env(n, device, rounds) for n in particle.SIZES]}
+    particle.print_env(results["env"], torch.get_num_threads(), str(device))
+    results["training"] = {}
+    for variant in ("directional", "absolute", "relative"):
+        thesis = training.TABLE_4_1[variant]
+        all_of_them = variant == "directional"
+        methods = {name: s for name, s in training.METHODS_TIMED.items() if all_of_them or name in thesis}
+        config = replace(TrainConfig(), env=Config(variant=variant))
+        results["training"][variant] = training.measure_training(
+            config, methods, thesis, device, rounds, beside_rsl_rl=all_of_them
+        )
+        training.print_training(f"{variant}, default sizes", results["training"][variant])
+    results["machine"] = training.machine(device)
+    for name, value in results["machine"].items():
+        Console().print(f"{name}: {value:.3g}", highlight=False)
+    return results

@@ -1,0 +1,146 @@
+"""What the oracle says would happen is what happens."""
+
+import pytest
+import torch
+
+from deimos.audit import audit_calibration, audit_fear
+from deimos.envs import particle
+from deimos.evaluation import EvalConfig, evaluate, play
+from deimos.fear import Fear, FearConfig
+from deimos.goal_loop import GoalLoop
+from deimos.oracle import Clones, Oracle
+from deimos.ppo import PPOConfig
+from deimos.run_folder import RunError
+from deimos.selectors import director
+from deimos.training import TrainConfig, Trainer
+
+CPU = torch.device("cpu")
+CONFIG = particle.Config(goal_period=20, max_speed=100.0, max_force=50.0)
+WORLDS, CANDIDATES = 24, 10
+
+
+def follow(obs):
+    """Accelerates towards the goal velocity and minds no wall."""
+    return (obs[:, 9:12] - obs[:, 0:3]) * 100.0
+
+
+def build(count):
+    return CONFIG.build(count, CPU, seed=5)
+
+
+def oracle(env, limit=10_000, **options):
+    """An oracle for ``env`` whose policy is the follower."""
+    return Oracle(env, Clones(build, follow, limit), candidates=CANDIDATES, **options)
+
+
+def watched(limit=10_000, rule="percentile", percentile=0.0, steps=100):
+    """The interactions under an oracle's goals."""
+    env = build(WORLDS)
+    loop = GoalLoop(env, oracle(env, limit, rule=rule, percentile=percentile), window=steps)
+    for _ in range(steps):
+        loop.advance(env.step(follow(env.obs)))
+    done = loop.interactions.resolved()
+    return done.where(done.issued <= steps - CONFIG.goal_period)
+
+
+def test_prophecies_come_true():
+    """A chosen goal crashes the policy exactly when the oracle says so, and exactly as soon."""
+    done = watched()
+    assert 0 < int(done.crashed.sum()) < len(done)
+    assert torch.equal(done.score > 0, done.crashed)
+    survived = (done.resolved - done.issued - done.crashed.long()).float()
+    assert torch.equal(CONFIG.goal_period - done.score, survived)
+
+
+def test_size_of_the_sets_does_not_matter():
+    """The same goals are chosen whether many decisions are tried at a time or one after another."""
+    together, alone = watched(), watched(limit=1)
+    assert torch.equal(together.next_goal, alone.next_goal)
+
+
+def test_worlds_are_not_touched():
+    """Trying candidates leaves the worlds, their goals and their draws alone."""
+    env = build(WORLDS)
+    before = env.state_dict()
+    rows = torch.arange(WORLDS)
+    Clones(build, follow).try_out(env, rows, env.sample_goals(rows, CANDIDATES).clone())
+    assert all(torch.equal(value, before[name]) for name, value in env.state_dict().items())
+
+
+def test_argmax_crashes_the_policy_whenever_a_candidate_can():
+    """The worst candidate crashes at least as often as any, and a Coop oracle crashes only where all do."""
+    rates = [watched(rule=rule).crashed.float().mean() for rule in ("argmin", "percentile", "argmax")]
+    assert rates[0] < rates[1] < rates[2]
+
+
+def test_ties_go_to_the_fear_network():
+    """Among candidates of equal fate the network's ranking decides, and never against the truth."""
+    env = build(WORLDS)
+    fear = Fear(FearConfig(), env.state_dim, env.goal_dim, CPU, seed=0)
+    fear.fitted = True
+    selector = oracle(env, fear=fear)
+    rows = torch.arange(WORLDS)
+    state, goal = env.state(env.obs), env.goal
+    candidates = env.sample_goals(rows, CANDIDATES).clone()
+    chosen = selector.propose(rows, state, goal, candidates, torch.zeros(WORLDS, 4))
+    danger = CONFIG.goal_period - Clones(build, follow).try_out(env, rows, candidates)
+    logit = fear.score(state, goal, candidates)
+    for row in range(WORLDS):
+        worst = (danger[row] == danger[row].max()).nonzero().flatten()
+        expected = worst[logit[row, worst].argmax()]
+        assert torch.equal(chosen.goal[row], candidates[row, expected])
+
+
+def test_evaluation_adds_a_row():
+    """``oracle_worlds`` adds the oracle Adversary, which crashes the policy more often than Naive goals do."""
+    config = EvalConfig(worlds=64, steps=100, adversary_steps=60, adversary_patience=1, oracle_worlds=16)
+    rows = evaluate(follow, CONFIG, config, CPU)
+    assert [row["goals"] for row in rows] == ["naive", "adversary", "oracle"]
+    assert rows[2]["worlds"] == 16
+    assert rows[2]["crash_rate"] > rows[0]["crash_rate"]
+
+
+@pytest.fixture(scope="module")
+def afraid():
+    """A short training run whose fear network has learnt something."""
+    selector = director.Config(fear=FearConfig(min_per_class=4))
+    config = TrainConfig(env=CONFIG, selector=selector, ppo=PPOConfig(hidden=(8,)), num_envs=128, evaluation=False)
+    trainer = Trainer(config, CPU)
+    for _ in range(6):
+        trainer.iterate()
+    assert trainer.loop.selector.fear.fitted
+    return trainer
+
+
+def test_calibration_is_judged_on_whole_periods(afraid):
+    """Chosen and uniform goals are judged on at least as many interactions as asked for, none cut off early."""
+    judged = audit_calibration(afraid, 200)
+    assert list(judged) == ["selected", "uniform"]
+    for probability, crashed, quality in judged.values():
+        assert len(probability) == len(crashed) == quality["interactions"] >= 100
+        assert ((probability > 0) & (probability < 1)).all()
+        assert 0 < quality["crash_share"] < 1
+        assert quality["brier"] <= 1
+
+
+def test_audit_agrees_with_itself(afraid):
+    """The audit ranks within contexts that have both outcomes and stays within [0, 1]."""
+    found = audit_fear(afraid, 5)
+    assert found["contexts"] >= 5
+    assert 0 <= found["low"] <= found["auroc"] <= found["high"] <= 1
+
+
+def test_a_run_without_fear_cannot_be_judged():
+    """Uniform has no fear network; the message says so."""
+    config = TrainConfig(env=CONFIG, method="uniform", ppo=PPOConfig(hidden=(8,)), num_envs=8, evaluation=False)
+    for judge in (audit_calibration, audit_fear):
+        with pytest.raises(RunError, match="no fear network"):
+            judge(Trainer(config, CPU), 10)
+
+
+def test_a_learnt_adversary_plays_beside_it():
+    """``play`` counts the same way for both, so that their rates compare."""
+    env = build(WORLDS)
+    row = play(env, follow, oracle(env), 60)
+    assert row["interaction_crashes"] <= row["interactions"]
+    assert row["crash_rate"] == pytest.approx(row["interaction_crashes"] / row["interactions"])
