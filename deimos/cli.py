@@ -1,4 +1,4 @@
-"""The command line: ``deimos train``, ``deimos evaluate``, ``deimos terrain``, ``deimos bench``.
+"""The command line: ``deimos train``, ``deimos evaluate``, ``deimos play``, ``deimos terrain``, ``deimos bench``.
 
 Whatever the user can mend (a flag, a folder, a disk) ends in one line on stderr and exit code 2.
 """
@@ -30,6 +30,7 @@ usage: deimos COMMAND [OPTIONS]
 commands:
   train      train a policy and evaluate it (also: python train.py)
   evaluate   evaluate the policy of a run folder
+  play       render a trained robot as a film
   terrain    make ground for legged robots (also: python -m terrain)
   bench      measure the speed of everything
 
@@ -40,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run ``deimos``; returns the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     commands: dict[str, Callable[[list[str]], int]] = {
-        "train": train, "evaluate": evaluate, "terrain": terrain, "bench": bench,
+        "train": train, "evaluate": evaluate, "play": play, "terrain": terrain, "bench": bench,
     }  # fmt: skip
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
@@ -101,6 +102,17 @@ def evaluate(arguments: list[str]) -> int:
     """Run ``deimos evaluate``; returns the exit code."""
     with _one_line_errors() as outcome:
         _evaluate(_parse(EvaluateOptions, arguments, "deimos evaluate"))
+    return outcome.code
+
+
+def play(arguments: list[str]) -> int:
+    """Run ``deimos play``; returns the exit code."""
+    with _one_line_errors() as outcome:
+        from deimos import playback
+
+        options = _parse(playback.PlayOptions, arguments, "deimos play")
+        _quiet_warp()
+        print(playback.play(options))
     return outcome.code
 
 

@@ -8,9 +8,13 @@ resets a world and never changes a goal: ``deimos.goal_loop`` does both, between
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True)
@@ -20,8 +24,8 @@ class ObsField:
     name: str
     size: int
     unit: str
-    scale: float
-    """The policy sees the physical value times this."""
+    scale: float | tuple[float, ...]
+    """The policy sees the physical value times this; one number for all components or one for each."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +159,19 @@ class Env(abc.ABC):
     @abc.abstractmethod
     def check(self) -> None:
         """Raise ``SimulationError`` if a world has become invalid; reads the device once."""
+
+    def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData] | None":
+        """One world as MuJoCo's model and data, for rendering; ``None`` where there is nothing to see."""
+        return None
+
+    @property
+    def has_seconds(self) -> bool:
+        """Whether ``dt`` is in seconds."""
+        return self.dt != 1
+
+    def strata(self) -> list[str]:
+        """What kind of world each one is, such as the ground that it stands on, for evaluation; empty for no kinds."""
+        return []
 
     def report(self) -> dict[str, float]:
         """What a log wants to know of the steps since the last call, the same keys every time; reads the device."""

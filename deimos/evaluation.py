@@ -9,11 +9,12 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import check_at_least, check_range
+from deimos.checks import check_at_least, check_choice, check_range
 from deimos.env import Env, EnvConfig
 from deimos.fear import Fear, FearConfig, auroc
 from deimos.goal_loop import GoalLoop, spaces
@@ -46,6 +47,9 @@ class EvalConfig:
     """Interactions that it needs, at least 0."""
     adversary_crashes: int = 500
     """Crashes among them that it needs, at least 0."""
+    adversary_enough: Literal["all", "any"] = "all"
+    """Whether it needs all of these before it stops collecting, or is content with the first of its interactions
+    and its crashes; simulators of robots are too slow for more."""
     adversary_patience: int = 10
     """It gives up collecting after this many times ``adversary_steps``, at least 1."""
     fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32, min_per_class=8))
@@ -60,6 +64,7 @@ class EvalConfig:
             check_at_least(name, getattr(self, name), 1)
         for name in ("adversary_interactions", "adversary_crashes", "oracle_worlds"):
             check_at_least(name, getattr(self, name), 0)
+        check_choice("adversary_enough", self.adversary_enough, ["all", "any"])
         check_range("seed", self.seed, 0, 2**32 - 2)
 
 
@@ -95,7 +100,8 @@ def evaluate(
         crashes under first goals apart, ``return_per_step`` (see ``play``) and ``score``: its place
         between the policy that does nothing (0) and the environment's reference policy (1), both
         under the Naive goals; and for the Adversary the size of its collection and its AUROC on
-        worlds that it did not learn from.
+        worlds that it did not learn from. ``tracking`` has the mean of every group of goal
+        components, ``strata`` the same and more by kind of world, where there are kinds.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -160,10 +166,13 @@ def play(
     loop = GoalLoop(env, selector, window=steps)
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
     reward, crashes, first_goal_steps, first_goal_crashes = totals
+    tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)
+    strata = env.strata()
     for t in range(steps):
         step = env.step(policy(env.obs))
         first = ~loop.interactions.active
         reward += step.reward
+        tracking += step.reward.unsqueeze(1) if step.tracking is None else step.tracking
         crashes += step.terminated
         first_goal_steps += first
         first_goal_crashes += first & step.terminated
@@ -186,7 +195,25 @@ def play(
         "first_goal_steps": int(first_count),
         "first_goal_crashes": int(first_crash_count),
         "return_per_step": done.reward.double().mean().item() / env.goal_period,
+        "tracking": (tracking.mean(0) / steps).tolist(),
+        "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
+        "strata": _by_stratum(strata, crashes, tracking / steps, done),
     }
+
+
+def _by_stratum(strata: list[str], crashes: Tensor, tracking: Tensor, done: Resolved) -> dict[str, dict]:
+    """Worlds, crashes, mean tracking and the share of survived interactions of every kind of world."""
+    rows = {}
+    for name in sorted(set(strata)):
+        own = torch.tensor([stratum == name for stratum in strata], device=crashes.device)
+        ended = done.crashed[own[done.env]]
+        rows[name] = {
+            "worlds": int(own.sum()),
+            "crashes": int(crashes[own].sum()),
+            "tracking": tracking[own].mean(0).tolist(),
+            "success": 1.0 - ended.float().mean().item() if len(ended) else math.nan,
+        }
+    return rows
 
 
 def train_adversary(
@@ -215,12 +242,7 @@ def train_adversary(
             progress(min(1.0, t / config.adversary_steps))
             data = _whole(loop.interactions)
             fear.fit(_training_part(data), epochs=1)
-            enough = (
-                len(data) >= config.adversary_interactions
-                and int(data.crashed.sum()) >= config.adversary_crashes
-                and t >= config.adversary_steps
-            )
-            if enough:
+            if _enough(config, len(data), int(data.crashed.sum()), t):
                 break
     env.check()
     data = _whole(loop.interactions)
@@ -237,6 +259,12 @@ def train_adversary(
         "adversary_auroc": quality,
         "weak_adversary": crashes < WEAK_CRASHES or not quality >= WEAK_AUROC,
     }
+
+
+def _enough(config: EvalConfig, interactions: int, crashes: int, steps: int) -> bool:
+    """Whether the Adversary has seen enough."""
+    counts = (interactions >= config.adversary_interactions, crashes >= config.adversary_crashes)
+    return any(counts) if config.adversary_enough == "any" else all(counts) and steps >= config.adversary_steps
 
 
 def _whole(interactions: Interactions) -> Resolved:

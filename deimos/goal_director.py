@@ -9,6 +9,7 @@ from deimos.checks import check_at_least
 from deimos.env import Step
 from deimos.fear_selector import fear_selector
 from deimos.interactions import Interactions
+from deimos.seeds import generator
 from deimos.selector import GoalSelector, SelectorConfig, Spaces
 
 
@@ -54,6 +55,7 @@ class GoalDirector:
         """What the selector's last lesson had to say."""
         self._config, self._total_steps, self._seed = selector, total_steps, seed
         self._selector: GoalSelector | None = None
+        self._sizes: tuple[int, int, int] | None = None  # worlds, components of a state, of a goal
 
     @property
     def selector(self) -> GoalSelector:
@@ -65,6 +67,14 @@ class GoalDirector:
         if self._selector is None:
             raise RuntimeError("The GoalDirector knows its worlds only after the first call of step().")
         return self._selector
+
+    @property
+    def goal_range(self) -> Tensor | None:
+        """Share of the goal range to draw candidates from, shape (goal_dim,); ``None`` for all of it.
+
+        Only a curriculum of the range (``cl``) has one, and only from the first step on.
+        """
+        return None if self._selector is None else self._selector.goal_range()
 
     def step(
         self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor,
@@ -80,7 +90,8 @@ class GoalDirector:
             goal: Goals that were in force during the step, shape (num_envs, goal_dim).
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
-            candidates: Independent uniform valid goals, shape (num_envs, N, goal_dim), N at least 1.
+            candidates: Independent uniform valid goals, from within ``goal_range``, shape
+                (num_envs, N, goal_dim), N at least 1.
             tracking: How well the goal is met, in [0, 1], shape (num_envs,), for curricula; ``None`` for 0.
 
         Raises:
@@ -111,14 +122,17 @@ class GoalDirector:
         spaces = Spaces(
             len(state), state.shape[1], goal.shape[1], self.goal_period, state.device, total_steps=self._total_steps
         )
-        self._selector = self._config.build(spaces, self._seed)
-        if self._selector.needs_rollout:
-            raise ValueError("selector must be one that needs no rollout of the learner; vds and plr do.")
-        self._interactions = Interactions(
-            len(state), state.shape[1], goal.shape[1], self.goal_period, 2 * self.goal_period, state.device
-        )
-        self._clock = torch.zeros(len(state), dtype=torch.int64, device=state.device)
-        self._generator = torch.Generator(state.device).manual_seed(self._seed)
+        with torch.inference_mode(False):  # what is made in a loop without gradients shall also be used outside it
+            selector = self._config.build(spaces, self._seed)
+            if selector.needs_rollout:
+                raise ValueError(
+                    f"selector must need no rollout of the learner, as vds and plr do; got {self._config}."
+                )
+            self._selector = selector
+            self._sizes = len(state), state.shape[1], goal.shape[1]
+            self._interactions = Interactions(*self._sizes, self.goal_period, 2 * self.goal_period, state.device)
+            self._clock = torch.zeros(len(state), dtype=torch.int64, device=state.device)
+            self._generator = generator(self._seed, "goal director", state.device)
 
     def _propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, goals: Tensor) -> None:
         draws = torch.rand(len(rows), 4, generator=self._generator, device=rows.device)
@@ -130,14 +144,17 @@ class GoalDirector:
         goals[rows] = proposal.goal
 
     def _check(self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor) -> None:
-        n = len(self._clock) if self._selector is not None else len(state)
-        sizes = {"state": (n, state.shape[-1]), "goal": (n, goal.shape[-1]), "terminated": (n,), "truncated": (n,)}
+        n, state_dim, goal_dim = self._sizes or (len(state), state.shape[-1], goal.shape[-1])
+        sizes = {"state": (n, state_dim), "goal": (n, goal_dim), "terminated": (n,), "truncated": (n,)}
         given = {"state": state, "goal": goal, "terminated": terminated, "truncated": truncated}
         for name, shape in sizes.items():
             if given[name].shape != shape:
                 raise ValueError(f"{name} must have the shape {shape}, got {tuple(given[name].shape)}.")
+        for name in ("terminated", "truncated"):
+            if given[name].dtype != torch.bool:
+                raise ValueError(f"{name} must be bool, got {given[name].dtype}.")
         if candidates.dim() != 3 or candidates.shape[::2] != goal.shape or candidates.shape[1] < 1:
-            expected = f"({n}, N, {goal.shape[1]}) with N at least 1"
+            expected = f"({n}, N, {goal_dim}) with N at least 1"
             raise ValueError(f"candidates must have the shape {expected}, got {tuple(candidates.shape)}.")
 
     def fear(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> Tensor:

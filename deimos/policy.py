@@ -36,8 +36,8 @@ class Policy(nn.Module):
         self.layout = tuple(layout)
         self.action_bound = action_bound
         self.dt = dt
-        scale = [field.scale for field in layout for _ in range(field.size)]
-        self.register_buffer("scale", torch.tensor(scale, device=actor.std.device))
+        scale = [torch.as_tensor(field.scale, dtype=torch.float32).expand(field.size) for field in layout]
+        self.register_buffer("scale", torch.cat(scale).to(actor.std.device))
         start = sum(field.size for field in self.layout[: [f.name for f in self.layout].index("goal")])
         self.goal_slice = slice(start, start + next(f.size for f in self.layout if f.name == "goal"))
 

@@ -35,6 +35,7 @@ class Purpose(IntEnum):
     NOISE = 4
     PUSH = 5
     FRICTION = 6
+    LEVEL = 7
 
 
 class vec4u(wp.types.vector(length=4, dtype=wp.uint32)):

@@ -20,10 +20,10 @@ def interactions(crashed, seed=0, state=None):
     n = len(crashed)
     state = torch.randn(n, STATE_DIM, generator=generator) if state is None else state
     goal, next_goal = (torch.randn(n, GOAL_DIM, generator=generator) for _ in range(2))
-    zeros = torch.zeros(n)
+    zeros, steps = torch.zeros(n), torch.zeros(n, dtype=torch.int64)
     return Resolved(
         env=torch.arange(n), state=state, goal=goal, next_goal=next_goal, score=zeros, reward=zeros,
-        crashed=crashed, issued=torch.zeros(n, dtype=torch.int64), resolved=torch.ones(n, dtype=torch.int64),
+        tracking=zeros.unsqueeze(1), probe=steps.bool(), note=steps, crashed=crashed, issued=steps, resolved=steps + 1,
     )  # fmt: skip
 
 

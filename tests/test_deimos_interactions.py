@@ -1,7 +1,7 @@
 """When an interaction begins, how it resolves, and how long it is remembered."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -425,3 +425,84 @@ def test_resume_is_exact(torch_device):
     assert results[0]["reward"].tolist() == [8.0, 0.0, 0.0, 9.0]
     for name, value in kept.items():  # the steps since have not reached into it
         assert torch.equal(saved[name], value) if isinstance(value, torch.Tensor) else saved[name] == value
+
+
+def test_notes_and_probes_come_back(torch_device):
+    """Whole numbers up to 2^24 - 1 and the marks of uniform goals come back with their own interactions."""
+    interactions = make_interactions(4, torch_device)
+    rows = torch.tensor([2, 0, 3], device=torch_device)
+    parts = [torch.zeros(3, size, device=torch_device) for size in (STATE_DIM, GOAL_DIM, GOAL_DIM)]
+    score = torch.zeros(3, device=torch_device)
+    note = torch.tensor([2**24 - 1, 0, 12_345_679], device=torch_device)
+    probe = torch.tensor([False, True, True], device=torch_device)
+    interactions.open(rows, *parts, score, probe=probe, note=note)
+    advance(interactions, make_step(4, torch_device, goal_due=[0, 2, 3]))
+    resolved = interactions.resolved()
+    assert resolved.env.tolist() == [0, 2, 3]
+    assert resolved.note.tolist() == [0, 2**24 - 1, 12_345_679]
+    assert resolved.probe.tolist() == [True, False, True]
+    interactions.open(rows, *parts, score)
+    advance(interactions, make_step(4, torch_device, terminated=[0, 2, 3]))
+    newest = interactions.resolved()
+    newest = newest.where(newest.resolved == 2)
+    assert (newest.note == 0).all()  # of what was not given nothing is left over
+    assert not newest.probe.any()
+
+
+def test_tracking_is_the_mean_over_the_period(torch_device):
+    """Each group has a column: its mean over all T steps, with 0 from the crash on; rewards are summed beside it."""
+    interactions = Interactions(3, STATE_DIM, GOAL_DIM, 4, 8, torch_device, groups=2)
+    issue(interactions, [0, 1], [0.0, 1.0], torch_device)
+    tracking = torch.tensor([[1.0, 0.25], [0.5, 0.0], [1.0, 1.0]], device=torch_device)
+    for t in range(4):
+        terminated = [1] if t == 2 else []
+        step = make_step(3, torch_device, terminated=terminated, goal_due=[0] if t == 3 else [], reward=2.0)
+        advance(interactions, replace(step, tracking=tracking * (t + 1) / 4))
+    resolved = interactions.resolved()
+    assert resolved.tracking.shape == (2, 2)
+    assert resolved.tracking[0].tolist() == [0.625, 0.15625]  # (1 + 2 + 3 + 4) / 16 of each
+    assert resolved.tracking[1].tolist() == [0.09375, 0.0]  # (1 + 2) / 16 of one half
+    assert resolved.reward.tolist() == [8.0, 4.0]
+
+
+def test_without_groups_the_reward_is_the_tracking(torch_device):
+    """Where a step tells no tracking, it is the mean reward over T steps, in one column."""
+    interactions = make_interactions(1, torch_device, goal_period=4)
+    issue(interactions, [0], [0.0], torch_device)
+    for t in range(4):
+        advance(interactions, make_step(1, torch_device, goal_due=[0] if t == 3 else [], reward=0.5 * t))
+    assert interactions.resolved().tracking.tolist() == [[0.75]]
+
+
+def test_issued_lists_everything_once(torch_device):
+    """Pending and resolved interactions that were issued after a step are listed once each, with what was decided."""
+    interactions = make_interactions(3, torch_device)
+    issue(interactions, [0, 1], [10.0, 11.0], torch_device)  # after step 0
+    advance(interactions, make_step(3, torch_device, terminated=[0]))
+    issue(interactions, [2], [12.0], torch_device)  # after step 1
+    advance(interactions, make_step(3, torch_device, goal_due=[1]))
+    issue(interactions, [1], [13.0], torch_device)  # after step 2
+    for since, expected in (
+        (-1, [(0, 10), (1, 11), (1, 13), (2, 12)]),
+        (0, [(1, 13), (2, 12)]),
+        (1, [(1, 13)]),
+        (2, []),
+    ):
+        env, state, goal, next_goal = interactions.issued(since)
+        assert sorted(zip(env.tolist(), state[:, 0].tolist(), strict=True)) == expected
+        assert torch.equal(goal[:, 0], state[:, 0] + 0.25)
+        assert torch.equal(next_goal[:, 1], state[:, 0] + 0.5)
+
+
+def test_a_view_without_scores_is_the_same_but_for_them(torch_device):
+    """It shows every interaction as it is, and NaN for what another selector thought; the original keeps its scores."""
+    interactions = make_interactions(2, torch_device)
+    issue(interactions, [0, 1], [3.0, 4.0], torch_device)
+    view = interactions.without_scores()
+    advance(interactions, make_step(2, torch_device, terminated=[1], goal_due=[0]))
+    shown, true = interactions.without_scores().resolved(), interactions.resolved()
+    assert true.score.tolist() == [3.75, 4.75]
+    assert shown.score.isnan().all()
+    for name in set(Resolved.__dataclass_fields__) - {"score"}:
+        assert torch.equal(getattr(shown, name), getattr(true, name)), name
+    assert torch.equal(view.resolved().crashed, true.crashed)  # it shares the memory

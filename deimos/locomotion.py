@@ -1,0 +1,476 @@
+"""Legged robots that follow velocity goals: everything that the environments of such robots share.
+
+The task is Legged Gym's (Rudin et al. 2021) as Gauthier's thesis uses it (4.1.2): no heading mode, levels that
+rise and fall with the reward.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+import terrain
+from deimos.checks import SimulationError, check_at_least, check_choice, check_positive, check_range
+from deimos.env import Env, EnvConfig, ObsField, Step
+from deimos.physics import Captured, Physics, PhysicsConfig
+from deimos.robots import Robot
+from deimos.shared import Shared, warp_device
+from kernels.goals import draw_candidates
+from kernels.height_scan import scan_points
+from kernels.locomotion import apply_actions, judge_step
+from kernels.locomotion_episodes import reset_worlds, set_goals, update_levels
+from kernels.locomotion_obs import finish_obs
+from kernels.locomotion_rewards import LEG_JOINTS, RewardWeights, vec12, vecT
+from kernels.locomotion_state import (
+    BROKEN,
+    COLUMNS,
+    HEIGHT_SCALE,
+    JOINT_SPEED_SCALE,
+    NUM_COLUMNS,
+    NUM_FEET,
+    RATE_SCALE,
+    VELOCITY_SCALE,
+    Ground,
+    Joints,
+    LevelRule,
+    LocomotionParams,
+    LocomotionState,
+    LocomotionStep,
+    Simulation,
+)
+from kernels.random import Purpose, draw_uniforms
+from terrain import Terrain
+
+SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
+MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
+MAX_INVALID_SHARE = 1e-3  # of all world-steps; more of them stop the run
+ACTION_BOUND = 100.0  # Legged Gym's: far beyond what a policy does, so that only nonsense is clipped
+SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
+EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
+NOWHERE = 1e9  # [m]; a plane has no edge
+NOISE = {
+    "linear_velocity": 0.1, "angular_velocity": 0.2, "gravity": 0.05, "joint_position": 0.01, "joint_velocity": 1.5,
+    "heights": 0.1,
+}  # half widths, in the unit of each field; Legged Gym's  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocomotionConfig(EnvConfig):
+    """A legged robot on a terrain. Defaults are Legged Gym's but for those that say otherwise."""
+
+    terrain: str = "flat"
+    """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a saved terrain."""
+    goal_period: int = 500
+    """T: steps that a goal is in force, at least 1 and at most an episode."""
+    episode_steps: int = 1000
+    """Steps after which an episode is truncated, at least 1."""
+    levels: Literal["reward", "displacement", "frozen"] = "reward"
+    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far it got (Legged
+    Gym), or nothing."""
+    start_levels: int = 6
+    """Levels that first episodes are drawn from, at least 1."""
+    rewards: RewardWeights = field(default_factory=RewardWeights)
+    """Weights of the reward's terms."""
+    air_time_target: float = 0.3
+    """Time in the air from which on a step is rewarded [s], at least 0. Legged Gym has 0.5 s, for larger robots."""
+    friction: tuple[float, float] = (0.5, 1.25)
+    """Range of the feet's friction, drawn once per world; at least 0.05, below which contacts are ill-conditioned."""
+    payload: float = 1.0
+    """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0."""
+    push_interval: float = 15.0
+    """Time from push to push, each robot in a phase of its own [s], at least 0; 0 for none."""
+    push_speed: float = 1.0
+    """Bound of the horizontal velocity that a push sets [m/s], at least 0."""
+    noise: bool = True
+    """Whether observations are noisy."""
+    stagger: bool = True
+    """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
+    stiffness: float = 30.0
+    """Position gain of the legs' joints [N m/rad], positive."""
+    damping: float = 0.8
+    """Velocity gain of the legs' joints [N m s/rad], positive."""
+    action_scale: float = 0.25
+    """What an action of one adds to a target angle [rad], positive."""
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    """The simulator's settings."""
+
+    def __post_init__(self) -> None:
+        for name in ("goal_period", "episode_steps", "start_levels"):
+            check_at_least(name, getattr(self, name), 1)
+        if self.goal_period > self.episode_steps:
+            raise ValueError(
+                f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
+            )
+        check_choice("levels", self.levels, [rule.name.lower() for rule in LevelRule])
+        for name in ("stiffness", "damping", "action_scale"):
+            check_positive(name, getattr(self, name), finite=True)
+        for name in ("air_time_target", "payload", "push_interval", "push_speed"):
+            check_range(name, getattr(self, name), 0, 1e6)
+        for weight in fields(self.rewards):
+            if not math.isfinite(getattr(self.rewards, weight.name)):
+                raise ValueError(f"rewards.{weight.name} must be finite, got {getattr(self.rewards, weight.name)}.")
+        low, high = self.friction
+        if not 0.05 <= low <= high < math.inf:
+            raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
+
+    def with_goal_period(self, goal_period: int) -> "LocomotionConfig":
+        """See ``EnvConfig.with_goal_period``."""
+        return replace(self, goal_period=goal_period)
+
+    def for_evaluation(self) -> "LocomotionConfig":
+        """See ``EnvConfig.for_evaluation``. World i stands on level (i // columns) % levels of column i % columns."""
+        return replace(
+            self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
+        )
+
+    def load_terrain(self) -> Terrain | None:
+        """The terrain; ``None`` for flat ground.
+
+        Raises:
+            ValueError: If there is none of this name, or the file is not one.
+        """
+        if self.terrain == "flat":
+            return None
+        if self.terrain == "rough":
+            return terrain.rough()
+        if not Path(self.terrain).is_file():
+            raise ValueError(f"terrain must be flat, rough or the path of a saved terrain, got '{self.terrain}'.")
+        return terrain.load(self.terrain)
+
+
+class Locomotion(Env):
+    """A legged robot in many worlds; see ``LocomotionConfig``.
+
+    Args:
+        config: The task.
+        robot: Who does it.
+        goal_range: Half side of the box of goals along every component, [m/s], [m/s], [rad/s] first.
+        goal_scale: What the policy sees goals multiplied by, a number for every component.
+        num_envs: Number of worlds.
+        device: Where they are simulated.
+        seed: Seed of every draw.
+        env_offset: Global number of world 0.
+    """
+
+    config: LocomotionConfig
+    goal_groups = (slice(0, 2), slice(2, 3))
+    may_go_on_invalid = True
+
+    def __init__(
+        self,
+        config: LocomotionConfig,
+        robot: Robot,
+        goal_range: tuple[float, ...],
+        goal_scale: tuple[float, ...],
+        num_envs: int,
+        device: torch.device,
+        seed: int,
+        env_offset: int = 0,
+    ) -> None:
+        self.config = config
+        self.robot = robot
+        self.num_envs = num_envs
+        self.device = device
+        self.action_dim = len(robot.pose)
+        self.action_bound = ACTION_BOUND
+        self.dt = config.physics.timestep * config.physics.substeps
+        self.goal_period = config.goal_period
+        self.time_limit = config.episode_steps
+        self.points = scan_points()
+        self.layout = _layout(self.action_dim, goal_scale, len(self.points))
+        ground = config.load_terrain()
+        self.terrain = ground or terrain.flat()
+        self._goal_scale = wp.array(goal_scale, dtype=wp.float32, device=warp_device(device))
+        self._goal_range = Shared.zeros(len(goal_range), wp.float32, device)
+        self._whole_range = torch.tensor(goal_range, device=device)
+        self._seen_range = self._whole_range * torch.tensor(goal_scale, device=device)
+        self._allocate(len(goal_range))
+        self._seed, self._offset = seed, env_offset
+        self.physics = self._build_physics(ground)
+        self._params = self._make_params(ground)
+        self._wire()
+        self._capture()
+        self._reset_all()
+
+    def _build_physics(self, ground: Terrain | None) -> Physics:
+        """The simulator, with a friction and a payload for every world unless they are fixed."""
+        config, n = self.config, self.num_envs
+        self._set_rows(torch.arange(n))
+        draw_uniforms(
+            self._row.array, self.state_arrays.episode_count, self._draw.array,
+            seed=self._seed, purpose=Purpose.FRICTION, world_offset=self._offset,
+        )  # fmt: skip
+        u = self._draw.array.numpy().astype(np.float64)
+        low, high = config.friction
+        varied = high > low or low != 1.0
+        return Physics(
+            self.robot, ground, n, self.device, config.physics,
+            friction=low + (high - low) * u[:, 0] if varied else None,
+            payload=config.payload * (2.0 * u[:, 1] - 1.0) if config.payload > 0 else None,
+        )  # fmt: skip
+
+    def _make_params(self, ground: Terrain | None) -> LocomotionParams:
+        """What the kernels need to know."""
+        config, robot, land = self.config, self.robot, self.terrain
+        limits = self.physics.joint_range[:LEG_JOINTS]
+        middle, half = limits.mean(axis=1), SOFT_LIMIT * np.ptp(limits, axis=1) / 2
+        corner = np.array(land.corner)
+        far = corner + (np.array(land.heights.shape) - 1) * land.cell
+        params = LocomotionParams()
+        values = {
+            "dt": self.dt, "goal_period": config.goal_period, "time_limit": config.episode_steps,
+            "stagger": config.stagger, "seed": self._seed, "world_offset": self._offset,
+            "action_bound": ACTION_BOUND, "noise": config.noise,
+            "push_interval": round(config.push_interval / self.dt), "push_speed": config.push_speed,
+            "weight": vecT(*asdict(config.rewards).values()), "air_time_target": config.air_time_target,
+            "soft_low": vec12(*(middle - half)), "soft_high": vec12(*(middle + half)),
+            "max_speed": MAX_SPEED, "max_rate": MAX_RATE, "lost_contacts": self.physics.lost_contacts,
+            "scan_start": self.obs_dim - len(self.points), "standing_height": robot.standing_height,
+            "spawn_height": robot.spawn_height, "spawn_range": SPAWN_RANGE, "spawn_speed": SPAWN_SPEED,
+            "spawn_reach": robot.reach, "level_rule": int(LevelRule[config.levels.upper()]),
+            "start_levels": config.start_levels, "cell": land.cell, "corner": wp.vec2(*land.corner),
+            "low": wp.vec2(*(corner + EDGE)) if ground else wp.vec2(-NOWHERE),
+            "high": wp.vec2(*(far - EDGE)) if ground else wp.vec2(NOWHERE),
+            "half_tile": land.tile / 2,
+        }  # fmt: skip
+        for name in LocomotionParams.vars:
+            setattr(params, name, values[name])
+        return params
+
+    def _allocate(self, goal_dim: int) -> None:
+        """Allocate every array once; nothing is allocated or rebound later."""
+        n, joints, device = self.num_envs, self.action_dim, self.device
+
+        def zeros(sizes: dict[str, tuple[int, ...]], dtype: type) -> dict[str, Shared]:
+            return {name: Shared.zeros(shape, dtype, device) for name, shape in sizes.items()}
+
+        counters = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count")
+        rows = {"goal": goal_dim, "action": joints, "joint_speed": joints, "air_time": NUM_FEET}
+        state = zeros({name: (n, width) for name, width in rows.items()}, wp.float32)
+        state |= zeros(dict.fromkeys(counters, (n,)), wp.int32) | zeros({"tracked": (n,)}, wp.vec2)
+        out = zeros({"obs": (n, self.obs_dim), "term": (n, NUM_COLUMNS), "reward": (n,), "value": (n,)}, wp.float32)
+        out |= zeros({"tracking": (n, len(self.goal_groups))}, wp.float32)
+        out |= zeros(dict.fromkeys(("terminated", "truncated", "goal_due", "invalid"), (n,)), wp.bool)
+        out |= zeros({"count": (2,), "fault": (3,), "cause": (n,)}, wp.int32)
+        self.state_arrays, self.step_arrays = LocomotionState(), LocomotionStep()
+        for struct, arrays in ((self.state_arrays, state), (self.step_arrays, out)):
+            for name, shared in arrays.items():
+                setattr(struct, name, shared.array)
+        self.obs = out["obs"].tensor
+        self.term = out["term"].tensor
+        """What the last reward is the sum of, shape (num_envs, len(COLUMNS)); see ``COLUMNS``."""
+        self._out = {name: shared.tensor for name, shared in out.items()}
+        self.tensors = {name: shared.tensor for name, shared in state.items()} | {"obs": self.obs}
+        self.episode_step = self.tensors["episode_step"]
+        self._step = Step(**{name: self._out[name] for name in Step.__dataclass_fields__})
+        self._sums = torch.zeros(NUM_COLUMNS, dtype=torch.float64, device=device)
+        self._steps_reported = self._steps_checked = self.invalid_steps = 0
+        self.action = Shared.zeros((n, joints), wp.float32, device)
+        self._mask = Shared.zeros(n, wp.bool, device)
+        self._row = Shared.zeros(n, wp.int32, device)
+        self._new_goal = Shared.zeros((n, goal_dim), wp.float32, device)
+        self._draw = Shared.zeros(n, wp.vec4, device)
+        self._candidate_scale = Shared.zeros(goal_dim, wp.float32, device)
+        self._candidates: dict[int, tuple[Shared, wp.Launch]] = {}
+
+    def _wire(self) -> None:
+        """Join the simulator's arrays and the robot's numbers to the kernels."""
+        name, robot, physics, land = warp_device(self.device), self.robot, self.physics, self.terrain
+        self.tensors = physics.tensors | self.tensors
+        self._joints, self._ground, self._sim = Joints(), Ground(), Simulation()
+        low, high = physics.joint_range.T
+        for key, value in (("pose", robot.pose), ("action_scale", robot.action_scale), ("low", low), ("high", high)):
+            setattr(self._joints, key, wp.array(np.asarray(value, np.float32), dtype=wp.float32, device=name))
+        self._ground.heights = wp.array(land.heights, dtype=wp.float32, device=name)
+        self._ground.origin = wp.array(land.origins, dtype=wp.vec3, device=name)
+        for key in Simulation.vars:
+            setattr(self._sim, key, getattr(physics, key))
+        self._points = wp.array(self.points, dtype=wp.vec2, device=name)
+        noise = [
+            NOISE.get(entry.name, 0.0) * scale
+            for entry in self.layout
+            for scale in np.broadcast_to(entry.scale, entry.size)
+        ]
+        self._noise = wp.array(noise, dtype=wp.float32, device=name)
+
+    def _capture(self) -> None:
+        """Record the step and the reset, each as one graph."""
+        self._launch_step = Captured(self._run_step, self.device)
+        self._launch_reset = Captured(self._run_reset, self.device)
+        self._launch_goals = set_goals(
+            self._row.array, self._new_goal.array, self._goal_scale, self.state_arrays, self.step_arrays.obs,
+            record=True,
+        )  # fmt: skip
+        self._launch_draw = draw_uniforms(
+            self._row.array, self.state_arrays.goal_count, self._draw.array, seed=self._seed, purpose=Purpose.GOAL,
+            world_offset=self._offset, record=True,
+        )  # fmt: skip
+
+    def _run_step(self) -> None:
+        params, state, out, sim = self._params, self.state_arrays, self.step_arrays, self._sim
+        apply_actions(params, self._joints, self.action.array, state, sim, out.fault)
+        self.physics.step()
+        judge_step(params, self._joints, self.action.array, self._goal_scale, sim, state, out)
+        self._run_scan(out.invalid, wanted=False)
+
+    def _run_scan(self, mask: wp.array, *, wanted: bool) -> None:
+        finish_obs(
+            self._params, mask, self._ground.heights, self._points, self._noise, self._sim.qpos, self.state_arrays,
+            self.step_arrays.obs, wanted=wanted,
+        )  # fmt: skip
+
+    def _run_reset(self) -> None:
+        params, state, out, sim, mask = (
+            self._params, self.state_arrays, self.step_arrays, self._sim, self._mask.array,
+        )  # fmt: skip
+        update_levels(
+            params, self._ground.origin, mask, out.terminated, out.truncated, out.invalid, sim.qpos, state
+        )  # fmt: skip
+        self.physics.reset(mask)
+        reset_worlds(
+            params, self._joints, self._ground, mask, self._goal_range.array, self._goal_scale, state, sim.qpos,
+            sim.qvel, out.obs,
+        )  # fmt: skip
+        self._run_scan(mask, wanted=True)
+
+    def _reset_all(self) -> None:
+        """Begin every world's first episode; what recording has done before is undone."""
+        for name, tensor in self.tensors.items():
+            if name not in self.physics.tensors:
+                tensor.zero_()
+        for tensor in self._out.values():
+            tensor.zero_()
+        self._clear_faults()
+        self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+
+    def step(self, action: Tensor) -> Step:
+        """See ``Env.step``. Actions are differences from the default pose, in units of ``action_scale``."""
+        if action.shape != self.action.tensor.shape:
+            expected = tuple(self.action.tensor.shape)
+            raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
+        self.action.tensor.copy_(action)
+        self._step.count.zero_()
+        self._launch_step()
+        self._sums += self.term.sum(0)
+        self._steps_reported += 1
+        self._steps_checked += 1
+        return self._step
+
+    def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
+        """See ``Env.reset``."""
+        self._mask.tensor.copy_(mask)
+        torch.mul(self._whole_range, 1.0 if goal_scale is None else goal_scale, out=self._goal_range.tensor)
+        self._launch_reset()
+
+    def sample_goals(self, rows: Tensor, count: int, scale: Tensor | None = None) -> Tensor:
+        """See ``Env.sample_goals``."""
+        if count not in self._candidates:
+            candidates = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device)
+            launch = draw_candidates(
+                self._row.array, self.state_arrays.goal_count, self._candidate_scale.array, candidates.array,
+                seed=self._seed, world_offset=self._offset, record=True,
+            )  # fmt: skip
+            self._candidates[count] = candidates, launch
+        candidates, launch = self._candidates[count]
+        self._set_rows(rows)
+        torch.mul(self._seen_range, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
+        launch.set_dim((len(rows), count))
+        launch.launch()
+        return candidates.tensor[: len(rows)]
+
+    def draw(self, rows: Tensor) -> Tensor:
+        """See ``Env.draw``."""
+        self._set_rows(rows)
+        self._launch_draw.set_dim(len(rows))
+        self._launch_draw.launch()
+        return self._draw.tensor[: len(rows)]
+
+    def set_goals(self, rows: Tensor, goal: Tensor) -> None:
+        """See ``Env.set_goals``."""
+        self._set_rows(rows)
+        self._new_goal.tensor[: len(rows)] = goal
+        self._launch_goals.set_dim(len(rows))
+        self._launch_goals.launch()
+
+    def check(self) -> None:
+        """See ``Env.check``. Single invalid worlds are reset and left out of learning; too many of them stop the run.
+
+        An action that is not finite stops it at once.
+        """
+        faults, world, broken_action = self._out["fault"].tolist()
+        steps, self._steps_checked = self._steps_checked, 0
+        self.invalid_steps = faults
+        self._clear_faults()
+        if broken_action < self.num_envs:
+            raise SimulationError(f"World {broken_action}: its action is not finite.")
+        if faults > MAX_INVALID_SHARE * steps * self.num_envs:
+            raise SimulationError(
+                f"World {world}: {self._describe_fault(world)}; {faults} of {steps * self.num_envs} world-steps since "
+                f"the last check were invalid, more than {100 * MAX_INVALID_SHARE:g} %."
+            )
+
+    def _describe_fault(self, world: int) -> str:
+        """What was wrong with an invalid world when it last was."""
+        cause, value = BROKEN[int(self._out["cause"][world]).bit_length() - 1], float(self._out["value"][world])
+        if cause != "contacts":
+            unit = " m/s or rad/s" if cause == "speed" else ""
+            return f"its {cause} was {value:g}{unit}"
+        use = self.physics.buffer_use()
+        return (
+            f"it lost contacts (overflow {int(value)}): up to {use['rows']} constraint rows in a world and "
+            f"{use['contacts']} contacts in all worlds were needed, with room for {use['max_rows']} and "
+            f"{use['max_contacts']}; raise physics.rows or physics.contacts"
+        )
+
+    def report(self) -> dict[str, float]:
+        """What a log wants to know since the last call: means of the reward's terms per step, levels, buffers.
+
+        The terms add up to the mean reward.
+        """
+        steps, self._steps_reported = max(self._steps_reported, 1), 0
+        means = (self._sums / (steps * self.num_envs)).tolist()
+        self._sums.zero_()
+        use = self.physics.buffer_use()
+        return {
+            **{f"reward/{name}": value for name, value in zip(COLUMNS, means, strict=True)},
+            "level": self.tensors["level"].float().mean().item(),
+            "invalid_steps": self.invalid_steps,
+            "contact_use": use["contacts"] / use["max_contacts"],
+            "row_use": use["rows"] / use["max_rows"],
+        }
+
+    def tiles(self) -> list[tuple[str, int]]:
+        """Shape and level of the tile that every world's episode began on; reads the device."""
+        columns = len(self.terrain.shapes)
+        levels = self.tensors["level"].tolist()
+        return [(self.terrain.shapes[(self._offset + i) % columns], level) for i, level in enumerate(levels)]
+
+    def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
+        """See ``Env.reference_policy``. Nobody has written down how to walk."""
+        return None
+
+    def _clear_faults(self) -> None:
+        self._out["fault"].copy_(torch.tensor([0, self.num_envs, self.num_envs], dtype=torch.int32))
+
+    def _set_rows(self, rows: Tensor) -> None:
+        self._row.tensor[: len(rows)] = rows
+
+
+def _layout(num_joints: int, goal_scale: tuple[float, ...], num_heights: int) -> tuple[ObsField, ...]:
+    """Legged Gym's observation."""
+    return (
+        ObsField("linear_velocity", 3, "m/s", VELOCITY_SCALE),
+        ObsField("angular_velocity", 3, "rad/s", RATE_SCALE),
+        ObsField("gravity", 3, "1", 1.0),
+        ObsField("goal", len(goal_scale), "m/s, m/s, rad/s", goal_scale),
+        ObsField("joint_position", num_joints, "rad", 1.0),
+        ObsField("joint_velocity", num_joints, "rad/s", JOINT_SPEED_SCALE),
+        ObsField("last_action", num_joints, "1", 1.0),
+        ObsField("heights", num_heights, "m", HEIGHT_SCALE),
+    )

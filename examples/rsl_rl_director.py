@@ -1,0 +1,59 @@
+"""A Director in rsl_rl's own training loop, on carts that are not Deimos': follow a speed, stay on the track."""
+
+import argparse
+
+import torch
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+
+from deimos import GoalDirector
+
+
+class Carts(VecEnv):
+    """Carts on a track of 2 m. An action accelerates [m/s^2]; the goal is a speed [m/s]; off the track is a crash."""
+
+    num_actions, max_episode_length, device = 1, 500, "cpu"
+
+    def __init__(self, num_envs: int, director: GoalDirector) -> None:
+        self.num_envs, self.director, self.cfg = num_envs, director, {}
+        self.state, self.goal = torch.zeros(num_envs, 2), torch.rand(num_envs, 1) * 2 - 1  # (position, speed), speed
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
+
+    def get_observations(self) -> TensorDict:  # noqa: D102
+        return TensorDict({"policy": torch.cat([self.state, self.goal], dim=1)}, batch_size=[self.num_envs])
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:  # noqa: D102
+        self.state[:, 1] += 0.05 * actions[:, 0].clamp(-2.0, 2.0)
+        self.state[:, 0] += 0.05 * self.state[:, 1]
+        self.episode_length_buf += 1
+        reward = torch.exp(-4.0 * (self.state[:, 1] - self.goal[:, 0]).square())
+        crashed = self.state[:, 0].abs() > 1.0
+        timed_out = (self.episode_length_buf >= self.max_episode_length) & ~crashed
+        done = crashed | timed_out
+        candidates = torch.rand(self.num_envs, 100, 1) * 2 - 1
+        self.goal = self.director.step(self.state, self.goal, crashed, timed_out, candidates, reward).goal
+        self.state[done], self.episode_length_buf[done] = 0.0, 0
+        return self.get_observations(), reward, done, {"time_outs": timed_out.float()}
+
+
+def main() -> None:
+    """Train, and say which speeds the policy has to fear close to the end of the track."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--iterations", type=int, default=100)
+    parser.add_argument("--num-envs", type=int, default=512)
+    args = parser.parse_args()
+    env = Carts(args.num_envs, GoalDirector("p75", goal_period=40))
+    model = {"class_name": "MLPModel", "hidden_dims": [32, 32], "activation": "elu"}
+    actor = model | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
+    config = {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "actor": actor, "critic": model}
+    config |= {"algorithm": {"class_name": "PPO"}, "num_steps_per_env": 24, "save_interval": 10**6}
+    OnPolicyRunner(env, config).learn(args.iterations)
+    edge, speeds = torch.tensor([0.9, 0.0]).expand(5, 2), torch.linspace(-1, 1, 5).unsqueeze(1)
+    print("Fear of a new speed for a cart that stands 0.1 m from the end of the track:")
+    for speed, fear in zip(speeds[:, 0], env.director.fear(edge, torch.zeros(5, 1), speeds), strict=True):
+        print(f"{speed:+.1f} m/s  {fear:.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,526 @@
+"""Quad: what an environment promises, shown on the Go1, and the task of the thesis."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import terrain
+from deimos.checks import SimulationError
+from deimos.env import Step
+from deimos.envs.quad import Config
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.physics import PhysicsConfig
+from deimos.selectors import uniform
+from kernels.height_scan import scan_points
+from kernels.locomotion_rewards import RewardWeights
+from kernels.locomotion_state import COLUMNS
+from kernels.random import Purpose
+from terrain import Grid, Share
+from terrain.shapes.stairs import Shape as Stairs
+
+U = 2.0**-24
+POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)
+
+
+@pytest.fixture(scope="module")
+def hills(tmp_path_factory):
+    """The path of a small saved terrain: 3 levels and 2 columns of stairs."""
+    shapes = tuple(Share(shape=Stairs(tile=4.0, platform=2.0, direction=way)) for way in ("up", "down"))
+    ground = terrain.build(Grid(shapes=shapes, levels=3, columns=2, tile=4.0, border=2.0, hardest=0.5))
+    path = tmp_path_factory.mktemp("terrain") / "hills.npz"
+    ground.save(path)
+    return str(path)
+
+
+def build(device, num_envs=6, seed=0, env_offset=0, **config):
+    """An environment with short goals and episodes unless told otherwise."""
+    return Config(**({"goal_period": 5, "episode_steps": 40} | config)).build(num_envs, device, seed, env_offset)
+
+
+def build_loop(env, candidates=3):
+    """A loop with uniform goals."""
+    return GoalLoop(env, uniform.Config(candidates=candidates).build(spaces(env), seed=0))
+
+
+def actions(num_envs, device, seed=0, scale=0.6):
+    """Constant actions, other for every world: some robots fall early, some late."""
+    a = np.random.default_rng(seed).normal(scale=scale, size=(num_envs, 12))
+    return torch.tensor(a, dtype=torch.float32, device=device)
+
+
+def tensors_of(env, step):
+    """Copies of all that a resume needs and of all that a step gave back."""
+    return env.state_dict() | {name: getattr(step, name).clone() for name in Step.__dataclass_fields__}
+
+
+def assert_equal(found, expected):
+    """Two dictionaries of tensors are the same in every value."""
+    assert found.keys() == expected.keys()
+    for name in expected:
+        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=0, equal_nan=True, msg=name)
+
+
+def rows_of(env, *rows):
+    """Rows as an environment takes them; all of them if none is given."""
+    return torch.tensor(rows or range(env.num_envs), dtype=torch.int64, device=env.device)
+
+
+def mask_of(env, *rows):
+    """A mask of the listed worlds."""
+    mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+    mask[list(rows)] = True
+    return mask
+
+
+def test_observation_is_legged_gyms(torch_device):
+    """48 numbers and 187 heights, in Legged Gym's order, scales and noise."""
+    env = build(torch_device)
+    fields = [(field.name, field.size, field.scale) for field in env.layout]
+    assert fields == [
+        ("linear_velocity", 3, 2.0), ("angular_velocity", 3, 0.25), ("gravity", 3, 1.0), ("goal", 3, (2.0, 2.0, 0.25)),
+        ("joint_position", 12, 1.0), ("joint_velocity", 12, 0.05), ("last_action", 12, 1.0), ("heights", 187, 5.0),
+    ]  # fmt: skip
+    assert env.obs_dim == 235
+    assert env.goal_slice == slice(9, 12)
+    assert env.dt == pytest.approx(0.02)
+    noise = [0.2] * 3 + [0.05] * 3 + [0.05] * 3 + [0.0] * 3 + [0.01] * 12 + [0.075] * 12 + [0.0] * 12 + [0.5] * 187
+    np.testing.assert_allclose(env._noise.numpy(), noise, rtol=1e-6)
+
+
+def test_observation_matches_numpy(torch_device, hills):
+    """After random steps on stairs, the whole observation, heights included, is that of NumPy from the same state."""
+    env = build(torch_device, num_envs=12, terrain=hills, noise=False)
+    action = actions(12, torch_device)
+    for _ in range(15):
+        step = env.step(action)
+    ground, points = env.terrain, scan_points()
+    qpos, qvel = (env.tensors[name].double().cpu().numpy() for name in ("qpos", "qvel"))
+    for i in range(12):
+        w, x, y, z = qpos[i, 3:7]
+        forward = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
+        left = np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
+        rotation = np.stack([forward, left, np.cross(forward, left)], axis=1)
+        yaw = np.arctan2(forward[1], forward[0])
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        cells = (qpos[i, :2] + points @ turn.T - ground.corner) / ground.cell
+        a, b = np.clip(np.floor(cells), 0, np.array(ground.heights.shape) - 2).astype(int).T
+        height = np.minimum(np.minimum(ground.heights[a, b], ground.heights[a + 1, b]), ground.heights[a, b + 1])
+        expected = np.concatenate([
+            2 * rotation.T @ qvel[i, :3], 0.25 * qvel[i, 3:6], -rotation[2],
+            env.tensors["goal"][i].cpu().numpy() * [2, 2, 0.25], qpos[i, 7:] - POSE, 0.05 * qvel[i, 6:],
+            action[i].cpu().numpy(), 5 * np.clip(qpos[i, 2] - 0.325 - height, -1, 1),
+        ])  # fmt: skip
+        found = step.obs[i].cpu().numpy()
+        np.testing.assert_allclose(found[:48], expected[:48], rtol=1e-5, atol=1e-5)
+        # A point within rounding of a cell's edge may be read from the next cell.
+        assert (np.abs(found[48:] - expected[48:]) > 1e-4).sum() <= 2
+
+
+def test_reward_is_the_sum_of_its_columns(torch_device, hills):
+    """Over steps with crashes on stairs, the columns sum to the reward, and the report's means to the mean reward."""
+    env = build(torch_device, num_envs=32, terrain=hills)
+    loop = build_loop(env)
+    total = 0.0
+    for _ in range(30):
+        step = env.step(actions(32, torch_device))
+        torch.testing.assert_close(env.term.sum(1), step.reward, rtol=0, atol=1e-5)
+        assert bool((step.reward >= 0).all())
+        total += float(step.reward.mean()) / 30
+        loop.advance(step)
+    report = env.report()
+    assert sum(report[f"reward/{name}"] for name in COLUMNS) == pytest.approx(total, abs=1e-6)
+    assert set(env.report()) == set(report)
+
+
+def test_tracking_is_the_reward_terms_unweighted(torch_device):
+    """``Step.tracking`` is each tracking term over its weight and the duration, a column for each goal group."""
+    env = build(torch_device)
+    assert env.goal_groups == (slice(0, 2), slice(2, 3))
+    step = env.step(actions(6, torch_device))
+    weights = RewardWeights()
+    for column, name in enumerate(("linear_tracking", "yaw_tracking")):
+        term = env.term[:, COLUMNS.index(name)]
+        torch.testing.assert_close(step.tracking[:, column], term / (getattr(weights, name) * 0.02), rtol=1e-6, atol=0)
+    assert bool(((step.tracking >= 0) & (step.tracking <= 1)).all())
+
+
+def test_crash_is_the_trunk_on_the_ground(torch_device):
+    """A robot dropped on its back crashes when the trunk touches the ground, not before; one that stands does not."""
+    env = build(torch_device, num_envs=2, episode_steps=500, goal_period=500).config.for_evaluation().build(
+        2, torch_device, 0
+    )  # fmt: skip
+    qpos = env.tensors["qpos"]
+    qpos[0, 2] = 0.5
+    qpos[0, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0], device=torch_device)
+    crashed_at, stood = None, True
+    for t in range(60):
+        step = env.step(torch.zeros(2, 12, device=torch_device))
+        stood &= not bool(step.terminated[1])
+        if bool(step.terminated[0]) and crashed_at is None:
+            crashed_at = t
+            assert float(qpos[0, 2]) < 0.12
+    # A fall by 0.4 m takes sqrt(2 0.4 / 9.81) = 0.29 s, or 14 steps; its first speed is at most 0.5 m/s either way.
+    assert crashed_at is not None
+    assert 8 <= crashed_at <= 22
+    assert stood
+
+
+def test_warp_and_torch_see_one_allocation_and_views_stay(torch_device):
+    """Every tensor keeps its address over steps, goals and resets, and a step gives back the very same views."""
+    env = build(torch_device, episode_steps=6)
+    loop = build_loop(env)
+    first = env.step(actions(6, torch_device))
+    addresses = [t.data_ptr() for t in (*env.tensors.values(), *vars(first).values())]
+    for _ in range(12):
+        last = env.step(actions(6, torch_device))
+        loop.advance(last)
+    assert last is first
+    assert addresses == [t.data_ptr() for t in (*env.tensors.values(), *vars(last).values())]
+    assert env.tensors["qpos"].data_ptr() == env.physics.qpos.ptr
+
+
+def test_reset_of_one_world_leaves_the_others(torch_device, hills):
+    """Resetting world 0 changes world 0 and no bit of any other, now and over the steps that follow."""
+    env, twin = (build(torch_device, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
+    action = actions(6, torch_device)
+    for _ in range(8):
+        env.step(action)
+        twin.step(action)
+    env.reset(mask_of(env, 0))
+    assert not torch.equal(env.tensors["qpos"][0], twin.tensors["qpos"][0])
+    assert int(env.tensors["episode_count"][0]) == 2
+    for _ in range(8):
+        for name, tensor in env.tensors.items():
+            assert torch.equal(tensor[1:], twin.tensors[name][1:]), name
+        env.step(action)
+        twin.step(action)
+
+
+def test_copied_worlds_are_exact_clones(torch_device):
+    """Clones, also into another environment, go on exactly as their originals, warm starts and payloads included."""
+    config = {"noise": False, "push_interval": 0.0, "episode_steps": 300, "goal_period": 100}
+    origin, env = build(torch_device, **config), build(torch_device, seed=3, **config)
+    action = actions(6, torch_device)
+    for _ in range(9):
+        origin.step(action)
+    source, target = rows_of(origin, 4, 1), rows_of(env, 0, 5)
+    env.copy_worlds(source, target, origin)
+    everyone = actions(6, torch_device, seed=1)
+    everyone[target] = action[source]
+    for _ in range(12):
+        for name, tensor in env.tensors.items():
+            assert torch.equal(tensor[target], origin.tensors[name][source]), name
+        env.step(everyone)
+        origin.step(action)
+
+
+def test_resume_is_exact(torch_device, hills):
+    """A new environment with the saved state goes on bit for bit, over goals, pushes, crashes, resets and levels."""
+    config = {"terrain": hills, "push_interval": 0.2}
+    env = build(torch_device, **config)
+    loop = build_loop(env)
+    action = actions(6, torch_device)
+    for _ in range(30):
+        loop.advance(env.step(action))
+    saved = loop.state_dict()
+    expected = []
+    for _ in range(45):
+        step = env.step(action)
+        loop.advance(step)
+        expected.append(tensors_of(env, step))
+    resumed_env = build(torch_device, **config)
+    resumed = build_loop(resumed_env)
+    resumed.load_state_dict(saved)
+    for want in expected:
+        step = resumed_env.step(action)
+        resumed.advance(step)
+        assert_equal(tensors_of(resumed_env, step), want)
+    assert bool((env.tensors["episode_count"] > saved["env"]["episode_count"]).any())
+
+
+def test_two_shards_equal_the_whole(torch_device, hills):
+    """Two environments of 4 worlds, the second with an offset of 4, do what one of 8 does, bit for bit."""
+    config = {"terrain": hills, "push_interval": 0.2}
+    whole = build(torch_device, num_envs=8, **config)
+    shards = [build(torch_device, num_envs=4, env_offset=offset, **config) for offset in (0, 4)]
+    loops = [build_loop(env) for env in (whole, *shards)]
+    action = actions(8, torch_device)
+    for _ in range(50):
+        loops[0].advance(whole.step(action))
+        for i, shard in enumerate(shards):
+            loops[1 + i].advance(shard.step(action[4 * i : 4 * i + 4]))
+    for name, tensor in whole.tensors.items():
+        assert torch.equal(tensor, torch.cat([shard.tensors[name] for shard in shards])), name
+    assert bool((whole.tensors["episode_count"] > 1).all())
+
+
+def test_goals_are_uniform_in_the_box_and_what_the_policy_sees(torch_device):
+    """Candidates fill [-1, 1]^3, scaled as observed; a goal that is set shows in its slot and starts its clock."""
+    env = build(torch_device, num_envs=50)
+    goals = env.sample_goals(rows_of(env), 200).clone() / torch.tensor([2.0, 2.0, 0.25], device=torch_device)
+    assert bool((goals.abs() <= 1).all())
+    # The mean of 10 000 uniform numbers has a standard deviation of 0.0058, their variance one of 0.003.
+    assert goals.mean((0, 1)).abs().max() < 5 * 0.0058
+    assert (goals.var((0, 1)) - 1 / 3).abs().max() < 5 * 0.003
+    small = env.sample_goals(rows_of(env), 200, torch.tensor([0.5, 0.25, 1.0], device=torch_device))
+    torch.testing.assert_close(small / torch.tensor([1.0, 0.5, 0.25], device=torch_device), goals, rtol=1e-5, atol=1e-6)
+    wanted = torch.tensor([[1.0, -2.0, 0.125], [0.0, 0.5, -0.25]], device=torch_device)
+    env.step(actions(50, torch_device))
+    before = env.obs.clone()
+    env.set_goals(rows_of(env, 7, 3), wanted)
+    assert torch.equal(env.goal[[7, 3]], wanted)
+    torch.testing.assert_close(env.tensors["goal"][7], torch.tensor([0.5, -1.0, 0.5], device=torch_device))
+    assert env.tensors["goal_clock"][[7, 3]].tolist() == [0, 0]
+    assert torch.equal(env.state(env.obs), env.state(before))
+
+
+def test_first_goals_fill_the_asked_share_of_the_range(torch_device):
+    """First goals lie within the given share of the box, and without one within all of it."""
+    env = build(torch_device, num_envs=200)
+    env.reset(mask_of(env, *range(200)), torch.tensor([0.1, 1.0, 0.5], device=torch_device))
+    largest = env.tensors["goal"].abs().amax(0)
+    assert bool((largest <= torch.tensor([0.1, 1.0, 0.5], device=torch_device)).all())
+    assert bool((largest > 0.9 * torch.tensor([0.1, 1.0, 0.5], device=torch_device)).all())
+
+
+def test_randomisation_is_drawn_per_world(torch_device, uniform_reference):
+    """Friction and payload are functions of the seed and the world's number, in their ranges; evaluation has none."""
+    env = build(torch_device, num_envs=40, seed=5, env_offset=100)
+    u = uniform_reference(5, Purpose.FRICTION, 100 + np.arange(40), 0)
+    model = env.physics.model
+    friction = env.physics.tensors["geom_friction"].cpu().numpy()
+    mass = env.physics.tensors["body_mass"].cpu().numpy()[:, 1]
+    np.testing.assert_allclose(mass, model.body("trunk").mass + 2 * u[:, 1] - 1, rtol=1e-6)
+    feet = np.sort(friction[:, :, 0], axis=1)
+    np.testing.assert_allclose(
+        np.unique(feet), np.unique(np.append(0.5 + 0.75 * u[:, 0], 1.0).astype(np.float32)), rtol=1e-6
+    )
+    quiet = Config().for_evaluation()
+    assert quiet == replace(
+        Config(), levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
+    )
+    assert "geom_friction" not in quiet.build(2, torch_device, 0).tensors
+
+
+def test_noise_is_uniform_and_keyed(torch_device):
+    """Noise is uniform within the published bounds, and another on every step and in every world."""
+    quiet, noisy = (build(torch_device, num_envs=300, noise=noise) for noise in (False, True))
+    action = actions(300, torch_device)
+    differences = []
+    for _ in range(2):
+        difference = noisy.step(action).obs - quiet.step(action).obs
+        differences.append(difference.cpu().numpy())
+    bound = noisy._noise.numpy()
+    for difference in differences:
+        assert np.all(np.abs(difference) <= bound + 1e-5)
+        assert np.all(np.abs(difference[:, bound == 0]) == 0)
+        # 300 draws in 208 columns: the largest of each comes within 10 % of the bound but for one in 10^13.
+        assert np.all(np.abs(difference).max(axis=0)[bound > 0] > 0.9 * bound[bound > 0])
+    assert not np.any(np.isclose(differences[0], differences[1])[:, bound > 0].all(axis=1))
+
+
+def test_levels_follow_the_tracking(torch_device, hills):
+    """A good episode lifts the level, a poor one or a crash lowers it, and one in between leaves it."""
+    env = build(torch_device, num_envs=6, terrain=hills, stagger=False)
+    cases = [(0.85, False, 1, 2), (0.45, False, 1, 0), (0.9, True, 1, 0), (0.65, False, 1, 1), (0.3, False, 0, 0)]
+    t = env.tensors
+    for i, (tracking, crashed, level, _) in enumerate(cases):
+        t["tracked"][i] = torch.tensor([tracking * 40, 40.0])
+        env._out["terminated"][i] = crashed
+        env._out["truncated"][i] = not crashed
+        t["level"][i] = level
+    t["tracked"][5], t["level"][5] = torch.tensor([40.0, 40.0]), 2
+    env._out["truncated"][5] = True
+    env.reset(mask_of(env, *range(6)))
+    assert t["level"][:5].tolist() == [case[3] for case in cases]
+    assert 0 <= int(t["level"][5]) <= 2
+    origin = torch.tensor(env.terrain.origins)[t["level"].cpu().long(), torch.arange(6) % 2]
+    assert bool(((t["qpos"][:, :2].cpu() - origin[:, :2]).abs() <= 1.0).all())
+
+
+def test_a_reset_in_the_middle_and_an_invalid_world_keep_their_level(torch_device, hills):
+    """Only an episode that ended says how it went."""
+    env = build(torch_device, num_envs=3, terrain=hills)
+    env.tensors["level"][:] = 1
+    env.tensors["tracked"][:] = torch.tensor([1.0, 40.0])
+    env._out["terminated"][:] = False
+    env._out["truncated"][:] = torch.tensor([False, True, True])
+    env._out["invalid"][:] = torch.tensor([False, True, False])
+    env.reset(mask_of(env, 0, 1, 2))
+    assert env.tensors["level"].tolist() == [1, 1, 0]
+
+
+def test_who_passes_the_last_level_is_sent_anywhere(torch_device, hills):
+    """After the last level the next is uniform over all of them."""
+    n = 600
+    env = build(torch_device, num_envs=n, terrain=hills)
+    env.tensors["level"][:] = 2
+    env.tensors["tracked"][:] = torch.tensor([40.0, 40.0])
+    env._out["truncated"][:] = True
+    env.reset(mask_of(env, *range(n)))
+    counts = torch.bincount(env.tensors["level"].long(), minlength=3)
+    assert (counts - n / 3).abs().max() < 5 * math.sqrt(n * 2 / 9)
+
+
+@pytest.mark.parametrize("rule", ["reward", "displacement"])
+def test_perfect_tracker_of_turning_goals(torch_device, rule):
+    """Who follows turning goals perfectly walks in circles: it never goes down by ours, but often by Legged Gym's."""
+    rng = np.random.default_rng(0)
+    n, steps = 64, 1000
+    ground = build(torch_device, num_envs=1).terrain
+    assert ground.tile == 8.0
+    env = build(torch_device, num_envs=n, levels=rule, episode_steps=steps, goal_period=500, start_levels=1)
+    # A world of ten levels, all of them flat: what the robots do is written, not simulated.
+    origins = np.zeros((10, 1, 3), np.float32)
+    env._ground.origin = wp.array(origins, dtype=wp.vec3, device=str(env._ground.heights.device))
+    env._capture()
+    t = env.tensors
+    t["level"][:] = 5
+    position, yaw = np.zeros((n, 2)), np.zeros(n)
+    for goal in rng.uniform(-1, 1, size=(2, n, 3)):
+        for _ in range(500):
+            yaw += goal[:, 2] * 0.02
+            c, s = np.cos(yaw), np.sin(yaw)
+            position += 0.02 * np.stack([c * goal[:, 0] - s * goal[:, 1], s * goal[:, 0] + c * goal[:, 1]], axis=1)
+    t["qpos"][:, :2] = torch.tensor(position, dtype=torch.float32)
+    t["goal"][:] = torch.tensor(goal, dtype=torch.float32)
+    t["tracked"][:] = torch.tensor([float(steps), float(steps)])
+    env._out["terminated"][:] = False
+    env._out["truncated"][:] = True
+    env._out["invalid"][:] = False
+    env.reset(mask_of(env, *range(n)))
+    down = int((t["level"] < 5).sum())
+    if rule == "reward":
+        assert t["level"].tolist() == [6] * n
+    else:
+        assert down > n / 4
+
+
+def test_evaluation_puts_world_i_on_tile_i(torch_device, hills):
+    """In evaluation the tile is a function of the world's number alone, and stays, whatever happens."""
+    config = Config(terrain=hills, episode_steps=6, goal_period=3).for_evaluation()
+    env = config.build(8, torch_device, 0)
+    tiles = [("stairs-up", 0), ("stairs-down", 0), ("stairs-up", 1), ("stairs-down", 1), ("stairs-up", 2)]
+    for _ in range(3):
+        assert [(shape.split("_")[0], level) for shape, level in env.tiles()][:5] == tiles
+        assert env.tiles()[6:] == env.tiles()[:2]
+        loop = build_loop(env)
+        for _ in range(7):
+            loop.advance(env.step(actions(8, torch_device)))
+    assert not env.tensors["goal_clock"].unique().numel() > 2
+
+
+def test_episodes_end_at_their_limit_and_first_ones_are_staggered(torch_device):
+    """An episode without a crash is cut off after exactly its steps; first clocks are spread over episode and goal."""
+    env = build(torch_device, num_envs=200, episode_steps=50, goal_period=20)
+    assert len(env.tensors["episode_step"].unique()) > 35
+    assert len(env.tensors["goal_clock"].unique()) == 20
+    calm = build(torch_device, num_envs=3, episode_steps=50, goal_period=20, stagger=False, push_interval=0.0)
+    ends = [bool(calm.step(torch.zeros(3, 12, device=torch_device)).truncated.all()) for _ in range(50)]
+    assert ends == [False] * 49 + [True]
+
+
+def test_walking_off_the_terrain_cuts_the_episode_off(torch_device, hills):
+    """Beyond the edge a robot is truncated, not terminated."""
+    env = build(torch_device, terrain=hills, episode_steps=200, goal_period=100)
+    env.tensors["qpos"][2, 0] += 100.0
+    step = env.step(torch.zeros(6, 12, device=torch_device))
+    assert step.truncated.tolist() == [False, False, True, False, False, False]
+    assert not step.terminated[2]
+    assert not step.invalid.any()
+
+
+@pytest.mark.parametrize(("name", "index", "value"), [("qpos", 8, math.nan), ("qvel", 0, 1e6), ("qvel", 12, math.inf)])
+def test_a_broken_world_is_reset_and_touches_nobody(torch_device, hills, name, index, value):
+    """NaN or a huge speed in one world: it is flagged, cut off and begins anew, and no bit of the others changes."""
+    env, twin = (build(torch_device, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
+    loops = [build_loop(e) for e in (env, twin)]
+    action = actions(6, torch_device, scale=0.2)
+    for _ in range(4):
+        for e, loop in zip((env, twin), loops, strict=True):
+            loop.advance(e.step(action))
+    env.tensors[name][2, index] = value
+    others = [0, 1, 3, 4, 5]
+    for t in range(6):
+        step, twin_step = env.step(action), twin.step(action)
+        assert step.invalid.tolist() == [t == 0 and i == 2 for i in range(6)]
+        assert bool(step.obs.isfinite().all())
+        for key in vars(step):
+            if key != "count":
+                assert torch.equal(getattr(step, key)[others], getattr(twin_step, key)[others]), key
+        for outcome, loop in zip((step, twin_step), loops, strict=True):
+            loop.advance(outcome)
+        for key, tensor in env.tensors.items():
+            assert torch.equal(tensor[others], twin.tensors[key][others]), key
+    assert bool(torch.stack([t.isfinite().all() for t in env.tensors.values()]).all())
+    assert int(env.tensors["episode_count"][2]) >= 2
+
+
+def test_too_many_invalid_worlds_stop_the_run(torch_device):
+    """One invalid world-step in six is far above 0.1 %: the check names the world, the quantity and the share."""
+    env = build(torch_device)
+    env.tensors["qvel"][4, 1] = 123.0
+    env.step(actions(6, torch_device))
+    with pytest.raises(SimulationError, match=r"World 4: its speed was 12\d.* 1 of 6 world-steps .* more than 0.1 %"):
+        env.check()
+    env.check()
+
+
+def test_buffers_too_small_say_how_large_they_had_to_be(torch_device):
+    """The message names the buffer, its size, what was needed and the flag."""
+    env = build(torch_device, physics=PhysicsConfig(rows=8))
+    for _ in range(20):
+        env.step(actions(6, torch_device))
+    with pytest.raises(SimulationError, match=r"lost contacts.*up to \d+ constraint rows.*room for 8 .*physics.rows"):
+        env.check()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_broken_action_stops_the_run(torch_device, value):
+    """A single action that is not finite is an error at once, with the world's number."""
+    env = build(torch_device)
+    action = actions(6, torch_device)
+    action[3, 5] = value
+    env.step(action)
+    with pytest.raises(SimulationError, match="World 3: its action is not finite"):
+        env.check()
+
+
+@pytest.mark.parametrize("shape", [(6,), (6, 11), (5, 12), (1, 12)])
+def test_actions_of_another_shape_are_refused(torch_device, shape):
+    """Actions are never broadcast."""
+    env = build(torch_device)
+    with pytest.raises(ValueError, match=r"action must have the shape \(6, 12\), got"):
+        env.step(torch.zeros(shape, device=torch_device))
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"goal_period": 1001}, "goal_period must be at most an episode of 1000 steps, got 1001"),
+        ({"goal_period": 0}, "goal_period must be at least 1, got 0"),
+        ({"levels": "up"}, "levels must be one of frozen, reward, displacement, got 'up'"),
+        ({"friction": (0.01, 1.0)}, r"friction must be a range within \[0.05, inf\), got \(0.01, 1.0\)"),
+        ({"friction": (1.0, 0.5)}, "friction must be a range"),
+        ({"payload": -1.0}, r"payload must be in \[0, 1e\+06\], got -1.0"),
+        ({"stiffness": 0.0}, "stiffness must be finite and positive, got 0.0"),
+        ({"rewards": RewardWeights(tilt=math.nan)}, "rewards.tilt must be finite, got nan"),
+    ],
+)
+def test_config_rejects_bad_values(config, message):
+    """The message names the field, what it must be and what it was."""
+    with pytest.raises(ValueError, match=message):
+        Config(**config)
+
+
+def test_unknown_and_broken_terrains_are_refused(tmp_path):
+    """A terrain that is neither a name nor a file, and a file that is not one, each give one clear line."""
+    with pytest.raises(ValueError, match=r"terrain must be flat, rough or the path of a saved terrain, got 'moon'"):
+        Config(terrain="moon").load_terrain()
+    (tmp_path / "x.npz").write_bytes(b"no terrain")
+    with pytest.raises(ValueError, match="is not a terrain file"):
+        Config(terrain=str(tmp_path / "x.npz")).load_terrain()

@@ -1,0 +1,290 @@
+"""The Director in other people's loops: against Deimos' own loop, and by itself."""
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from deimos import GoalDirector
+from deimos.envs import particle
+from deimos.fear import FearConfig
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.interactions import Resolved
+from deimos.selectors import director, learnability, mix, uniform
+
+CPU = torch.device("cpu")
+N, PERIOD = 96, 5
+CONFIG = particle.Config(goal_period=PERIOD, max_speed=200.0, max_force=100.0, time_limit=23)
+AFRAID = director.Config(percentile=75, candidates=20, fear=FearConfig(min_per_class=8))
+
+
+def action(now):
+    """What everybody does after ``now`` steps: worlds accelerate their own ways, some hardly and some into the wall."""
+    return torch.sin(torch.arange(3.0 * N).view(N, 3) + 0.1 * now) * torch.linspace(0, 90, N).unsqueeze(1)
+
+
+class Theirs:
+    """Somebody else's loop: Particle Gym with its own resets, and goals that a GoalDirector gives."""
+
+    def __init__(self, goals, candidates=1):
+        self.env, self.goals, self.candidates = CONFIG.build(N, CPU, 0), goals, candidates
+        self.now = 0
+
+    def step(self):
+        """One step of the worlds; returns what the GoalDirector said."""
+        env, every = self.env, torch.arange(N)
+        step = env.step(action(self.now))
+        self.now += 1
+        candidates = env.sample_goals(every, self.candidates).clone()
+        given = self.goals.step(
+            env.state(step.obs), env.goal.clone(), step.terminated, step.truncated, candidates, tracking=step.reward
+        )
+        done = step.terminated | step.truncated
+        rows = torch.nonzero(given.changed & ~done).squeeze(1)
+        env.set_goals(rows, given.goal[rows])
+        env.reset(done)  # with a first goal of its own
+        return given, done
+
+
+def test_it_does_what_the_loop_does():
+    """On the same worlds it issues the same goals and keeps the same interactions, labels, scores and fear."""
+    config = director.Config(candidates=1, fear=FearConfig(min_per_class=8))
+    env = CONFIG.build(N, CPU, 0)
+    ours = GoalLoop(env, config.build(spaces(env), seed=3))
+    theirs = Theirs(GoalDirector(config, PERIOD, learn_every=12, seed=3))
+    labels = []
+    for now in range(96):
+        ours.advance(env.step(action(now)))
+        if (now + 1) % 12 == 0:
+            ours.selector.learn(ours.interactions, None)
+        theirs.step()
+        assert torch.equal(env.obs, theirs.env.obs)
+        expected, found = ours.interactions.resolved(), theirs.goals._interactions.resolved()
+        for name in Resolved.__dataclass_fields__:
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=0, equal_nan=True)
+        labels.append(expected.crashed.float().mean())
+    assert expected.score.isfinite().all()
+    assert 0.05 < torch.stack(labels).nanmean() < 0.95
+    for a, b in zip(
+        ours.selector.fear.network.parameters(), theirs.goals.selector.fear.network.parameters(), strict=True
+    ):
+        assert torch.equal(a, b)
+    assert ours.selector.calibration.state_dict() == theirs.goals.selector.calibration.state_dict()
+
+
+def test_goals_change_when_they_are_due_or_the_world_is_done():
+    """Goals stay for T steps, then come from the world's own candidates; a done world gets its first candidate."""
+    goals = GoalDirector(AFRAID, 3)
+    terminated = torch.tensor([False, True, False])
+    no = torch.zeros(3, dtype=torch.bool)
+    goal = torch.zeros(3, 2)
+    clock = [0, 0, 0]
+    generator = torch.Generator().manual_seed(0)
+    for step in range(1, 20):
+        candidates = torch.randn(3, 7, 2, generator=generator)
+        crash = terminated if step % 5 == 2 else no
+        given = goals.step(torch.randn(3, 4, generator=generator), goal, crash, no, candidates)
+        for world in range(3):
+            clock[world] += 1
+            if crash[world]:
+                assert torch.equal(given.goal[world], candidates[world, 0])
+            elif clock[world] == 3:
+                assert (given.goal[world] == candidates[world]).all(1).any()
+            else:
+                assert torch.equal(given.goal[world], goal[world])
+            assert given.changed[world] == bool(crash[world] or clock[world] == 3)
+            clock[world] = 0 if given.changed[world] else clock[world]
+        goal = given.goal
+
+
+def trained(steps=96, config=AFRAID, **options):
+    theirs = Theirs(GoalDirector(config, PERIOD, learn_every=12, **options), candidates=20)
+    for _ in range(steps):
+        theirs.step()
+    return theirs
+
+
+def test_it_learns_fear_and_tells_it_calibrated():
+    """``fear`` is the calibrated probability of the network's score, and its mean is near the share of crashes."""
+    theirs = trained()
+    goals, env = theirs.goals, theirs.env
+    assert {"fear/loss", "fear/auroc", "calibration/ece"} <= set(goals.metrics)
+    state, goal, new = env.state(env.obs), env.goal, env.sample_goals(torch.arange(N), 1)[:, 0].clone()
+    selector = goals.selector
+    logit = selector.fear.network(torch.cat([state, goal, new], dim=1)).squeeze(1).detach()
+    expected = torch.sigmoid((logit + selector.calibration.prior) / selector.calibration.temperature)
+    torch.testing.assert_close(goals.fear(state, goal, new), expected, rtol=1e-4, atol=1e-6)
+    window = goals._interactions.resolved()
+    told = goals.fear(window.state, window.goal, window.next_goal)
+    assert abs(told.mean() - window.crashed.float().mean()) < 0.1
+    assert told[window.crashed].mean() > told[~window.crashed].mean() + 0.1
+
+
+def test_fear_is_found_in_mixed_and_blind_selectors():
+    """A Mix has the fear of its method, and a state-blind one says the same whatever the state."""
+    theirs = trained(config=mix.Config(base="p75"), steps=48)
+    arguments = torch.zeros(2, 9), torch.zeros(2, 3), torch.zeros(2, 3)
+    assert theirs.goals.fear(*arguments).shape == (2,)
+    blind = director.Config(candidates=20, control="state-blind", fear=FearConfig(min_per_class=8))
+    theirs = trained(config=blind, steps=48)
+    assert torch.equal(theirs.goals.fear(*arguments), theirs.goals.fear(arguments[0] + 3.0, *arguments[1:]))
+
+
+def test_it_resumes_bit_for_bit():
+    """Saved, loaded into a fresh one and driven on, it gives the goals of the one that never stopped."""
+    first = trained(steps=50)
+    saved = io.BytesIO()
+    torch.save({"goals": first.goals.state_dict(), "env": first.env.state_dict()}, saved)
+    saved.seek(0)
+    state = torch.load(saved, weights_only=True)
+    second = Theirs(GoalDirector(AFRAID, PERIOD, learn_every=12), candidates=20)
+    second.now = 50
+    second.env.load_state_dict(state["env"])
+    second.goals.load_state_dict(state["goals"], second.env.state(second.env.obs), second.env.goal)
+    for _ in range(40):
+        (one, done), (two, _) = first.step(), second.step()
+        assert torch.equal(one.goal, two.goal)
+        assert torch.equal(first.env.obs, second.env.obs)
+    assert not bool(done.all())
+    assert repr(first.goals.metrics) == repr(second.goals.metrics)
+
+
+def test_its_seed_fixes_every_choice():
+    """Two of one seed choose alike whatever torch has drawn meanwhile; another seed chooses otherwise."""
+    first = trained(steps=40, seed=1)
+    torch.rand(5)
+    second, other = trained(steps=40, seed=1), trained(steps=40, seed=2)
+    assert torch.equal(first.env.obs, second.env.obs)
+    assert not torch.equal(first.env.goal, other.env.goal)
+
+
+def test_a_loop_without_gradients_may_go_on_with_them():
+    """Begun in rsl_rl's inference mode, it steps, learns and loads outside of it, and the other way round."""
+    goals = GoalDirector(AFRAID, PERIOD, learn_every=12)
+    theirs = Theirs(goals, candidates=20)
+    with torch.inference_mode():
+        theirs.step()
+    for _ in range(40):
+        theirs.step()
+    with torch.inference_mode():
+        for _ in range(30):
+            theirs.step()
+    assert goals.selector.fear.fitted
+    goals.load_state_dict(goals.state_dict(), theirs.env.state(theirs.env.obs), theirs.env.goal)
+    theirs.step()
+
+
+def test_a_curriculum_tells_its_range():
+    """Candidates are the caller's, so the range that they shall come from can be asked for, and it grows."""
+    goals = GoalDirector("cl", PERIOD, learn_every=10)
+    assert goals.goal_range is None
+    no, goal = torch.zeros(300, dtype=torch.bool), torch.zeros(300, 2)
+    ranges = []
+    for _ in range(30):
+        goals.step(torch.zeros(300, 4), goal, no, no, torch.zeros(300, 1, 2), tracking=torch.ones(300))
+        ranges.append(goals.goal_range.tolist())
+    assert ranges[0] == [0.25, 0.25]
+    assert ranges[-1][0] > 0.25
+    assert GoalDirector(uniform.Config(), PERIOD).goal_range is None
+
+
+def test_torch_is_all_that_it_imports():
+    """Importing and using it loads neither Warp nor a simulator nor an adapter's library."""
+    code = """
+import sys, torch
+from deimos import GoalDirector
+from deimos.selectors import director
+goals = GoalDirector("p75", goal_period=2)
+no = torch.zeros(4, dtype=torch.bool)
+for _ in range(30):
+    goals.step(torch.zeros(4, 3), torch.zeros(4, 2), no, no, torch.rand(4, 9, 2))
+loaded = {"warp", "mujoco", "mujoco_warp", "trimesh", "gymnasium", "rsl_rl", "kernels", "terrain"} & set(sys.modules)
+assert not loaded, loaded
+"""
+    home = Path(__file__).resolve().parent.parent
+    done = subprocess.run([sys.executable, "-c", code], cwd=home, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def arguments(**changes):
+    """A good first call, with changes."""
+    no = torch.zeros(4, dtype=torch.bool)
+    good = {"state": torch.zeros(4, 3), "goal": torch.zeros(4, 2), "terminated": no, "truncated": no}
+    return good | {"candidates": torch.zeros(4, 9, 2)} | changes
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"goal": torch.zeros(3, 2)}, r"goal must have the shape \(4, 2\), got \(3, 2\)"),
+        ({"terminated": torch.zeros(3, dtype=torch.bool)}, r"terminated must have the shape \(4,\), got \(3,\)"),
+        ({"truncated": torch.zeros(4, 1, dtype=torch.bool)}, r"truncated must have the shape \(4,\), got \(4, 1\)"),
+        ({"truncated": torch.zeros(4)}, r"truncated must be bool, got torch\.float32"),
+        (
+            {"candidates": torch.zeros(4, 2)},
+            r"candidates must have the shape \(4, N, 2\) with N at least 1, got \(4, 2\)",
+        ),
+        ({"candidates": torch.zeros(4, 0, 2)}, r"candidates must have the shape .*, got \(4, 0, 2\)"),
+        ({"candidates": torch.zeros(4, 9, 3)}, r"candidates must have the shape .*, got \(4, 9, 3\)"),
+    ],
+)
+def test_shapes_are_checked(changes, message):
+    """What does not fit the rest is named, on the first call and on later ones."""
+    goals = GoalDirector("p25", 5)
+    with pytest.raises(ValueError, match=message):
+        goals.step(**arguments(**changes))
+    goals.step(**arguments())
+    with pytest.raises(ValueError, match=message):
+        goals.step(**arguments(**changes))
+
+
+def test_worlds_may_not_change():
+    """Later calls must have as many worlds and components as the first."""
+    goals = GoalDirector("p25", 5)
+    goals.step(**arguments())
+    for name, tensor in (("state", torch.zeros(4, 2)), ("state", torch.zeros(3, 3)), ("goal", torch.zeros(4, 1))):
+        with pytest.raises(ValueError, match=rf"{name} must have the shape \(4, "):
+            goals.step(**arguments(**{name: tensor}))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"goal_period": 0}, "goal_period must be at least 1, got 0"),
+        ({"learn_every": 0}, "learn_every must be at least 1, got 0"),
+        ({"total_steps": -1}, "total_steps must be at least 0, got -1"),
+        ({"selector": "p33"}, "no method 'p33'; there are: uniform"),
+    ],
+)
+def test_options_are_checked(options, message):
+    """The message names the argument and what it was."""
+    with pytest.raises(ValueError, match=message):
+        GoalDirector(**({"selector": "p25", "goal_period": 5} | options))
+
+
+@pytest.mark.parametrize("name", ["vds", "plr", "vds+p75"])
+def test_selectors_that_need_a_rollout_are_refused(name):
+    """Every call says so, not only the first."""
+    goals = GoalDirector(name, 5, total_steps=100)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="selector must need no rollout of the learner, as vds and plr do; got "):
+            goals.step(**arguments())
+
+
+def test_what_is_not_there_yet_is_refused():
+    """There is no selector before the first step, no fear before something was learnt, and none in Uniform."""
+    goals = GoalDirector(learnability.Config(), 5)
+    with pytest.raises(RuntimeError, match=r"knows its worlds only after the first call of step\(\)"):
+        goals.fear(torch.zeros(1, 3), torch.zeros(1, 2), torch.zeros(1, 2))
+    goals.step(**arguments())
+    with pytest.raises(RuntimeError, match="fear network has learnt nothing yet"):
+        goals.fear(torch.zeros(1, 3), torch.zeros(1, 2), torch.zeros(1, 2))
+    goals = GoalDirector("uniform", 5)
+    goals.step(**arguments())
+    with pytest.raises(ValueError, match="selector must have a fear network"):
+        goals.fear(torch.zeros(1, 3), torch.zeros(1, 2), torch.zeros(1, 2))
+    with pytest.raises(ValueError, match="changes over the training"):
+        GoalDirector("boltzmann", 5).step(**arguments())

@@ -1,0 +1,280 @@
+"""The simulator behind its face: agreement with MuJoCo C, resets, friction, payload, contact forces."""
+
+import time
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from deimos.physics import Captured, Physics, PhysicsConfig
+from deimos.robots import go1
+from terrain import Grid, Share, build
+from terrain.shapes.stairs import Shape as Stairs
+
+ROBOT = go1.build()
+
+
+@pytest.fixture(scope="module")
+def stairs():
+    """A small hill of stairs with risers of 0.14 m."""
+    return build(
+        Grid(shapes=(Share(shape=Stairs(tile=4.0, platform=1.0, direction="down")),), levels=1, columns=1, tile=4.0,
+             border=1.0, hardest=0.5, easiest=0.5)
+    )  # fmt: skip
+
+
+def make(n, device, terrain=None, **options):
+    """Worlds with robots in their default pose, high above the ground."""
+    config = options.pop("config", PhysicsConfig())
+    physics = Physics(ROBOT, terrain, n, torch.device(device), config, **options)
+    place(physics, 5.0)
+    return physics
+
+
+def place(physics, z, quat=(1, 0, 0, 0)):
+    """Put every robot into its default pose at the origin."""
+    qpos = np.zeros((physics.num_envs, 19), np.float32)
+    qpos[:, 2:7] = [z, *quat]
+    qpos[:, 7:] = ROBOT.pose
+    physics.qpos.assign(qpos)
+    physics.ctrl.assign(qpos[:, 7:])
+    physics.qvel.zero_()
+
+
+def reference(physics, world=0):
+    """MuJoCo C in the state of a world."""
+    return physics.to_mujoco(world)
+
+
+def run_both(physics, targets):
+    """Step both simulators with the same targets; gives positions and velocities of both, (steps, 19 + 18) each."""
+    data = reference(physics)
+    ours, theirs = [], []
+    for target in targets:
+        physics.ctrl.assign(np.tile(target, (physics.num_envs, 1)).astype(np.float32))
+        physics.step()
+        data.ctrl[:] = target
+        for _ in range(physics.config.substeps):
+            mujoco.mj_step(physics.model, data)
+        ours.append(np.concatenate([physics.qpos.numpy()[0], physics.qvel.numpy()[0]]))
+        theirs.append(np.concatenate([data.qpos, data.qvel]))
+    return np.array(ours), np.array(theirs)
+
+
+def wave(steps, size, seed=0):
+    """Smooth random targets around the default pose."""
+    rng = np.random.default_rng(seed)
+    t, phase = np.arange(steps)[:, None] * 0.02, rng.uniform(0, 2 * np.pi, 12)
+    return np.array(ROBOT.pose) + size * np.sin(2 * np.pi * 1.5 * t + phase)
+
+
+def test_free_flight_agrees_with_mujoco(device):
+    """Half a second of tumbling with moving legs: every angle to 1e-4, as float32 integration allows."""
+    physics = make(1, device)
+    qvel = np.random.default_rng(1).normal(size=(1, 18)).astype(np.float32)
+    physics.qvel.assign(qvel)
+    ours, theirs = run_both(physics, wave(25, 0.4))
+    # 100 substeps, each with rounding of about 1e-7 in numbers of order 5, and forces of 30 N m/rad that bind them.
+    np.testing.assert_allclose(ours[:, :19], theirs[:, :19], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(ours[:, 19:], theirs[:, 19:], rtol=0, atol=2e-3)
+
+
+def test_standing_agrees_with_mujoco(device):
+    """Set down on flat ground and swaying for a second: base to a millimetre, joints to 5 mrad."""
+    physics = make(1, device)
+    place(physics, ROBOT.standing_height)
+    ours, theirs = run_both(physics, wave(50, 0.1))
+    np.testing.assert_allclose(ours[:, :3], theirs[:, :3], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(ours[:, 3:19], theirs[:, 3:19], rtol=0, atol=5e-3)
+    assert 0.2 < theirs[-1, 2] < 0.33
+
+
+def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
+    """Dropped askew onto stairs: the same until shortly after the first contacts, and at rest at the same height."""
+    physics = make(1, device, stairs)
+    tilt = np.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0])
+    place(physics, stairs.heights.max() + 0.45, tilt)
+    qpos = physics.qpos.numpy()
+    qpos[0, 0] = 0.9
+    physics.qpos.assign(qpos)
+    ours, theirs = run_both(physics, np.tile(ROBOT.pose, (100, 1)))
+    touched = np.flatnonzero(np.abs(np.diff(theirs[:, 21])) < 0.15)[0]  # the fall is braked
+    # A fall is chaotic: contacts on the two sides of a prism's edge part ways, so only its start can be compared.
+    first = touched + 3
+    assert first < 30
+    np.testing.assert_allclose(ours[:first, :3], theirs[:first, :3], rtol=0, atol=3e-3)
+    np.testing.assert_allclose(ours[:first, 3:19], theirs[:first, 3:19], rtol=0, atol=3e-2)
+    low = stairs.heights.min()
+    assert low < ours[-1, 2] < stairs.heights.max() + 0.45
+    assert not physics.overflow.numpy()[0] & physics.lost_contacts
+
+
+def test_part_forces_carry_the_robot(device):
+    """Standing still, the feet's normal forces add up to the weight, and no other part touches the ground."""
+    physics = make(3, device)
+    place(physics, 0.29)
+    for _ in range(150):
+        physics.step()
+    force = physics.part_force.numpy()
+    assert force.shape == (4, 3, 13)
+    # What remains of the swaying after 3 s moves the forces by less than 2 %.
+    np.testing.assert_allclose(force[:, :, 1:5].sum(axis=2), go1.MASS * 9.81, rtol=0.02)
+    assert not force[:, :, [0, *range(5, 13)]].any()
+
+
+def test_part_forces_agree_with_mujoco(device):
+    """Lying on its back: the normal force on every part is that of MuJoCo C in the same state."""
+    physics = make(1, device, config=PhysicsConfig(substeps=1))
+    place(physics, 0.049, (0, 1, 0, 0))
+    data = reference(physics)
+    physics.step()
+    part = {name: i for i, names in enumerate(ROBOT.parts) for name in names}
+    expected, wrench = np.zeros(13), np.zeros(6)
+    for i in range(data.ncon):
+        mujoco.mj_contactForce(physics.model, data, i, wrench)
+        names = [physics.model.geom(g).name for g in data.contact[i].geom]
+        expected[next(part[name] for name in names if name in part)] += wrench[0]
+    assert expected[0] > 1.0
+    # Five Newton iterations converge to float32's accuracy of a stiff problem.
+    np.testing.assert_allclose(physics.part_force.numpy()[0, 0], expected, rtol=1e-2, atol=0.1)
+
+
+def test_reset_forgets_everything_and_touches_nobody_else(device):
+    """A masked reset takes a NaN world back to the start, warm start too, and leaves the others bit for bit."""
+    physics, twin = (make(4, device) for _ in range(2))
+    for both in (physics, twin):
+        place(both, 0.3)
+        both.step()
+    qpos = physics.qpos.numpy()
+    qpos[1] = np.nan
+    physics.qpos.assign(qpos)
+    for both in (physics, twin):
+        both.step()
+    assert np.isnan(physics.tensors["warmstart"][1].cpu().numpy()).any()
+    mask = wp.array([False, True, False, False], dtype=wp.bool, device=device)
+    for both in (physics, twin):
+        both.reset(mask)
+        both.step()
+    for name in physics.tensors:
+        a, b = (both.tensors[name].cpu().numpy() for both in (physics, twin))
+        assert np.isfinite(a).all(), name
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def test_identical_worlds_stay_identical(device):
+    """Worlds do not depend on their number: equal states give equal motion, bit for bit, on a CPU."""
+    physics = make(5, device)
+    place(physics, 0.3)
+    for target in wave(20, 0.3):
+        physics.ctrl.assign(np.tile(target, (5, 1)).astype(np.float32))
+        physics.step()
+    qpos = physics.qpos.numpy()
+    if device == "cpu":
+        np.testing.assert_array_equal(qpos, np.tile(qpos[0], (5, 1)))
+    else:  # the order of contacts, and with it that of sums, is not fixed there
+        np.testing.assert_allclose(qpos, np.tile(qpos[0], (5, 1)), atol=1e-3)
+
+
+def test_capture_replays_the_step(device):
+    """A captured step does what the launches do, and the launches are made once."""
+    physics, twin = (make(2, device) for _ in range(2))
+    step = Captured(physics.step, torch.device(device))
+    for both in (physics, twin):
+        for tensor in both.tensors.values():
+            tensor.zero_()
+        place(both, 0.3)
+    for _ in range(5):
+        step()
+        twin.step()
+    np.testing.assert_array_equal(physics.qpos.numpy(), twin.qpos.numpy())
+
+
+def test_a_long_silence_is_explained(torch_device, capsys, monkeypatch):
+    """A first run that takes longer than a person's patience says what it waits for; a quick one says nothing."""
+    monkeypatch.setattr("deimos.physics.PATIENCE", 0.2)
+    Captured(lambda: time.sleep(0.01), torch_device)
+    assert capsys.readouterr().err == ""
+    Captured(lambda: time.sleep(0.3), torch_device)
+    assert capsys.readouterr().err.startswith("Compiling the simulator for this machine")
+
+
+def test_friction_is_the_worlds_own(device):
+    """On its own slippery feet a sliding robot slides farther than one with grip, by what friction brakes."""
+    physics = make(2, device, friction=np.array([0.2, 1.0]))
+    place(physics, 0.29)
+    for _ in range(50):
+        physics.step()
+    physics.qvel.assign(np.array([[1.0, *[0.0] * 17]] * 2, np.float32))
+    start = physics.qpos.numpy()[:, 0].copy()
+    for _ in range(50):
+        physics.step()
+    way = physics.qpos.numpy()[:, 0] - start
+    assert way[0] > 1.5 * way[1]
+
+
+def test_payload_changes_mass_and_what_follows_from_it(device):
+    """A payload adds to the base's mass, scales its inertia, and is carried by the feet; sensitivities are MuJoCo's."""
+    payload = np.array([-1.0, 0.0, 1.0])
+    physics = make(3, device, payload=payload)
+    mass = physics.tensors["body_mass"].cpu().numpy()
+    np.testing.assert_allclose(mass.sum(axis=1), go1.build().spec.compile().body_mass.sum() + payload, rtol=1e-6)
+    place(physics, 0.29)
+    for _ in range(150):
+        physics.step()
+    carried = physics.part_force.numpy()[-1, :, 1:5].sum(axis=1)
+    np.testing.assert_allclose(carried, (go1.MASS + payload) * 9.81, rtol=0.02)
+    spec = go1.build().spec
+    spec.body("trunk").mass += 1.0
+    spec.body("trunk").fullinertia = np.array(spec.body("trunk").fullinertia) * (1 + 1 / 5.204)
+    heavy = spec.compile()
+    np.testing.assert_allclose(
+        physics.tensors["dof_invweight0"][2].cpu().numpy(), heavy.dof_invweight0, rtol=1e-3, atol=1e-6
+    )
+
+
+def test_buffers_tell_their_use(device):
+    """The peak of contacts and rows is counted, and too few rows set a bit that means lost contacts."""
+    physics = make(2, device)
+    place(physics, 0.05, (0, 1, 0, 0))
+    physics.step()
+    use = physics.buffer_use()
+    assert 0 < use["contacts"] <= use["max_contacts"]
+    # Four feet with four rows each, a head, ten capsules with two contacts each, and twelve limits.
+    assert 0 < use["rows"] <= use["max_rows"] == 4 * 4 + 1 + 10 * 2 + 12
+    assert physics.buffer_use()["rows"] == 0  # since the last call
+    small = make(2, device, config=PhysicsConfig(rows=8))
+    place(small, 0.25)
+    small.step()
+    assert np.all(small.overflow.numpy() & small.lost_contacts)
+    assert small.rows.numpy().max() > 8
+
+
+def test_to_mujoco_shows_the_state(device):
+    """One world comes out as MuJoCo's own data, with the geoms where its kinematics put them."""
+    physics = make(2, device)
+    place(physics, 0.3)
+    qpos = physics.qpos.numpy()
+    qpos[1, 0] = 2.0
+    physics.qpos.assign(qpos)
+    data = physics.to_mujoco(1)
+    np.testing.assert_allclose(data.qpos, qpos[1], rtol=0)
+    np.testing.assert_allclose(data.body("trunk").xpos, [2.0, 0.0, 0.3], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("timestep", 0.0, "timestep must be finite and positive, got 0.0"),
+        ("substeps", 0, "substeps must be at least 1, got 0"),
+        ("iterations", 0, "iterations must be at least 1, got 0"),
+        ("line_search", 0, "line_search must be at least 1, got 0"),
+        ("contacts", -1, "contacts must be at least 0, got -1"),
+        ("rows", 2.5, "rows must be a whole number, got 2.5"),
+    ],
+)
+def test_config_rejects_bad_values(field, value, message):
+    """The message names the field, what it must be and what it was."""
+    with pytest.raises(ValueError, match=message):
+        PhysicsConfig(**{field: value})

@@ -1,0 +1,64 @@
+"""Streams of random numbers that depend on the seed and the use alone."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from deimos.networks import ManyCandidates, mlp
+from deimos.seeds import derive, generator, weights_from
+
+USES = ("policy weights", "policy noise", "fear weights", "fear minibatches", "vds critic 0", "vds critic 1", "")
+
+
+def test_every_seed_and_use_has_a_number_of_its_own():
+    """No two of 200 seeds and seven uses share a number, the same pair always has the same, and all fit torch."""
+    numbers = [derive(seed, use) for seed, use in itertools.product(range(200), USES)]
+    assert len(set(numbers)) == len(numbers)
+    assert numbers == [derive(seed, use) for seed, use in itertools.product(range(200), USES)]
+    assert all(0 <= number < 2**64 for number in numbers)
+    assert torch.Generator().manual_seed(max(numbers)).initial_seed() == max(numbers)
+
+
+def test_streams_are_independent():
+    """Streams of neighbouring seeds and of different uses are uncorrelated: 28 pairs of 10 000 numbers, 4.5 sigma."""
+    streams = [
+        torch.randn(10_000, generator=generator(seed, use, torch.device("cpu")))
+        for seed, use in itertools.product((0, 1), USES[:4])
+    ]
+    correlation = np.corrcoef(torch.stack(streams).numpy())
+    assert np.abs(correlation[np.triu_indices(8, 1)]).max() < 4.5 / 100
+
+
+def test_weights_leave_the_global_stream_alone():
+    """Networks built inside depend on seed and use alone, and torch's own stream goes on as if nothing had been."""
+
+    def weights(seed, use):
+        with weights_from(seed, use):
+            return mlp(4, (8,), 1, "relu")[0].weight.detach().clone()
+
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    first = weights(1, "a")
+    assert torch.equal(torch.rand(3), expected)
+    assert torch.equal(weights(1, "a"), first)
+    assert not torch.equal(weights(1, "b"), first)
+    assert not torch.equal(weights(2, "a"), first)
+
+
+@pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])
+@pytest.mark.parametrize("outputs", [1, 16])
+def test_candidates_are_evaluated_as_the_network_would(activation, outputs):
+    """Products shared by all candidates of a context change nothing but rounding, whatever the workspace."""
+    torch.manual_seed(0)
+    net = mlp(9, (64, 32), outputs, activation)
+    context, candidates = torch.randn(300, 6), torch.randn(300, 50, 3)
+    inputs = torch.cat([context.unsqueeze(1).expand(-1, 50, -1), candidates], dim=2)
+    with torch.no_grad():
+        expected = net(inputs)
+    for workspace in (1, 1024):
+        found = ManyCandidates(net, 3, workspace)(context, candidates)
+        # Sums of at most 64 products of numbers of order 1, in another order.
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
