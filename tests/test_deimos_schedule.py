@@ -166,3 +166,16 @@ def test_a_mix_is_its_method_in_all_else():
     alone, mixed = (trainer(config) for config in (director.Config(percentile=75), mix.Config(base="p75", share=0.0)))
     for _ in range(4):
         assert repr(alone.iterate()) == repr(mixed.iterate())
+
+
+def test_the_baseline_stays_with_the_first():
+    """VDS supplies the learner's baseline; after the switch it still does and still learns, while p75 chooses."""
+    run = trainer(schedule.Config(first="vds", second="p75", at=0.5))
+    for _ in range(2):
+        run.iterate()
+    selector = run.loop.selector
+    assert selector.switched
+    assert selector.critic() is selector.parts[0]
+    before = selector.parts[0].stack.parameters.detach().clone()
+    assert math.isfinite(run.iterate()["vds/loss"])
+    assert not torch.equal(before, selector.parts[0].stack.parameters)

@@ -15,8 +15,8 @@ from deimos.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spac
 class Config(SelectorConfig):
     """The first method chooses the goals up to a share of the training, the second one from there on.
 
-    The second learns from the start, so that it knows something when its time comes; the first goes on
-    learning only as long as it chooses.
+    The second learns from the start, so that it knows something when its time comes. The first goes on learning
+    as long as it chooses, and beyond where the learner has its baseline from it.
     """
 
     first: str = "vds"
@@ -82,19 +82,24 @@ class Schedule(GoalSelector):
 
     def critic(self) -> Critic | None:
         """See ``GoalSelector.critic``."""
-        return self.now.critic()
+        # The baseline stays with whoever has it: the learner's own has learnt nothing meanwhile.
+        return self.now.critic() or self.parts[0].critic()
 
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
         """See ``GoalSelector.learn``."""
         row = {"schedule/switched": float(self.switched)}
         first, second = self.parts
+        # The scores at issue are those of whoever chose: the other one must not judge itself by them.
+        of_first, of_second = interactions, interactions.without_scores()
         if self.switched:
-            row |= dict.fromkeys(self._keys, math.nan) | second.learn(interactions, rollout)
+            of_first, of_second = of_second, of_first
+        if self.switched and first.critic() is None:
+            row |= dict.fromkeys(self._keys, math.nan)
         else:
-            learnt = first.learn(interactions, rollout)
+            learnt = first.learn(of_first, rollout)
             self._keys = list(learnt)
-            # The scores at issue are the first method's: the second must not judge itself by them.
-            row |= learnt | second.learn(interactions.without_scores(), rollout)
+            row |= learnt
+        row |= second.learn(of_second, rollout)
         self.switched = self.switched or interactions.now >= self._switch
         return row
 
