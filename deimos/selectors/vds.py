@@ -13,7 +13,7 @@ from torch import Tensor
 from deimos import picks
 from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
-from deimos.ensemble import CandidateValues, Stack
+from deimos.ensemble import CandidateValues, Stack, deviation
 from deimos.interactions import Interactions
 from deimos.networks import Activation, mlp, operations, rows_in_cache
 from deimos.ppo import advantages, value_gradient
@@ -105,7 +105,7 @@ class VDS(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
-        score = self._of_candidates(state, candidates).std(dim=0, correction=0)
+        score = deviation(self._of_candidates(state, candidates))
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
 
@@ -131,7 +131,7 @@ class VDS(GoalSelector):
             raise ValueError("vds learns values, so it needs the learner's rollout, got None.")
         worlds = self._worlds(rollout.obs.shape[1], rollout.obs.device)
         old, returns = self._targets(rollout, worlds)
-        spread = old.std(dim=0, correction=0).mean().item() if self.config.data == "all" else float("nan")
+        spread = deviation(old).mean().item() if self.config.data == "all" else float("nan")
         loss = self._fit(rollout, worlds, old, returns)
         self._known = None
         return {"vds/loss": loss, "vds/deviation": spread, "vds/value": old.mean().item()}
@@ -174,7 +174,8 @@ class VDS(GoalSelector):
         """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
         inputs = self._spaces.state_then_goal(obs)
         return torch.stack(self.stack.each(
-            lambda k: self.stack.members[k].forward(inputs[:, worlds[k]].flatten(0, 1)).view(len(obs), -1)
+            lambda k: self.stack.members[k].forward(inputs[:, worlds[k]].flatten(0, 1)).view(len(obs), -1),
+            len(obs) * worlds.shape[1],
         ))  # fmt: skip
 
     def _fit(self, rollout: Rollout, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
@@ -190,7 +191,7 @@ class VDS(GoalSelector):
             own = (old[k].flatten()[order[k]], returns[k].flatten()[order[k]], rollout.weight[step, world])
             return inputs[step, world], *own
 
-        data = self.stack.each(data_of)
+        data = self.stack.each(data_of, rows)
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
         for _ in range(self.config.epochs):
@@ -226,7 +227,7 @@ class VDS(GoalSelector):
                 loss += gained
             return loss
 
-        return torch.stack(self.stack.each(work))
+        return torch.stack(self.stack.each(work, len(data[0][0])))
 
     def operations(self, decisions: float, transitions: int) -> float:
         """See ``GoalSelector.operations``."""
