@@ -6,7 +6,6 @@ import math
 import statistics
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -36,9 +35,9 @@ def measure_training(
     config: TrainConfig, methods: Mapping[str, SelectorConfig], thesis: Mapping[str, int], device: torch.device,
     rounds: int, *, beside_rsl_rl: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Training speed of every method on one environment, in turns of a few iterations.
+    """Training speed of every method on one environment, iteration by iteration in turn.
 
-    A turn is as many iterations as it takes for every world to get at least one goal.
+    A round is as many iterations as it takes for every world to get at least one goal.
 
     Args:
         config: What to train; its method does not count.
@@ -49,31 +48,31 @@ def measure_training(
         beside_rsl_rl: Whether to time rsl_rl's own loop on the same environment too, if it is installed.
     """
     config = replace(config, method=None, device="cuda" if device.type == "cuda" else "cpu")
-    turn = math.ceil(config.env.goal_period / config.ppo.num_steps)
+    length = math.ceil(config.env.goal_period / config.ppo.num_steps)
     trainers = {name: Trainer(replace(config, selector=selector), device) for name, selector in methods.items()}
 
-    def iterate(trainer: Trainer) -> None:
-        for _ in range(turn):
-            trainer.iterate()
-
-    work: dict[str, Callable[[], Any]] = {name: partial(iterate, trainer) for name, trainer in trainers.items()}
+    work: dict[str, Callable[[], Any]] = {name: trainer.iterate for name, trainer in trainers.items()}
     learn = _rsl_rl(config, device) if beside_rsl_rl else None
     if learn is not None:
-        work["rsl_rl"] = lambda: learn(turn)
+        work["rsl_rl"] = lambda: learn(1)
     for trainer in trainers.values():  # let every fear network see both classes before anything is timed
-        for _ in range(4):
-            iterate(trainer)
+        for _ in range(4 * length):
+            trainer.iterate()
         trainer.synchronise = True
         trainer.seconds.update(dict.fromkeys(trainer.seconds, 0.0))
-    seconds = in_turn(work, rounds, device)
-    transitions = turn * config.num_envs * config.ppo.num_steps
+    single = in_turn(work, rounds * length, device)
+    seconds = {
+        name: [math.fsum(values[i : i + length]) for i in range(0, len(values), length)]
+        for name, values in single.items()
+    }
+    transitions = length * config.num_envs * config.ppo.num_steps
     learner = update_operations(trainers["uniform"])
     rows = []
     for name, values in seconds.items():
         row: dict[str, Any] = {
             "method": name,
             "fps": transitions / statistics.median(values),
-            "ms per iteration": 1000 * statistics.median(values) / turn,
+            "ms per iteration": 1000 * statistics.median(values) / length,
             "ratio to uniform": 1 / ratio(values, seconds["uniform"]),
             "thesis": thesis[name] / thesis["uniform"] if name in thesis else None,
         }
