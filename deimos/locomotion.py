@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -46,6 +46,9 @@ from kernels.locomotion_state import (
 )
 from kernels.random import Purpose, draw_uniforms
 from terrain import Terrain
+
+if TYPE_CHECKING:
+    import mujoco
 
 SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
 MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
@@ -450,6 +453,14 @@ class Locomotion(Env):
         columns = len(self.terrain.shapes)
         levels = self.tensors["level"].tolist()
         return [(self.terrain.shapes[(self._offset + i) % columns], level) for i, level in enumerate(levels)]
+
+    def strata(self) -> list[str]:
+        """See ``Env.strata``: shape and level of the tile; empty on flat ground."""
+        return [] if self.config.terrain == "flat" else [f"{shape} {level}" for shape, level in self.tiles()]
+
+    def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData]":
+        """See ``Env.scene``."""
+        return self.physics.model, self.physics.to_mujoco(world)
 
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
         """See ``Env.reference_policy``. Nobody has written down how to walk."""

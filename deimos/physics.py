@@ -268,8 +268,30 @@ def _with_ground(robot: "mujoco.MjSpec", terrain: Terrain | None) -> "mujoco.MjS
         ground = add_height_field(spec, terrain.heights, terrain.cell, terrain.corner)
     ground.contype, ground.conaffinity, ground.condim = TERRAIN_BIT, ROBOT_BIT, 1
     ground.solref = CONTACT_STIFFNESS
-    ground.rgba = (0.42, 0.45, 0.5, 1.0)
+    _dress(spec, ground)
     return spec
+
+
+def _dress(spec: "mujoco.MjSpec", ground: "mujoco.MjsGeom") -> None:
+    """Daylight, a sky and a chequered ground, so that one sees how the robot moves over it."""
+    import mujoco
+
+    headlight = spec.visual.headlight
+    headlight.ambient, headlight.diffuse, headlight.specular = (0.45,) * 3, (0.35,) * 3, (0.1,) * 3
+    light = spec.worldbody.add_light(pos=(0.0, 0.0, 4.0), dir=(-0.3, 0.4, -1.0), castshadow=False)
+    light.type, light.diffuse = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, (0.5,) * 3
+    texture = mujoco.mjtTexture
+    spec.add_texture(
+        name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.78, 0.85, 0.93), rgb2=(0.95, 0.97, 1.0), width=64, height=64,
+    )  # fmt: skip
+    spec.add_texture(
+        name="squares", type=texture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=(0.62, 0.66, 0.7), rgb2=(0.55, 0.59, 0.64), width=256, height=256,
+    )  # fmt: skip
+    material = spec.add_material(name="ground", texuniform=True, texrepeat=(1.0, 1.0))
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "squares"
+    ground.material = "ground"
 
 
 def _largest_demand(model: "mujoco.MjModel", *, plane: bool) -> tuple[int, int, int]:

@@ -84,7 +84,9 @@ class Curriculum(GoalSelector):
 
     def state_dict(self) -> dict:
         """See ``GoalSelector.state_dict``."""
-        lists = {"share": self.share, "since": self._since, "sum": self._sum, "count": self._count}
+        lists: dict[str, list] = {
+            "share": self.share, "since": self._since, "sum": self._sum, "count": self._count,
+        }  # fmt: skip
         copies = {name: list(values) for name, values in lists.items()}
         return {"range": self._range.clone(), "counted_at": self._counted_at} | copies
 
