@@ -1,4 +1,4 @@
-"""The command line: ``deimos train``, ``deimos evaluate``, ``deimos play``, ``deimos terrain``, ``deimos bench``.
+"""The command line: ``deimos train``, ``evaluate``, ``study``, ``play``, ``terrain`` and ``bench``.
 
 Whatever the user can mend (a flag, a folder, a disk) ends in one line on stderr and exit code 2.
 """
@@ -30,6 +30,7 @@ usage: deimos COMMAND [OPTIONS]
 commands:
   train      train a policy and evaluate it (also: python train.py)
   evaluate   evaluate the policy of a run folder
+  study      train and compare populations of policies
   play       render a trained robot as a film
   terrain    make ground for legged robots (also: python -m terrain)
   bench      measure the speed of everything
@@ -41,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run ``deimos``; returns the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     commands: dict[str, Callable[[list[str]], int]] = {
-        "train": train, "evaluate": evaluate, "play": play, "terrain": terrain, "bench": bench,
+        "train": train, "evaluate": evaluate, "study": study, "play": play, "terrain": terrain, "bench": bench,
     }  # fmt: skip
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
@@ -121,6 +122,27 @@ def terrain(arguments: list[str]) -> int:
     from terrain import cli as generator
 
     return generator.main(arguments, "deimos terrain")
+
+
+def study(arguments: list[str]) -> int:
+    """Run ``deimos study``; returns the exit code."""
+    with _one_line_errors() as outcome:
+        from deimos.study import cli as studies
+
+        if not arguments or arguments[0] in ("-h", "--help"):
+            print(studies.USAGE)
+            return 0
+        name = arguments[0]
+        if name not in studies.COMMANDS:
+            raise RunError(f"There is no command 'study {name}'; there are: {', '.join(studies.COMMANDS)}.")
+        options, command = studies.COMMANDS[name]
+        parsed = _parse(options, arguments[1:], f"deimos study {name}")
+        if name == "run":
+            with _stop_on_interrupt() as stopped:
+                command(parsed, stopped)
+        else:
+            command(parsed)
+    return outcome.code
 
 
 def bench(arguments: list[str]) -> int:

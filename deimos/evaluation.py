@@ -249,9 +249,11 @@ def train_adversary(
     fear.fit(_training_part(data))
     fear.check()
     held_out = data.where(data.env % HELD_OUT == 0)
-    logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
+    quality = math.nan
+    if fear.fitted and len(held_out):
+        logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
+        quality = auroc(logits, held_out.crashed)
     crashes = int(data.crashed.sum())
-    quality = auroc(logits, held_out.crashed) if fear.fitted else math.nan
     return fear, {
         "adversary_steps": t,
         "adversary_interactions": len(data),

@@ -1,0 +1,142 @@
+"""The results of a study as samples: one value per policy, by environment, goals, T and method."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deimos.methods import METHODS
+from deimos.run_folder import RunError
+from deimos.study.presets import DIRECTORS
+from deimos.study.results import curves, results
+from deimos.study.stats import Array
+
+DIRECTOR_METHODS = ("coop", *DIRECTORS, "antagonist")
+ENVIRONMENTS = ("absolute", "relative", "directional", "quad", "quad_arm")
+"""The thesis's, in its order."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """One evaluation: a panel of a figure."""
+
+    environment: str
+    """Name of the environment or variant."""
+    goals: str
+    """Who chose the goals: naive, adversary or oracle."""
+    period: int
+    """T [steps]."""
+
+    def __str__(self) -> str:
+        return f"{self.environment}, {self.goals.capitalize()}, T = {self.period}"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Means over stretches of one training run."""
+
+    env_steps: Array
+    """Parallel steps at the end of every stretch, shape (k,)."""
+    reward: Array
+    """Mean reward per transition, shape (k,)."""
+    crashes: Array
+    """Crashes per 1000 transitions, shape (k,)."""
+    selected_share: Array
+    """Share of the worlds whose goal the selector chose, shape (k,)."""
+
+
+class Data:
+    """All rows of a study folder. Rows of a weak adversary are counted, and left out of every sample."""
+
+    def __init__(self, rows: list[dict[str, Any]], lines: list[dict[str, Any]]) -> None:
+        _check_settings(rows)
+        self.rows = rows
+        self.weak = [row for row in rows if row["weak_adversary"]]
+        self._samples: dict[tuple[Where, str], dict[int, dict[str, Any]]] = {}
+        for row in rows:
+            if not row["weak_adversary"]:
+                where = Where(row["environment"], row["goals"], row["goal_period"])
+                self._samples.setdefault((where, row["method"]), {})[row["seed"]] = row
+        self._curves: dict[tuple[str, str], dict[int, Curve]] = {}
+        for line in lines:
+            columns = (np.array(line[name]) for name in ("env_steps", "reward", "crashes_per_1000", "selected_share"))
+            self._curves.setdefault((line["environment"], line["method"]), {})[line["seed"]] = Curve(*columns)
+
+    @classmethod
+    def read(cls, folder: Path) -> "Data":
+        """Read the tables of a study folder.
+
+        Raises:
+            RunError: If there are no results, a table has another schema, or the cells of an environment
+                were run with different settings.
+        """
+        rows = results(folder).read()
+        if not rows:
+            raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
+        return cls(rows, curves(folder).read())
+
+    @property
+    def environments(self) -> list[str]:
+        """Their names: the thesis's in its order, then the others."""
+        found = {row["environment"] for row in self.rows}
+        return [name for name in ENVIRONMENTS if name in found] + sorted(found - set(ENVIRONMENTS))
+
+    def periods(self, environment: str) -> list[int]:
+        """The T that an environment's policies were evaluated at."""
+        return sorted({row["goal_period"] for row in self.rows if row["environment"] == environment})
+
+    def places(self, environment: str, goals: str) -> list[Where]:
+        """The evaluations of an environment under one kind of goals."""
+        return [Where(environment, goals, period) for period in self.periods(environment)]
+
+    def methods(self, environment: str) -> list[str]:
+        """Methods that an environment has results of: the Directors by rising p, then the others."""
+        found = {row["method"] for row in self.rows if row["environment"] == environment}
+        order = [*DIRECTOR_METHODS, *(name for name in METHODS if name not in DIRECTOR_METHODS)]
+        return [name for name in order if name in found] + sorted(found - set(order))
+
+    def seeds(self, where: Where, methods: Sequence[str]) -> list[int]:
+        """Seeds that all of some methods have a row of."""
+        found = [set(self._samples.get((where, name), {})) for name in methods]
+        return sorted(set.intersection(*found)) if found else []
+
+    def sample(self, where: Where, method: str, metric: str, seeds: Sequence[int] | None = None) -> Array:
+        """The values of a metric over the seeds of a method, in the seeds' order; NaN are left out.
+
+        ``log_crashes`` is log(1 + crashes).
+
+        Args:
+            where: The evaluation.
+            method: The method.
+            metric: A column of the results, or ``log_crashes``.
+            seeds: Which; ``None`` for all.
+        """
+        rows = self._samples.get((where, method), {})
+        chosen = sorted(rows) if seeds is None else [seed for seed in seeds if seed in rows]
+        values = np.array([_metric(rows[seed], metric) for seed in chosen], float)
+        return values[~np.isnan(values)]
+
+    def curves(self, environment: str, method: str) -> list[Curve]:
+        """The training curves of a method, seed by seed."""
+        found = self._curves.get((environment, method), {})
+        return [found[seed] for seed in sorted(found)]
+
+
+def _metric(row: dict[str, Any], name: str) -> float:
+    return math.log1p(row["crashes"]) if name == "log_crashes" else row[name]
+
+
+def _check_settings(rows: list[dict[str, Any]]) -> None:
+    """Refuse to mix what cannot be compared."""
+    settings: dict[str, set[str]] = {}
+    for row in rows:
+        settings.setdefault(row["environment"], set()).add(row["setting"])
+    for environment, found in settings.items():
+        if len(found) > 1:
+            raise RunError(
+                f"The cells of environment '{environment}' were run with {len(found)} different settings "
+                f"({', '.join(sorted(found))}) and cannot be compared; keep one setting in a folder."
+            )

@@ -1,0 +1,120 @@
+"""A page of headings, paragraphs, tables and figures, as one self-contained HTML file and as Markdown."""
+
+import base64
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+h1, h2, h3 { line-height: 1.2; } h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; margin: 1rem 0; }
+th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: left; vertical-align: top; }
+th { border-bottom: 2px solid #888; } td { font-variant-numeric: tabular-nums; }
+figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 13px; }
+"""
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading."""
+
+    text: str
+    """Its text."""
+    level: int = 2
+    """1 for the title of the page."""
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A paragraph of plain text."""
+
+    text: str
+    """Its text."""
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of plain texts."""
+
+    items: Sequence[str]
+    """One text each."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of plain texts."""
+
+    header: Sequence[str]
+    """Titles of the columns."""
+    rows: Sequence[Sequence[str]]
+    """Its cells."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure that lies beside the page as NAME.png and NAME.svg."""
+
+    name: str
+    """Of its files."""
+    caption: str
+    """What it shows."""
+
+
+Block = Heading | Paragraph | Bullets | Table | Picture
+
+
+def to_html(blocks: Sequence[Block], folder: Path) -> str:
+    """The page as HTML that needs no other file: figures are inside."""
+    title = next((block.text for block in blocks if isinstance(block, Heading)), "")
+    body = "\n".join(_html(block, folder) for block in blocks)
+    return (
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
+        f"<style>{STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _html(block: Block, folder: Path) -> str:
+    match block:
+        case Heading(text, level):
+            return f"<h{level}>{html.escape(text)}</h{level}>"
+        case Paragraph(text):
+            return f"<p>{html.escape(text)}</p>"
+        case Bullets(items):
+            return "<ul>" + "".join(f"<li>{html.escape(item)}</li>" for item in items) + "</ul>"
+        case Table(header, rows):
+            head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+            lines = ("".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows)
+            body = "\n".join(f"<tr>{line}</tr>" for line in lines)
+            return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+        case Picture(name, caption):
+            data = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
+            alt = html.escape(caption, quote=True)
+            image = f'<img alt="{alt}" src="data:image/png;base64,{data}">'
+            return f"<figure>{image}<figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def to_markdown(blocks: Sequence[Block], pictures: str) -> str:
+    """The page as Markdown, with links to the figures.
+
+    Args:
+        blocks: The page.
+        pictures: Folder of the figures, as seen from the page.
+    """
+    return "\n\n".join(_markdown(block, pictures) for block in blocks) + "\n"
+
+
+def _markdown(block: Block, pictures: str) -> str:
+    match block:
+        case Heading(text, level):
+            return f"{'#' * level} {text}"
+        case Paragraph(text):
+            return text
+        case Bullets(items):
+            return "\n".join(f"* {item}" for item in items)
+        case Table(header, rows):
+            lines = [header, ["---"] * len(header), *rows]
+            return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+        case Picture(name, caption):
+            return f"![{caption}]({pictures}/{name}.png)"

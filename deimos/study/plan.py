@@ -1,0 +1,214 @@
+"""The grid of a study: which cells it has, and what fixes each of them."""
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from deimos.config import from_dict, to_dict
+from deimos.env import EnvConfig
+from deimos.methods import method
+from deimos.run_folder import RunError
+from deimos.study.presets import PRESETS
+from deimos.training import TrainConfig
+
+SCHEMA = 1  # of cell.json
+_KEYS = {"about", "preset", "seeds", "methods", "train", "environment"}
+_ENVIRONMENT_KEYS = {"name", "env", "methods", "train", "goal_periods"}
+_GRID = {"env", "method", "selector", "seed", "evaluation"}  # of TrainConfig: the grid's, not the settings'
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One training run and its evaluations: a pure function of ``digest``."""
+
+    environment: str
+    """Name of the environment or variant in tables and figures."""
+    config: TrainConfig
+    """The run, with the evaluation's sizes."""
+    goal_periods: tuple[int, ...]
+    """The T that the policy is evaluated at [steps]."""
+
+    def __post_init__(self) -> None:
+        if not self.goal_periods or len(set(self.goal_periods)) < len(self.goal_periods):
+            raise ValueError(f"goal_periods must be one or more different numbers, got {self.goal_periods}.")
+        for period in self.goal_periods:
+            replace(self.config, env=self.config.env.with_goal_period(period))  # is the evaluation long enough for it?
+
+    @cached_property
+    def digest(self) -> str:
+        """First 12 hexadecimal digits of the SHA-256 of everything that the numbers depend on."""
+        selector = to_dict(self.config.goals)  # what the method's name stands for
+        periods = list(self.goal_periods)
+        return _digest({"config": to_dict(self.config), "selector": selector, "goal_periods": periods})
+
+    @cached_property
+    def setting(self) -> str:
+        """The same of what the cells of one environment must share to be compared: all but method and seed."""
+        config = to_dict(self.config)
+        shared = {name: value for name, value in config.items() if name not in ("method", "selector", "seed")}
+        return _digest({"config": shared, "goal_periods": list(self.goal_periods)})
+
+    @cached_property
+    def name(self) -> str:
+        """Name of its folder."""
+        return f"{self.environment}-{self.config.label}-s{self.config.seed}-{self.digest[:8]}"
+
+    def to_dict(self) -> dict:
+        """As JSON types."""
+        return {
+            "schema": SCHEMA, "environment": self.environment, "config": to_dict(self.config),
+            "goal_periods": list(self.goal_periods),
+        }  # fmt: skip
+
+
+def _digest(data: dict) -> str:
+    text = json.dumps({"schema": SCHEMA} | data, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def read_cell(path: Path) -> Cell:
+    """Read a ``cell.json``.
+
+    Raises:
+        RunError: If it is broken or of another version.
+    """
+    try:
+        data = json.loads(path.read_text())
+        if data["schema"] != SCHEMA:
+            raise ValueError(f"its schema is {data['schema']}, not {SCHEMA}")
+        config = from_dict(TrainConfig, data["config"])
+        return Cell(environment=data["environment"], config=config, goal_periods=tuple(data["goal_periods"]))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{path} does not describe a cell ({error}).") from error
+
+
+def preset(name: str) -> dict:
+    """The description of a ready-made study.
+
+    Raises:
+        RunError: If there is none of that name.
+    """
+    if name not in PRESETS:
+        raise RunError(f"There is no preset '{name}'; there are: {', '.join(PRESETS)}.")
+    return PRESETS[name]
+
+
+def read(path: Path) -> dict:
+    """Read the description of a study from a TOML file.
+
+    Its keys: ``seeds`` (a number of seeds, or a list of them), ``methods`` (names), ``train`` (fields of
+    ``TrainConfig`` for all cells), and an ``[[environment]]`` for each environment or variant, with ``name``,
+    ``env`` (its ``kind`` and fields) and, if they differ there, ``methods``, ``train`` and ``goal_periods``.
+    ``preset`` names a ready-made study, where everything comes from that is not said.
+
+    Raises:
+        RunError: If it cannot be read or is not TOML, or has other keys.
+    """
+    try:
+        data = tomllib.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} is not a study's TOML file ({error}).") from error
+    base = preset(data["preset"]) if "preset" in data else {}
+    return base | data
+
+
+def expand(
+    description: dict,
+    *,
+    seeds: Sequence[int] | None = None,
+    methods: Sequence[str] | None = None,
+    environments: Sequence[str] | None = None,
+    train: dict | None = None,
+) -> list[Cell]:
+    """All cells of a study, seed by seed, so that a study cut short has the same seeds of every method.
+
+    Args:
+        description: See ``read``.
+        seeds: In place of its own.
+        methods: In place of its own, in every environment.
+        environments: Names of those to take; ``None`` for all.
+        train: Fields of ``TrainConfig`` that come before its own.
+
+    Raises:
+        RunError: If something is unknown, missing, doubled or out of range.
+    """
+    _check_keys("A study", description, _KEYS)
+    tables = description.get("environment", [])
+    if not isinstance(tables, list) or not tables:
+        raise RunError("A study must have an [[environment]].")
+    names = [str(table.get("name", "")) for table in tables]
+    _check_unique("environment", names)
+    if environments is not None:
+        if unknown := [name for name in environments if name not in names]:
+            raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}.")
+        tables = [table for table in tables if table["name"] in environments]
+    numbers = _seeds(description.get("seeds", 10) if seeds is None else list(seeds))
+    shared = _merged({"threads": 1}, description.get("train", {}))
+    try:
+        grid = [_environment(table, shared, description.get("methods"), methods, train or {}) for table in tables]
+        return [_cell(environment, name, seed) for seed in numbers for environment in grid for name in environment[2]]
+    except (AttributeError, TypeError, ValueError) as error:  # what from_dict and the configurations raise
+        raise RunError(" ".join(str(error).split())) from error
+
+
+def _environment(
+    table: dict, shared: dict, default: Any, chosen: Sequence[str] | None, last: dict
+) -> tuple[str, dict, list[str], list[int] | None]:
+    """Name, fields of ``TrainConfig``, methods and goal periods of an environment."""
+    _check_keys("An [[environment]]", table, _ENVIRONMENT_KEYS)
+    name = table.get("name")
+    if not isinstance(name, str) or not name.replace("_", "").replace(".", "").isalnum():
+        raise RunError(f"An [[environment]] must have a name of letters, digits, '.' and '_', got {name!r}.")
+    own = table.get("train", {})
+    if taken := sorted((set(shared) | set(own)) & _GRID):
+        raise RunError(f"{', '.join(taken)} cannot stand in 'train': the grid of the study says it.")
+    try:
+        env = from_dict(EnvConfig, table.get("env", {}))
+    except ValueError as error:
+        raise RunError(f"Environment '{name}': {error}") from error
+    methods = list(chosen if chosen is not None else table.get("methods", default) or [])
+    if not methods:
+        raise RunError(f"Environment '{name}' has no methods.")
+    for each in methods:
+        method(each)
+    _check_unique("method", methods)
+    return name, _merged(_merged(shared, own), last) | {"env": to_dict(env)}, methods, table.get("goal_periods")
+
+
+def _cell(environment: tuple[str, dict, list[str], list[int] | None], method_name: str, seed: int) -> Cell:
+    name, fields, _, periods = environment
+    config = from_dict(TrainConfig, fields | {"method": method_name, "seed": seed})
+    return Cell(environment=name, config=config, goal_periods=tuple(periods or [config.env.goal_period]))
+
+
+def _seeds(given: Any) -> list[int]:
+    if isinstance(given, int) and not isinstance(given, bool) and given >= 1:
+        return list(range(given))
+    if not isinstance(given, list) or not given or not all(type(seed) is int for seed in given):
+        raise RunError(f"seeds must be a number of seeds or a list of them, got {given!r}.")
+    _check_unique("seed", given)
+    return given
+
+
+def _check_unique(what: str, values: Sequence[Any]) -> None:
+    if doubled := sorted({value for value in values if list(values).count(value) > 1}):
+        raise RunError(f"Every {what} must be given once; doubled: {', '.join(map(str, doubled))}.")
+
+
+def _check_keys(what: str, data: dict, known: set[str]) -> None:
+    if unknown := sorted(set(data) - known):
+        raise RunError(f"{what} has no {', '.join(unknown)}; it has: {', '.join(sorted(known))}.")
+
+
+def _merged(base: dict, over: dict) -> dict:
+    """``base`` with what ``over`` says, table by table."""
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merged(merged[key], value) if both else value
+    return merged

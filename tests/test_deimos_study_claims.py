@@ -1,0 +1,277 @@
+"""Claims: findings on populations whose truth is known, Holm's correction, and what a verdict means."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats as scipy_stats
+
+from deimos.run_folder import RunError
+from deimos.study import claim_custom, claim_tests, claims, stats
+from deimos.study.claim_list import ALL, CLAIMS
+from deimos.study.claims import Claim, Finding
+from deimos.study.data import Data, Where
+from deimos.study.presets import LEGGED_METHODS, PARTICLE_METHODS
+from deimos.study.results import RESULT_COLUMNS
+from deimos.study.stats import Interval
+
+POINTS = 40
+BY_ID = {claim.id: claim for claim in CLAIMS}
+
+
+def level(environment, method, goals, period):
+    """Mean log crashes of a method: the same for all under Naive, two more under the Adversary."""
+    return 5.0 + 2.0 * (goals == "adversary")
+
+
+def population(seeds=10, environments=ALL, level=level, spread=0.5, methods=None):
+    """Rows and curves of every method everywhere, with log crashes that are normal around a level."""
+    rng = np.random.default_rng(0)
+    empty = {name: None if kind is str else math.nan for name, kind in RESULT_COLUMNS.items()}
+    rows, lines = [], []
+    for environment in environments:
+        legged = environment.startswith("quad")
+        for method in methods or (LEGGED_METHODS if legged else PARTICLE_METHODS):
+            for seed in range(seeds):
+                key = {"environment": environment, "method": method, "seed": seed, "setting": environment}
+                for period in (100, 500) if legged else (100,):
+                    for goals in ("naive", "adversary"):
+                        crashes = int(np.exp(rng.normal(level(environment, method, goals, period), spread)))
+                        rows.append(empty | key | {
+                            "goals": goals, "goal_period": period, "worlds": 2000, "steps": 2000, "crashes": crashes,
+                            "crashes_per_1000": crashes / 4000, "crash_rate": crashes / 40_000,
+                            "reward": rng.normal(0.8, 0.01), "score": rng.normal(0.8, 0.02),
+                            "weak_adversary": False if goals == "adversary" else None, "fps": rng.normal(3e5, 1e3),
+                            "num_envs": 2000, "env_steps": 2000, "trained_period": 100, "device": "cpu",
+                            "versions": "v",
+                        })  # fmt: skip
+                crashes = 5 * np.exp(-np.arange(POINTS) / 20 + rng.normal(0, 0.2, POINTS))
+                lines.append(key | {
+                    "env_steps": tuple(24.0 * np.arange(1, POINTS + 1)), "reward": (0.7,) * POINTS,
+                    "crashes_per_1000": tuple(crashes), "selected_share": tuple(rng.normal(0.98, 0.001, POINTS)),
+                })  # fmt: skip
+    return rows, lines
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    """Bootstrap little: no test here looks at the ends of an interval."""
+    monkeypatch.setattr(stats, "RESAMPLES", 200)
+
+
+@pytest.fixture(scope="module")
+def alike():
+    """Twenty seeds of everything, where no method differs from another."""
+    return Data(*population(20))
+
+
+def finding(p_for, p_against, detectable=0.7, required=True):
+    """A finding with these p-values, whose smallest effect of interest is 0.75."""
+    return Finding(
+        what="x", where="y", effect="z", interval=Interval(0, 0, 0), p_for=p_for, p_against=p_against,
+        detectable=lambda alpha: detectable, wanted=0.75, n=(10, 10), required=required,
+    )  # fmt: skip
+
+
+def test_all_claims_are_there():
+    """There are 32, numbered in order, each with its words, its environments and its test."""
+    assert [claim.id for claim in CLAIMS] == [f"C{i}" for i in range(1, 33)]
+    for claim in CLAIMS:
+        assert set(claim.environments) <= set(ALL)
+        assert claim.text.endswith(".")
+        assert claim.test
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
+def test_complete_data_give_every_planned_test(alike, claim):
+    """With every method in every environment a claim makes exactly the tests that were planned."""
+    outcome = claims.test(claim, alike)
+    assert (outcome.made, outcome.missing, outcome.in_part) == (claim.planned, (), False)
+    for judged in outcome.judged:
+        assert 0.0 <= judged.p <= 1.0
+        assert judged.detectable >= 0.0
+        assert not math.isnan(judged.finding.interval.estimate)
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
+def test_no_data_is_not_testable(claim):
+    """Where no environment of a claim was run, it is not testable, and says where data are missing."""
+    outcome = claims.test(claim, Data(*population(3, ["elsewhere"])))
+    assert (outcome.verdict, outcome.judged, outcome.missing) == ("not testable", [], claim.environments)
+
+
+@pytest.mark.parametrize(
+    ("p_for", "p_against", "detectable", "verdict"),
+    [
+        (0.01, 1, 0.9, "supported"),
+        (1, 0.01, 0.9, "contradicted"),
+        (0.3, 1, 0.7, "undecided"),
+        (0.3, 1, 0.8, "underpowered"),
+    ],
+)
+def test_verdict_of_one_finding(p_for, p_against, detectable, verdict):
+    """A miss is undecided only if the test could have found the smallest effect of interest."""
+    (judged,) = claims.judge([finding(p_for, p_against, detectable)])
+    assert (judged.verdict, judged.p) == (verdict, min(p_for, p_against))
+
+
+def test_findings_of_a_claim_are_corrected_together():
+    """Of two p-values of 0.03 neither survives Holm's correction; effects are detectable at the stricter level."""
+    pair = [finding(0.03, 1), finding(0.03, 1)]
+    assert [each.verdict for each in claims.judge(pair)] == ["undecided", "undecided"]
+    assert [each.p for each in claims.judge(pair)] == [0.06, 0.06]
+    levels = []
+    spy = finding(1, 1)
+    object.__setattr__(spy, "detectable", lambda alpha: levels.append(alpha) or 1.0)
+    claims.judge([spy, spy])
+    assert levels == [0.025, 0.025]
+
+
+def test_verdict_of_a_claim():
+    """All required findings must support a claim and one contradicts it; where one is enough, only all contradict."""
+    yes, no, open_one = finding(1e-6, 1), finding(1, 1e-6), finding(0.5, 1)
+    for findings, every, one in (
+        ([yes, yes], "supported", "supported"),
+        ([yes, no], "contradicted", "supported"),
+        ([yes, open_one], "undecided", "supported"),
+        ([no, open_one], "contradicted", "undecided"),
+        ([no, no], "contradicted", "contradicted"),
+        ([yes, finding(0.5, 1, 0.9)], "underpowered", "supported"),
+        ([finding(1, 1, required=False)], "not testable", "not testable"),
+        ([yes, finding(1, 1, required=False)], "supported", "supported"),
+        ([yes, finding(1, 1e-6, required=False)], "contradicted", "supported"),
+    ):
+        judged = claims.judge(findings)
+        assert claims.combined(judged) == every
+        assert claims.combined(judged, "any") == one
+    assert claims.combined(claims.judge([no, no]), "any", planned=3) == "undecided"
+
+
+def test_planted_effects_are_found():
+    """Populations in which the thesis is right support its claims, and those in which it is wrong contradict them."""
+
+    def right(environment, method, goals, period):
+        if goals == "naive":
+            return 5.0 + 2 * (method == "rnd")
+        return {"p25": 5.0, "uniform": 7.0, "vds": 7.0, "p10": 6.5, "p50": 6.5}.get(method, 8.0)
+
+    data = Data(*population(20, ["directional", "absolute"], right, 0.3))
+    attacked = claims.test(BY_ID["C7"], data)
+    by_method = {each.finding.what.split(":")[0]: each.verdict for each in attacked.judged}
+    assert by_method["p25"] != "supported"  # it crashes no more under attack here
+    assert {verdict for name, verdict in by_method.items() if name not in ("p25", "rnd")} == {"supported"}
+    safest = claims.test(BY_ID["C15"], data)
+    crashes = [each.verdict for each in safest.judged if each.finding.what.startswith("crashes")]
+    assert crashes == ["supported"] * 7
+    assert claims.test(BY_ID["C1"], data).verdict != "supported"  # all train alike
+    assert [each.verdict for each in claims.test(BY_ID["C11"], data).judged] == []
+    swapped = Data(*population(20, ["directional"], lambda e, m, g, t: 7.0 if m == "p25" else 5.0, 0.3))
+    assert claims.test(BY_ID["C15"], swapped).verdict == "contradicted"
+
+
+def test_weak_adversaries_stay_out():
+    """A row that is marked weak is in no sample, but counted."""
+    rows, lines = population(5, ["directional"], methods=["uniform"])
+    rows[1]["weak_adversary"] = True
+    data = Data(rows, lines)
+    assert data.weak == [rows[1]]
+    assert len(data.sample(Where("directional", "adversary", 100), "uniform", "crashes")) == 4
+    assert data.seeds(Where("directional", "adversary", 100), ["uniform"]) == [1, 2, 3, 4]
+    naive, attacked = claim_tests.both(data, "directional", 100, "uniform", "crashes")
+    assert len(naive) == len(attacked) == 4
+
+
+def test_best_p_needs_twenty_seeds():
+    """With fewer than twenty seeds the headline cannot be split and is not testable."""
+    for seeds, verdict in ((19, {"not testable"}), (20, set(claims.VERDICTS) - {"not testable"})):
+        assert claims.test(BY_ID["C28"], Data(*population(seeds, ["relative"]))).verdict in verdict
+
+
+def test_settings_are_not_mixed():
+    """Cells of one environment that were run with different settings are refused together."""
+    rows, lines = population(3, ["relative"])
+    rows[0]["setting"] = "other"
+    with pytest.raises(RunError, match="environment 'relative' were run with 2 different settings"):
+        Data(rows, lines)
+
+
+def test_paired_test_is_wilcoxons():
+    """Its p-value is SciPy's on the pairs, for the side that the signed ranks lean to."""
+    rng = np.random.default_rng(1)
+    y = rng.normal(size=12)
+    x = y + rng.normal(0.8, 1, size=12)
+    (found,) = claim_tests.paired_more("", "here", x, y)
+    (mirrored,) = claim_tests.paired_more("", "here", y, x)
+    assert found.p_for == mirrored.p_against == scipy_stats.wilcoxon(x, y).pvalue
+    assert found.p_against == mirrored.p_for == 1.0
+    assert claim_tests.paired_more("", "here", x, x)[0].p_for == 1.0
+
+
+def test_one_sample_test_is_students():
+    """Above and below its limit it gives SciPy's two-sided p-value."""
+    x = np.random.default_rng(2).normal(1, 1, size=9)
+    p = scipy_stats.ttest_1samp(x, 0.2).pvalue
+    (found,) = claim_tests.positive("", "here", "", x, 1.0, at=0.2)
+    assert (min(found.p_for, found.p_against), max(found.p_for, found.p_against)) == (pytest.approx(p), 1.0)
+    assert claim_tests.positive("", "here", "", np.ones(4), 1.0)[0].p_for == 0.0
+
+
+def test_poisson_bound_of_few_crashes():
+    """3 crashes in 4 10^6 steps, five times over: 15 in 2 10^7, tested exactly against one in 10^6."""
+    rows, lines = population(5, ["relative"], methods=["vds"])
+    for row in rows:
+        row["crashes"] = 3
+    (found,) = claim_custom.nearly_none(Data(rows, lines), "relative")
+    assert found.interval.estimate == pytest.approx(15 / 20)
+    assert found.interval.low == pytest.approx(scipy_stats.chi2.ppf(0.025, 30) / 40)
+    assert found.p_for == pytest.approx(scipy_stats.poisson.cdf(15, 20))
+    assert found.p_against == pytest.approx(1 - scipy_stats.poisson.cdf(14, 20))
+
+
+def test_vertex_of_a_known_parabola():
+    """Log crashes on an exact parabola have their vertex where it is."""
+    samples = {
+        name: np.full(4, 3.0 + 0.002 * (place - 62.0) ** 2)
+        for name, place in claim_custom.ACHIEVED.items()
+        if name != "uniform"
+    }
+    interval, _, curvature = claim_custom.vertex(samples, 50)
+    assert (interval.estimate, interval.low, interval.high) == pytest.approx((62.0, 62.0, 62.0))
+    assert (curvature > 0).all()
+    assert claim_custom.ACHIEVED["p25"] == 62.5
+    assert claim_custom.ACHIEVED["p90"] == 95.0
+
+
+def test_eta_squared_is_the_anova_share():
+    """It is the sum of squares between the groups over the total one."""
+    groups = [np.array([1.0, 2, 3]), np.array([4.0, 6]), np.array([0.0, 0, 1])]
+    values = np.concatenate(groups)
+    between = sum(len(g) * (g.mean() - values.mean()) ** 2 for g in groups)
+    expected = between / ((values - values.mean()) ** 2).sum()
+    assert claim_custom._eta_squared(*groups) == pytest.approx(expected)
+    assert claim_custom._eta_squared(np.ones(3), np.ones(2)) == 0.0
+
+
+def test_energy_distance_is_its_definition():
+    """It is 2 E|X - Y| - E|X - X'| - E|Y - Y'| on scaled columns; equal populations are not told apart, others are."""
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=(8, 2)), rng.normal([5.0, 0.0], size=(7, 2))
+    scale = np.concatenate([x, y]).std(axis=0)
+    a, b = x / scale, y / scale
+
+    def apart(u, v):
+        return np.mean([np.linalg.norm(p - q) for p in u for q in v])
+
+    distance, p = claim_custom.energy_test(x, y)
+    assert distance == pytest.approx(2 * apart(a, b) - apart(a, a) - apart(b, b))
+    assert p < 0.005
+    assert claim_custom.energy_test(x, x + 1e-9)[1] > 0.9
+
+
+def test_claim_in_part():
+    """A claim whose tests could be made only for some methods holds only in part."""
+    data = Data(*population(10, ["directional"], methods=["uniform", "p25", "coop"]))
+    outcome = claims.test(BY_ID["C14"], data)
+    assert 0 < outcome.made < BY_ID["C14"].planned
+    assert outcome.in_part
+    assert isinstance(outcome.claim, Claim)

@@ -1,0 +1,157 @@
+"""The grid of a study: its cells, what fixes them, and what is refused before anything runs."""
+
+import dataclasses
+import json
+import re
+
+import pytest
+
+from deimos.run_folder import RunError
+from deimos.study import plan
+from deimos.study.presets import LEGGED_METHODS, PARTICLE_METHODS, PRESETS
+from deimos.training import TrainConfig
+
+TOML = """
+seeds = [3, 5]
+methods = ["uniform", "p25"]
+[train]
+num_envs = 64
+ppo = { hidden = [16, 16] }
+[[environment]]
+name = "near"
+env = { kind = "particle", variant = "directional" }
+goal_periods = [50, 100]
+[[environment]]
+name = "far"
+env = { kind = "particle", variant = "absolute" }
+methods = ["coop"]
+train = { env_steps = 500, ppo = { epochs = 2 } }
+"""
+
+
+def described(tmp_path, text):
+    """The description in a TOML text."""
+    path = tmp_path / "study.toml"
+    path.write_text(text)
+    return plan.read(path)
+
+
+def test_file_becomes_a_grid(tmp_path):
+    """A file gives every combination, seed by seed, with the fields of the study under those of the environment."""
+    cells = plan.expand(described(tmp_path, TOML))
+    found = [(cell.environment, cell.config.method, cell.config.seed) for cell in cells]
+    assert found == [
+        (name, method, seed)
+        for seed in (3, 5)
+        for name, method in (("near", "uniform"), ("near", "p25"), ("far", "coop"))
+    ]
+    near, far = cells[0], cells[2]
+    assert (near.config.num_envs, near.config.env_steps, near.goal_periods) == (64, TrainConfig().env_steps, (50, 100))
+    assert (far.config.env_steps, far.config.ppo.epochs, far.config.ppo.hidden) == (500, 2, (16, 16))
+    assert far.goal_periods == (far.config.env.goal_period,)
+    assert all(cell.config.threads == 1 for cell in cells)
+
+
+def test_choices_come_before_the_file(tmp_path):
+    """Seeds, methods, environments and budgets of the command line replace those of the file."""
+    cells = plan.expand(
+        described(tmp_path, TOML), seeds=[9], methods=["rnd"], environments=["far"], train={"env_steps": 77}
+    )
+    assert [(cell.environment, cell.config.method, cell.config.seed) for cell in cells] == [("far", "rnd", 9)]
+    assert cells[0].config.env_steps == 77
+
+
+def test_file_extends_a_preset(tmp_path):
+    """What a file does not say comes from the preset that it names."""
+    cells = plan.expand(described(tmp_path, 'preset = "directional"\nseeds = 1\n'))
+    assert [cell.config.method for cell in cells] == PRESETS["directional"]["methods"]
+
+
+@pytest.mark.parametrize("name", [name for name in PRESETS if "quad" not in name])
+def test_presets_of_particle_gym_expand(name):
+    """Every preset of Particle Gym is a valid grid of different cells."""
+    cells = plan.expand(PRESETS[name], seeds=[0, 1])
+    assert len({cell.digest for cell in cells}) == len({cell.name for cell in cells}) == len(cells)
+    expected = sum(len(each.get("methods", PRESETS[name]["methods"])) for each in PRESETS[name]["environment"])
+    assert len(cells) == 2 * expected
+
+
+def test_presets_are_the_thesis():
+    """Particle Gym has ten methods, ten seeds and 2000 or 5000 steps; the legged ones twelve, thirty and two T."""
+    cells = plan.expand(PRESETS["particle"], seeds=[0])
+    steps = {cell.environment: cell.config.env_steps for cell in cells}
+    assert steps == {"directional": 2000, "relative": 2000, "absolute": 5000}
+    assert {cell.config.num_envs for cell in cells} == {2000}
+    assert PRESETS["particle"]["seeds"] == 10
+    assert (len(PARTICLE_METHODS), len(LEGGED_METHODS)) == (10, 12)
+    for name in ("quad", "quad_arm"):
+        assert (PRESETS[name]["seeds"], PRESETS[name]["environment"][0]["goal_periods"]) == (30, [100, 500])
+
+
+def test_digest_is_a_function_of_all_that_matters():
+    """Another seed, method, budget, evaluation or T is another cell, and another setting but for seed and method."""
+    config = TrainConfig(method="p25", threads=1)
+    cell = plan.Cell(environment="directional", config=config, goal_periods=(100,))
+    same = plan.Cell(environment="directional", config=TrainConfig(method="p25", threads=1), goal_periods=(100,))
+    assert (cell.digest, cell.setting, cell.name) == (same.digest, same.setting, same.name)
+    for shares, change in (
+        (True, {"seed": 1}),
+        (True, {"method": "p50"}),
+        (False, {"env_steps": 4000}),
+        (False, {"eval": dataclasses.replace(config.eval, steps=1000)}),
+    ):
+        other = dataclasses.replace(cell, config=dataclasses.replace(config, **change))
+        assert other.digest != cell.digest
+        assert (other.setting == cell.setting) == shares
+    assert dataclasses.replace(cell, goal_periods=(50, 100)).setting != cell.setting
+
+
+def test_cell_survives_its_file(tmp_path):
+    """A cell that is written and read is the same one."""
+    cell = plan.Cell(environment="x", config=TrainConfig(method="vds+p75", seed=3), goal_periods=(20, 100))
+    (tmp_path / "cell.json").write_text(json.dumps(cell.to_dict()))
+    assert plan.read_cell(tmp_path / "cell.json") == cell
+    (tmp_path / "cell.json").write_text('{"schema": 99}')
+    with pytest.raises(RunError, match="its schema is 99, not 1"):
+        plan.read_cell(tmp_path / "cell.json")
+
+
+ERRORS = {
+    # what is said in the file, and the one line that refuses it
+    TOML.replace('"uniform", "p25"', '"uniform", "p33"'): "There is no method 'p33'; there are: uniform, coop",
+    TOML.replace('"uniform", "p25"', '"uniform", "uniform"'): "Every method must be given once; doubled: uniform",
+    TOML.replace("[3, 5]", "[3, 3]"): "Every seed must be given once; doubled: 3",
+    TOML.replace("[3, 5]", "0"): "seeds must be a number of seeds or a list of them, got 0",
+    TOML.replace("[3, 5]", "[-1]"): r"seed must be in \[0, 2\^32\), got -1",
+    TOML.replace('"far"', '"near"'): "Every environment must be given once; doubled: near",
+    TOML.replace('"far"', '"../far"'): r"must have a name of letters, digits, '\.' and '_', got '\.\./far'",
+    TOML.replace(
+        '"particle", variant = "absolute"', '"hexapod"'
+    ): "'far': deimos.envs has no 'hexapod'; it has: particle",
+    TOML.replace('variant = "absolute"', 'variant = "cubic"'): "'far': variant must be one of",
+    TOML.replace('variant = "absolute"', "friction = 1"): "'far': .*Config has no friction; it has: ",
+    TOML.replace("num_envs = 64", "num_worlds = 64"): "TrainConfig has no num_worlds; it has: ",
+    TOML.replace("num_envs = 64", "seed = 64"): "seed cannot stand in 'train': the grid of the study says it",
+    TOML.replace("num_envs = 64", "num_envs = 0"): "num_envs must be at least 1, got 0",
+    TOML.replace("[50, 100]", "[50, 5000]"): "eval.steps must be at least 2 T = 10000, got 2000",
+    TOML.replace("[50, 100]", "[50, 50]"): r"goal_periods must be one or more different numbers, got \(50, 50\)",
+    TOML.replace("seeds", "seed"): "A study has no seed; it has: about, environment",
+    TOML.replace("goal_periods", "periods"): r"An \[\[environment\]\] has no periods; it has: env, goal_periods",
+    "seeds = 3": r"A study must have an \[\[environment\]\]",
+    'preset = "huge"': "There is no preset 'huge'; there are: absolute, relative",
+    "seeds = = 3": r"study\.toml is not a study's TOML file",
+}
+
+
+@pytest.mark.parametrize(("text", "message"), ERRORS.items())
+def test_mistake_in_a_file_is_one_line(tmp_path, text, message):
+    """Whatever is wrong in a file is said in one line that names it, before anything runs."""
+    with pytest.raises(RunError, match=message) as error:
+        plan.expand(described(tmp_path, text))
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_environment_is_refused(tmp_path):
+    """Asking for an environment that a study does not have lists those that it has."""
+    with pytest.raises(RunError, match=re.escape("This study has no environment quad; it has: near, far.")):
+        plan.expand(described(tmp_path, TOML), environments=["quad"])

@@ -1,0 +1,157 @@
+"""The report: complete, self-contained, and the figures that stand in it."""
+
+import base64
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deimos.run_folder import RunError
+from deimos.study import document, figures, report, stats
+from deimos.study.claim_list import CLAIMS
+from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, curves, results
+
+METHODS = ["coop", "p25", "p75", "antagonist", "uniform", "vds"]
+
+
+def fill(folder, seeds=4, points=20):
+    """Write the tables of a study of six methods in two environments."""
+    rng = np.random.default_rng(0)
+    values = {str: "v", int: 100, float: 0.5, bool: False}
+    rows, lines = [], []
+    for environment in ("directional", "quad"):
+        for method in METHODS:
+            for seed in range(seeds):
+                key = {"environment": environment, "method": method, "seed": seed, "setting": environment,
+                       "hash": f"{environment}-{method}-{seed}"}  # fmt: skip
+                for goals in ("naive", "adversary"):
+                    row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | key
+                    crashes = int(np.exp(rng.normal(5, 0.5))) if goals == "adversary" else 0
+                    weak = method == "coop" and seed == 0 and goals == "adversary"
+                    rows.append(row | {"goals": goals, "crashes": crashes, "crashes_per_1000": crashes / 4000,
+                                       "reward": rng.normal(0.8, 0.01), "fps": rng.normal(1e5, 1e3),
+                                       "weak_adversary": weak})  # fmt: skip
+                line = dict.fromkeys(CURVE_COLUMNS, tuple(rng.uniform(0.1, 1, points))) | key
+                lines.append(line | {"num_envs": 100, "env_steps": tuple(24.0 * np.arange(1, points + 1))})
+    folder.mkdir(exist_ok=True)
+    results(folder).append(rows)
+    curves(folder).append(lines)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A study folder with its report."""
+    path = tmp_path_factory.mktemp("study")
+    fill(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stats, "RESAMPLES", 200)  # nothing here looks at the ends of an interval
+        report.write(path, path, resamples=200)
+    return path
+
+
+class Page(HTMLParser):
+    """Collects what a browser would load, and checks that every element is closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.sources, self.links = [], [], []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        """Take note of what an element loads."""
+        given = dict(attributes)
+        self.sources += [given["src"]] if "src" in given else []
+        self.links += [given["href"]] if "href" in given else []
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        """Close the innermost element."""
+        assert self.open.pop() == tag
+
+
+def test_page_needs_no_other_file(folder):
+    """The HTML page is well formed, holds every figure as a readable PNG, loads nothing, and is under 5 MB."""
+    text = (folder / "report.html").read_text()
+    page = Page(text)
+    assert page.open == []
+    assert page.links == []
+    prefix = "data:image/png;base64,"
+    assert all(source.startswith(prefix) for source in page.sources)
+    drawn = {path.read_bytes() for path in (folder / "figures").glob("*.png")}
+    assert {base64.b64decode(source.removeprefix(prefix)) for source in page.sources} == drawn
+    assert len(text.encode()) < 5e6
+
+
+def test_every_figure_is_there_twice(folder):
+    """Each environment has its training curves, boxes, profiles and dose-response, as PNG and as SVG."""
+    names = {f"training-{name}" for name in ("directional", "quad")}
+    names |= {f"{kind}-{e}-T100" for kind in ("evaluation", "profile", "dose") for e in ("directional", "quad")}
+    for ending in ("png", "svg"):
+        assert {path.stem for path in (folder / "figures").glob(f"*.{ending}")} == names
+    for path in (folder / "figures").glob("*.png"):
+        with Image.open(path) as image:
+            assert len(image.convert("RGB").getcolors(2**24)) > 10, path
+
+
+def test_markdown_says_the_same(folder):
+    """The Markdown twin has every claim with its verdict, and links to figures that exist."""
+    text = (folder / "report.md").read_text()
+    page = (folder / "report.html").read_text()
+    for claim in CLAIMS:
+        heading = re.search(rf"^### {claim.id}: (.+)$", text, re.MULTILINE)
+        assert heading is not None
+        assert f"<h3>{claim.id}: {heading[1]}</h3>" in page
+    links = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
+    assert len(links) == 8
+    assert all((folder / link).is_file() for link in links)
+
+
+def test_report_says_what_limits_it(folder):
+    """Weak adversaries are counted; the caveat of training curves and the detectable effects are printed."""
+    text = (folder / "report.md").read_text()
+    assert "2 of 48 evaluations by the Adversary are marked weak" in text
+    assert figures.CAVEAT in text
+    assert "minimum detectable effect" in text
+    assert "| quad | vds |" in text
+    assert "0.69 |" in text  # the thesis's VDS over Uniform in Quad, 70 / 101
+
+
+def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):
+    """The bootstrap is seeded: another call writes the same Markdown."""
+    monkeypatch.setattr(stats, "RESAMPLES", 200)
+    monkeypatch.setattr(report, "draw_all", lambda data, out: {})
+    report.write(folder, tmp_path, resamples=200)
+    text = re.sub(r"!\[.*\n\n", "", (folder / "report.md").read_text())
+    assert (tmp_path / "report.md").read_text() == text
+
+
+def test_empty_folder_has_no_report(tmp_path):
+    """There is no report of nothing."""
+    with pytest.raises(RunError, match="holds no results; it is empty, or no study folder"):
+        report.write(tmp_path, tmp_path)
+
+
+def test_text_is_escaped():
+    """What HTML or a Markdown table would take for markup is only text."""
+    blocks = [document.Heading("a < b"), document.Table(["x"], [["P(a | b) & <c>"]])]
+    assert "<td>P(a | b) &amp; &lt;c&gt;</td>" in document.to_html(blocks, None)
+    assert "| P(a \\| b) & <c> |" in document.to_markdown(blocks, "figures")
+
+
+def test_methods_have_their_own_colours():
+    """No two of the thesis's methods share a colour or a marker, nor are two colours close to each other."""
+    names = [*METHODS, "p10", "p50", "p90", "rnd", "cl", "vds+p75", "learnability"]
+    assert len({figures.colour(name) for name in names}) == len(names)
+    assert len({figures.marker(name) for name in names}) == len(names)
+    codes = np.array([[int(figures.colour(name)[i : i + 2], 16) for i in (1, 3, 5)] for name in names])
+    apart = np.abs(codes[:, None] - codes[None]).sum(axis=2) + 1000 * np.eye(len(names))
+    assert apart.min() > 40
+
+
+def test_rolling_mean_is_short_at_the_start():
+    """The rolling mean takes what there is until its window is full."""
+    assert figures._rolling(np.array([1.0, 3, 5, 7]), 2).tolist() == [1, 2, 4, 6]

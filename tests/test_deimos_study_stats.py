@@ -1,0 +1,235 @@
+"""Statistics of populations: against published formulas, SciPy, rliable where it is there, and hand calculation."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats as scipy_stats
+
+from deimos.study import coverage, stats
+
+RNG = np.random.default_rng(7)
+X = RNG.lognormal(size=12)
+Y = RNG.lognormal(0.8, 0.5, size=9)
+
+
+def test_iqm_drops_a_quarter_on_each_side():
+    """Of ten values the two lowest and the two highest go, as in SciPy's trimmed mean, which rliable uses."""
+    x = np.array([100.0, 1, 2, 3, 4, 5, 6, 7, 8, -50.0])
+    assert stats.iqm(x) == np.mean([2, 3, 4, 5, 6, 7])
+    for n in range(4, 20):
+        values = np.random.default_rng(n).normal(size=n)
+        assert stats.iqm(values) == pytest.approx(scipy_stats.trim_mean(values, 0.25), rel=1e-12)
+    assert np.array_equal(stats.iqm(np.stack([x, 2 * x])), [stats.iqm(x), stats.iqm(2 * x)])
+
+
+def test_iqr_is_numpys():
+    """The quartiles are interpolated linearly, as SciPy's interquartile range does."""
+    assert stats.iqr(X) == pytest.approx(scipy_stats.iqr(X))
+
+
+def test_cvar_counts_the_boundary_by_its_fraction():
+    """With 10 values and a share of 0.25 the third worst counts half: (10 + 9 + 8 / 2) / 2.5."""
+    x = np.arange(1.0, 11.0)
+    assert stats.cvar(x, 0.25) == pytest.approx((10 + 9 + 8 / 2) / 2.5)
+    assert stats.cvar(x, 0.2) == pytest.approx(9.5)
+    assert stats.cvar(x, 1.0) == pytest.approx(x.mean())
+    assert stats.cvar(np.arange(1.0, 31.0), 0.2) == pytest.approx(np.mean([25, 26, 27, 28, 29, 30]))
+    with pytest.raises(ValueError, match=r"share must be in \(0, 1\], got 0"):
+        stats.cvar(x, 0.0)
+
+
+def test_cvar_minimises_rockafellar_and_uryasevs_function():
+    """CVaR is the least value over a of a + E[(x - a)+] / share, their defining property."""
+    for share in (0.1, 0.23, 0.5):
+        values = X + np.maximum(X[:, None] - X, 0).mean(axis=0) / share  # its minimum lies at a sample point
+        assert stats.cvar(X, share) == pytest.approx(values.min(), rel=1e-12)
+
+
+def test_bootstrap_of_the_mean_has_its_known_spread():
+    """The bootstrap distribution of a mean has the variance s^2 (n - 1) / n^2, and two seeds differ, one does not."""
+    draws = stats.resample([X], 40_000, 0)[0].mean(axis=1)
+    expected = X.std() / math.sqrt(len(X))
+    # The standard deviation of 40 000 draws is known to 1 / sqrt(80 000), or 0.35 %; skewness adds a little.
+    assert draws.std() == pytest.approx(expected, rel=0.02)
+    one, again, other = (stats.bootstrap([X], stats.iqm, seed=seed) for seed in (1, 1, 2))
+    assert one == again
+    assert one != other
+
+
+def test_bootstrap_resamples_within_strata():
+    """Every resample keeps the size of each stratum, and takes values from that stratum alone."""
+    draws = stats.resample([X, Y + 100], 50, 3)
+    assert [draw.shape for draw in draws] == [(50, 12), (50, 9)]
+    assert np.isin(draws[0], X).all()
+    assert np.isin(draws[1], Y + 100).all()
+
+
+def test_bca_agrees_with_scipy():
+    """The bias-corrected, accelerated interval of a skewed mean is SciPy's, within the noise of the resampling."""
+    ours = stats.bca(X, lambda x: x.mean(axis=-1), resamples=40_000)
+    theirs = scipy_stats.bootstrap(
+        (X,), np.mean, n_resamples=40_000, method="BCa", vectorized=True, axis=-1, rng=np.random.default_rng(1)
+    ).confidence_interval
+    error = X.std() / math.sqrt(len(X))
+    # The 2.5 % quantile of 40 000 draws has a standard error of about 0.013 standard deviations; 5 of them, twice.
+    assert ours.low == pytest.approx(theirs.low, abs=0.15 * error)
+    assert ours.high == pytest.approx(theirs.high, abs=0.15 * error)
+
+
+def test_bootstrap_t_is_students_interval_for_many_normal_values():
+    """With many normal values the studentised bootstrap approaches Student's interval."""
+    x = np.random.default_rng(0).normal(3.0, 2.0, size=400)
+    found = stats.bootstrap_t(x)
+    low, high = scipy_stats.t.interval(0.95, 399, loc=x.mean(), scale=x.std(ddof=1) / 20)
+    assert found.low == pytest.approx(low, abs=0.02)  # a fifth of the standard error of 0.1
+    assert found.high == pytest.approx(high, abs=0.02)
+
+
+def test_bootstrap_t_leans_towards_the_long_tail():
+    """Of a right-skewed sample the interval reaches farther up than down, as the exact one does."""
+    found = stats.bootstrap_t(X)
+    assert found.high - found.estimate > 1.2 * (found.estimate - found.low)
+
+
+@pytest.mark.parametrize("interval", [stats.bootstrap_t, lambda x: stats.bca(x, stats.iqm)])
+def test_constant_sample_has_no_width(interval):
+    """A population of equal values has a point as its interval, without a warning."""
+    assert interval(np.full(6, 2.5)) == stats.Interval(2.5, 2.5, 2.5)
+
+
+def test_probability_of_improvement_is_mann_whitneys():
+    """It is U / (n m) with ties counted half, averaged over tasks."""
+    x, y = np.array([1.0, 2, 2, 5]), np.array([2.0, 0, 4])
+    # Wins of 1: 1; of each 2: 1 and a tie; of 5: 3.
+    assert stats.probability_of_improvement([(x, y)]).estimate == pytest.approx((1 + 1.5 + 1.5 + 3) / 12)
+    u = [scipy_stats.mannwhitneyu(a, b).statistic / (len(a) * len(b)) for a, b in ((X, Y), (x, y))]
+    assert stats.probability_of_improvement([(X, Y), (x, y)]).estimate == pytest.approx(np.mean(u))
+    assert stats.probability_of_improvement([(X, X + 100)]) == stats.Interval(0.0, 0.0, 0.0)
+
+
+def test_probability_of_improvement_resamples_both_arms():
+    """Its interval is that of drawing both samples anew and counting wins, done the slow way."""
+    rng = np.random.default_rng(5)
+    slow = [np.mean(rng.choice(X, len(X))[:, None] > rng.choice(Y, len(Y))) for _ in range(4000)]
+    found = stats.probability_of_improvement([(X, Y)], resamples=20_000)
+    # 5 standard errors of a 2.5 % quantile of 4000 draws: 5 * sqrt(0.025 * 0.975 / 4000) / density, 0.06 / sd there.
+    assert found.low == pytest.approx(np.quantile(slow, 0.025), abs=0.25 * np.std(slow))
+    assert found.high == pytest.approx(np.quantile(slow, 0.975), abs=0.25 * np.std(slow))
+
+
+def test_performance_profile_counts_runs_above():
+    """The profile is the share of runs above each threshold, averaged over tasks, inside its band."""
+    share, low, high = stats.performance_profile(
+        [np.array([1.0, 2, 3, 4]), np.array([2.0, 2])], np.array([0.0, 2, 3.5])
+    )
+    assert share.tolist() == [1.0, 0.25, 0.125]
+    assert (low <= share).all()
+    assert (share <= high).all()
+    assert (low[0], high[0]) == (1.0, 1.0)
+
+
+def test_log_iqr_ratio_knows_no_spread():
+    """Two populations without spread have the ratio 1, and one without has an infinite or zero one, silently."""
+    flat = np.ones(5)
+    assert stats.log_iqr_ratio(3 * X, X) == pytest.approx(math.log(3))
+    assert stats.log_iqr_ratio(flat, flat) == 0.0
+    assert stats.log_iqr_ratio(X, flat) == math.inf
+    assert stats.log_iqr_ratio(flat, X) == -math.inf
+    assert stats.bootstrap([X, flat], stats.log_iqr_ratio).low == math.inf
+
+
+def test_brown_forsythe_is_scipys():
+    """It is Levene's test on the distances from the medians; constant populations are handled."""
+    assert stats.brown_forsythe(X, Y) == pytest.approx(scipy_stats.levene(X, Y, center="median").pvalue, rel=1e-12)
+    assert stats.brown_forsythe(np.ones(4), np.full(4, 7.0)) == 1.0
+    assert stats.brown_forsythe(np.array([0.0, 0, 2, 2]), np.ones(4)) == 0.0
+
+
+def test_holm_on_the_textbook_example():
+    """Holm's procedure on 0.01, 0.04, 0.03, 0.005 multiplies by 4, 3, 2, 1 and never falls."""
+    assert stats.holm([0.01, 0.04, 0.03, 0.005]).tolist() == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert stats.holm([0.6, 0.7]).tolist() == [1.0, 1.0]
+
+
+def test_equivalence_is_two_one_sided_welch_tests():
+    """The p-value is the larger of SciPy's two one-sided Welch tests, and the 90 % interval tells the same."""
+    for margin in (0.2, 1.0, 3.0):
+        found = stats.equivalence(X, Y, margin)
+        lower = scipy_stats.ttest_ind(X + margin, Y, equal_var=False, alternative="greater").pvalue
+        upper = scipy_stats.ttest_ind(X - margin, Y, equal_var=False, alternative="less").pvalue
+        assert found.p_same == pytest.approx(max(lower, upper), rel=1e-9)
+        assert (found.p_same < 0.05) == (-margin < found.low and found.high < margin)
+    far = stats.equivalence(X + 50, Y, 1.0)
+    assert far.p_same > 0.999
+    assert far.p_other < 1e-6
+    with pytest.raises(ValueError, match="margin must be positive, got 0"):
+        stats.equivalence(X, Y, 0.0)
+
+
+def test_equivalence_of_constant_samples_is_exact():
+    """Without spread the difference itself decides."""
+    assert stats.equivalence(np.ones(3), np.full(3, 1.5), 1.0).p_same == 0.0
+    assert stats.equivalence(np.ones(3), np.full(3, 2.5), 1.0).p_other == 0.0
+
+
+def test_detectable_probability_is_noethers():
+    """Ten a side detect 0.86 and thirty 0.71 with a power of 80 %, by (z + z') / sqrt(12 n m / (n + m))."""
+    z = 1.959964 + 0.841621
+    assert stats.detectable_probability(10, 10) == pytest.approx(0.5 + z / math.sqrt(12 * 100 / 20), abs=1e-5)
+    assert stats.detectable_probability(30, 30) == pytest.approx(0.7088, abs=1e-4)
+    assert stats.detectable_probability(3, 3) == 1.0
+
+
+def test_detectable_spread_has_the_promised_power():
+    """At the ratio that it names, SciPy's Brown-Forsythe test on fresh normal samples finds 80 %."""
+    ratio = stats.detectable_spread(10, 10)
+    rng = np.random.default_rng(3)
+    x, y = ratio * rng.normal(size=(2000, 10)), rng.normal(size=(2000, 10))
+    p = scipy_stats.levene(x, y, center="median", axis=1).pvalue
+    # Both shares are binomial: standard errors of sqrt(0.16 / 4000) and sqrt(0.16 / 2000), four of them together.
+    assert (p < 0.05).mean() == pytest.approx(0.8, abs=4 * math.sqrt(0.16 / 4000 + 0.16 / 2000))
+
+
+def test_detectable_margin_has_the_promised_power():
+    """Two populations with equal means are found equivalent within that margin in 80 % of all samples."""
+    rng = np.random.default_rng(4)
+    found = []
+    margin = (scipy_stats.t.ppf(0.95, 28) + scipy_stats.t.ppf(0.9, 28)) * math.sqrt(2 / 15)
+    for _ in range(600):
+        x, y = rng.normal(size=(2, 15))
+        found.append(stats.equivalence(x, y, margin).p_same < 0.05)
+    # The two tests' shared noise makes the formula a little too careful or too bold: 0.05 beside 4 standard errors.
+    assert np.mean(found) == pytest.approx(0.8, abs=0.05 + 4 * math.sqrt(0.16 / 600))
+    x, y = (np.arange(15.0) - 7) / np.arange(15.0).std(ddof=1), (np.arange(15.0) - 7) / np.arange(15.0).std(ddof=1)
+    assert stats.detectable_margin(x, y) == pytest.approx(margin, rel=1e-6)
+
+
+@pytest.mark.parametrize("x", [np.array([1.0]), np.ones((2, 2)), np.array([1.0, math.nan])])
+def test_bad_samples_are_refused(x):
+    """A sample is two numbers or more along one axis."""
+    with pytest.raises(ValueError, match="A sample must"):
+        stats.bootstrap([x], stats.iqm)
+
+
+def test_coverage_of_the_intervals():
+    """In 200 populations of 10, IQM, median and bootstrap-t cover as promised, and the percentile mean does not."""
+    rows = {(row.statistic, row.interval): row for row in coverage.simulate(10, 200, 1000, seed=1)}
+    error = 4 * math.sqrt(0.95 * 0.05 / 200)  # four standard errors of a coverage of 95 %
+    for statistic in ("IQM", "median"):
+        row = rows[statistic, "percentile"]
+        assert 0.92 - error < min(row.normal, row.lognormal)
+        assert max(row.normal, row.lognormal) < 0.97 + error
+    assert rows["mean", "percentile"].lognormal < rows["mean", "bootstrap-t"].lognormal
+    assert rows["mean", "bootstrap-t"].normal > 0.92 - error
+    assert rows["ratio of IQRs", "percentile of the logarithm"].normal > 0.97
+
+
+def test_against_rliable():
+    """IQM and probability of improvement are those of the library of their inventors."""
+    metrics = pytest.importorskip("rliable.metrics", exc_type=ImportError)
+    scores = np.stack([X, 2 * X], axis=1)  # runs x tasks
+    assert stats.iqm(scores.ravel()) == pytest.approx(metrics.aggregate_iqm(scores))
+    other = np.stack([Y, Y], axis=1)
+    ours = stats.probability_of_improvement([(X, Y), (2 * X, Y)], resamples=10).estimate
+    assert ours == pytest.approx(metrics.probability_of_improvement(scores, other))
