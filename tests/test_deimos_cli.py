@@ -186,7 +186,10 @@ def test_other_commands_refuse(here, capfd, arguments):
         ("--worlds many", "--worlds: .*'many'"),
         ("--seed -1", r"seed must be in \[0, .*, got -1"),
         ("--contexts -1", "contexts must be at least 0, got -1"),
-        ("--contexts 5 --worlds 3", "contexts judges the fear network of the run as it was trained and excludes worlds"),
+        (
+            "--contexts 5 --worlds 3",
+            "contexts judges the fear network .* excludes worlds",
+        ),
     ],
 )
 def test_evaluation_refuses(copied, capfd, arguments, message):

@@ -32,9 +32,7 @@ PRESETS = {
         "env_steps": 9600,
         # Rewards hold the time step already. A larger deviation at the start clips nearly all of them to 0.
         "ppo": PPOConfig(hidden=(256, 128, 64), activation="elu", init_std=0.6, reward_scale=1.0),
-        "eval": EvalConfig(
-            worlds=256, steps=1000, adversary_steps=1500, adversary_patience=2, adversary_enough="any"
-        ),
+        "eval": EvalConfig(worlds=256, steps=1000, adversary_steps=1500, adversary_patience=2, adversary_enough="any"),
     },
     # The thesis's (4.2): 3000 iterations of 24 steps on Legged Gym's sizes.
     "quad-thesis": {
@@ -42,8 +40,6 @@ PRESETS = {
         "num_envs": 4096,
         "env_steps": 72_000,
         "ppo": PPOConfig(hidden=(512, 256, 128), activation="elu", reward_scale=1.0),
-        "eval": EvalConfig(
-            worlds=4096, steps=2000, adversary_steps=1500, adversary_patience=2, adversary_enough="any"
-        ),
+        "eval": EvalConfig(worlds=4096, steps=2000, adversary_steps=1500, adversary_patience=2, adversary_enough="any"),
     },
 }
