@@ -17,7 +17,7 @@ from deimos.run_folder import RunError
 class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
-    what: tyro.conf.Positional[Literal["particle", "terrain"]]
+    what: tyro.conf.Positional[Literal["particle", "quad", "terrain"]]
     """What to measure."""
     json: Path | None = None
     """Write all numbers to this file too."""
@@ -51,7 +51,7 @@ def run(options: BenchOptions) -> dict[str, Any]:
         "versions": provenance(), "threads": torch.get_num_threads(), "device": str(device),
     }  # fmt: skip
     with one_stream(device):
-        results |= _particle(options.rounds, device)
+        results |= (_quad if options.what == "quad" else _particle)(options.rounds, device)
     if options.json is not None:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
     return results
@@ -78,4 +78,13 @@ def _particle(rounds: int, device: torch.device) -> dict[str, Any]:
     results["machine"] = training.machine(device)
     for name, value in results["machine"].items():
         Console().print(f"{name}: {value:.3g}", highlight=False)
+    return results
+
+
+def _quad(rounds: int, device: torch.device) -> dict[str, Any]:
+    """The step of Quad beside the bare simulator."""
+    from deimos.bench import quad
+
+    results: dict[str, Any] = {"env": quad.measure_env(device, rounds)}
+    quad.print_env(results["env"])
     return results
