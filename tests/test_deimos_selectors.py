@@ -14,10 +14,11 @@ from deimos import envs, plugins, selectors
 from deimos.checks import SimulationError
 from deimos.fear import FearConfig
 from deimos.fear_selector import fear_selector
-from deimos.goal_loop import spaces
+from deimos.goal_loop import GoalLoop, spaces
 from deimos.interactions import Interactions
 from deimos.methods import METHODS, method
 from deimos.ppo import PPOConfig
+from deimos.rollout import Rollout
 from deimos.selector import Spaces
 from deimos.selectors import boltzmann, cl, director, grid, learnability, mix, plr, rnd, schedule, uniform, vds
 from deimos.training import TrainConfig, Trainer
@@ -29,8 +30,8 @@ ALL = {name: plugins.load(selectors, name).Config() for name in plugins.names(se
 # Settings under which a few worlds of an environment crash often within a few steps; one that is not listed is
 # taken as it is.
 SMALL_ENVS = {"particle": {"goal_period": 4, "max_speed": 200.0, "max_force": 100.0, "time_limit": 40}}
-# What the names of environments on a rigid-body engine begin with. Each would build its robot for every selector,
-# so they are left out; to let one in, narrow this down and give it cheap settings above.
+# What the names of environments on a rigid-body engine begin with. Each would build its robot for every selector, so
+# these have a test of their own, which builds one for all.
 RIGID_BODY = ("quad",)
 # What makes a selector choose within two rollouts of 128 worlds.
 SMALL_FIELDS = {"candidates": 20, "capacity": 64, "min_interactions": 50, "fear": FearConfig(min_per_class=8)}
@@ -425,3 +426,29 @@ def test_the_thesis_has_twelve_methods():
     assert [method(name).percentile for name in twelve[2:7]] == [10, 25, 50, 75, 90]
     assert method("vds").role == "replace"
     assert method("vds+p75") == schedule.Config(first="vds", second="p75", at=0.5)
+
+
+@pytest.fixture(scope="module", params=[name for name in plugins.names(envs) if name.startswith(RIGID_BODY)])
+def robots(request):
+    """A few robots of every environment on a rigid-body engine, built once for all selectors: that takes seconds."""
+    return plugins.load(envs, request.param).Config(goal_period=4, episode_steps=40).build(12, CPU, 0)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_it_chooses_goals_for_robots(robots, name):
+    """Every selector, CL with its groups included, issues goals within range to robots and learns from what follows."""
+    selector = small(ALL[name]).build(spaces(robots, total_steps=96), 0)
+    loop = GoalLoop(robots, selector)
+    loop.start()
+    rollout = Rollout(robots, 12)
+    for t in range(rollout.num_steps):
+        rollout.obs[t] = robots.obs
+        step = robots.step(torch.zeros(robots.num_envs, robots.action_dim))
+        rollout.record(t, step, loop.learn)
+        loop.advance(step)
+    rollout.obs[-1] = robots.obs
+    row = selector.learn(loop.interactions, rollout)
+    assert all(isinstance(value, float) for value in row.values())
+    assert loop.interactions.active.any()
+    limit = robots.sample_goals(torch.arange(robots.num_envs), 1000).abs().amax((0, 1)) * 1.05
+    assert (robots.goal.abs() <= limit).all()
