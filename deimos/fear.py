@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Resolved
-from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
+from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, weights_of
 from deimos.ranks import mean_over_ranks
 from deimos.seeds import generator, weights_from
 
@@ -133,7 +133,7 @@ class Fear:
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
         return {
-            "network": self.network.state_dict(),
+            "network": weights_of(self.network),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "fitted": self.fitted,

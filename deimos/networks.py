@@ -58,6 +58,14 @@ def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]
     return flat, slices
 
 
+def weights_of(net: nn.Module) -> dict[str, Tensor]:
+    """A copy of a network's ``state_dict``: later lessons leave it alone, and a file of it holds nothing else.
+
+    Parameters that ``flatten_parameters`` has laid out are views, and a view is saved with all that it is a view of.
+    """
+    return {name: value.detach().clone() for name, value in net.state_dict().items()}
+
+
 def _aligned(count: int) -> int:
     """``count`` rounded up to 64 bytes of float32: products of unaligned weights are slower."""
     return -(-count // 16) * 16

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from deimos.env import Env, ObsField
-from deimos.networks import Activation, Actor
+from deimos.networks import Activation, Actor, weights_of
 from deimos.run_folder import RunError, load_tensors, save_tensors
 
 SCHEMA = 1
@@ -56,7 +56,7 @@ def save_policy(path: Path, actor: Actor, hidden: Sequence[int], activation: Act
     """Write a policy that needs nothing else to run."""
     save_tensors(path, {
         "schema": SCHEMA,
-        "actor": actor.state_dict(),
+        "actor": weights_of(actor),
         "hidden": list(hidden),
         "activation": activation,
         "layout": [asdict(field) for field in env.layout],

@@ -15,7 +15,7 @@ from torch import Tensor
 from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.env import Env
-from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
+from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache, weights_of
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 from deimos.seeds import generator, weights_from
@@ -394,8 +394,8 @@ class PPO:
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
         return {
-            "actor": self.actor.state_dict(),
-            "critic": self.critic.state_dict(),
+            "actor": weights_of(self.actor),
+            "critic": weights_of(self.critic),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
         }

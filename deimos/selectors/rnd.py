@@ -10,7 +10,7 @@ from deimos import picks
 from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.interactions import Interactions
-from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, operations
+from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, operations, weights_of
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 from deimos.seeds import generator, weights_from
@@ -166,8 +166,8 @@ class RND(GoalSelector):
     def state_dict(self) -> dict:
         """See ``GoalSelector.state_dict``."""
         return {
-            "predictor": self.predictor.state_dict(),
-            "target": self.target.state_dict(),
+            "predictor": weights_of(self.predictor),
+            "target": weights_of(self.target),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "uniform": self._uniform.clone(),
