@@ -29,7 +29,7 @@ PRESETS = {
     "quad": {
         "env": Config(),
         "num_envs": 1024,
-        "env_steps": 9600,
+        "env_steps": 6400,
         # Rewards hold the time step already. A larger deviation at the start clips nearly all of them to 0.
         "ppo": PPOConfig(hidden=(256, 128, 64), activation="elu", init_std=0.6, reward_scale=1.0),
         "eval": EvalConfig(worlds=256, steps=1000, adversary_steps=1500, adversary_patience=2, adversary_enough="any"),
