@@ -67,6 +67,7 @@ def print_evaluation(rows: list[dict]) -> None:
         ("reward per transition", "reward", ".4f"),
         ("crashes", "crashes", "d"),
         ("crashes per 1000 transitions", "crashes_per_1000", ".3f"),
+        ("crashes per robot-minute", "crashes_per_minute", ".3f"),
         ("crashes per interaction", "crash_rate", ".4f"),
         ("interactions", "interactions", "d"),
         ("crashes under first goals", "first_goal_crashes", "d"),
@@ -74,7 +75,12 @@ def print_evaluation(rows: list[dict]) -> None:
         ("Adversary's interactions", "adversary_interactions", "d"),
         ("crashes among them", "adversary_crashes", "d"),
     ):
-        table.add_row(label, *[_cell(row.get(name), form) for row in rows])
+        cells = [_cell(row.get(name), form) for row in rows]
+        if set(cells) != {"-"}:
+            table.add_row(label, *cells)
+    groups = len(rows[0]["tracking"])
+    for i in range(groups if groups > 1 else 0):  # a single one is the reward
+        table.add_row(f"tracking of goal group {i}", *[_cell(row["tracking"][i], ".3f") for row in rows])
     Console().print(table)
     if any(row.get("weak_adversary") for row in rows):
         Console().print("weak adversary: it has seen too few crashes, or ranks goals too badly, to prove much")
