@@ -66,6 +66,7 @@ def play(options: PlayOptions) -> Path:
     Raises:
         RunError: If there is nothing to render, or it cannot be written.
     """
+    _import_mujoco()
     folder = RunFolder.open(options.run)
     config = read_config(folder)
     policy = load_policy(folder.path)
@@ -83,13 +84,34 @@ def play(options: PlayOptions) -> Path:
     every = max(1, round(1.0 / (options.fps * env.dt)))
     target = options.video or options.frames
     assert target is not None
-    with _writer(options, 1.0 / (every * env.dt)) as write, _camera(env, options) as picture:
+    with _camera(env, options) as picture, _writer(options, 1.0 / (every * env.dt)) as write:
         for t in range(round(options.seconds / env.dt)):
             if t % every == 0:
                 write(_captioned(picture(), _caption(env, afraid, t)))
             loop.advance(env.step(policy.scaled(env.obs)))
     env.check()
     return target
+
+
+def _import_mujoco() -> None:
+    """Import MuJoCo, which decides then how it will render.
+
+    Raises:
+        RunError: If it cannot render in the way that MUJOCO_GL asks for.
+    """
+    if sys.platform.startswith("linux"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import mujoco  # noqa: F401
+    except Exception as error:  # each of its back ends has its own
+        raise _unrenderable(error) from error
+
+
+def _unrenderable(error: Exception) -> RunError:
+    return RunError(
+        f"Nothing can be rendered with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({error}); "
+        "install libegl1 or libosmesa6 and set MUJOCO_GL=egl or osmesa."
+    )
 
 
 def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | None:
@@ -118,8 +140,6 @@ def _caption(env: Env, afraid: FearSelector | None, t: int) -> str:
 @contextmanager
 def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]]:
     """A camera that follows the robot of world 0."""
-    if sys.platform.startswith("linux"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
     import mujoco
 
     scene = env.scene(0)
@@ -128,10 +148,8 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
     model.vis.global_.offwidth, model.vis.global_.offheight = options.width, options.height
     try:
         renderer = mujoco.Renderer(model, options.height, options.width)
-    except Exception as error:  # each of MuJoCo's back ends has its own
-        raise RunError(
-            f"Nothing can be rendered here ({error}); install libegl1 or libosmesa6 and set MUJOCO_GL=egl or osmesa."
-        ) from error
+    except Exception as error:
+        raise _unrenderable(error) from error
     camera = mujoco.MjvCamera()
     camera.distance, camera.azimuth, camera.elevation = 1.8, 130.0, -18.0
 
