@@ -239,8 +239,9 @@ def vertex(samples: dict[str, Array], resamples: int = stats.RESAMPLES) -> tuple
     x = np.array([ACHIEVED[name] for name in samples])
 
     def place(c: Array) -> Array:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.clip(np.nan_to_num(50.0 - 50.0 * c[..., 1] / (2 * c[..., 0]), nan=50.0), -1000.0, 1000.0)
+        # A straight line has no vertex: it is put into the middle, and the curvature of 0 that is given beside says so.
+        offset = np.divide(c[..., 1], 2 * c[..., 0], out=np.zeros_like(c[..., 1]), where=c[..., 0] != 0)
+        return np.clip(50.0 - 50.0 * offset, -1000.0, 1000.0)
 
     values = _parabola(*stats.resample(list(samples.values()), resamples, 0), x=x)
     places = place(values)
