@@ -212,6 +212,10 @@ class ManyCandidates:
         rest = sum(2 * layer.weight.numel() for layer in self._others)
         return contexts * (shared + count * (own + rest))
 
+    def contexts_at_once(self, count: int) -> int:
+        """Contexts, each with ``count`` candidates, whose activations fit the workspace; at least 1."""
+        return max(1, self._rows // count)
+
     @torch.no_grad()
     def __call__(self, context: Tensor, candidates: Tensor) -> Tensor:
         """The network's output for every candidate, shape (B, N, outputs).
@@ -223,7 +227,7 @@ class ManyCandidates:
         count = candidates.shape[1]
         of_candidate = self._of_candidate.expand(len(candidates), -1, -1)
         of_context = torch.addmm(self._first.bias, context, self._of_context).unsqueeze(1)
-        size = max(1, self._rows // count)
+        size = self.contexts_at_once(count)
         outputs = []
         for known, part in zip(of_context.split(size), candidates.split(size), strict=True):
             x = torch.baddbmm(known, part, of_candidate[: len(part)]).flatten(0, 1)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from deimos import picks
 from deimos.adam import Adam
-from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
+from deimos.checks import SimulationError, check_at_least, check_choice, check_positive
 from deimos.interactions import Interactions
 from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, operations, weights_of
 from deimos.ranks import mean_over_ranks
@@ -27,10 +27,10 @@ class Config(SelectorConfig):
     """Take the most surprising candidate, or draw in proportion to the surprise."""
     candidates: int = 100
     """N: uniform candidates per decision, at least 1."""
-    target: tuple[int, ...] = (32,)
-    """Hidden layers of the frozen network."""
-    predictor: tuple[int, ...] = (32, 32)
-    """Hidden layers of the trained network, which should not be weaker than the frozen one."""
+    target: int = 32
+    """Units in the hidden layer of the frozen network, at least 1."""
+    predictor: int = 64
+    """Units in the hidden layer of the trained network, at least as many, so that it can become the frozen one."""
     features: int = 16
     """Outputs of both networks, at least 1."""
     activation: Activation = "relu"
@@ -45,11 +45,14 @@ class Config(SelectorConfig):
     def __post_init__(self) -> None:
         check_choice("rule", self.rule, ["argmax", "proportional"])
         check_choice("activation", self.activation, ["relu", "elu", "tanh"])
-        check_hidden("target", self.target)
-        check_hidden("predictor", self.predictor)
         check_positive("learning_rate", self.learning_rate, finite=True)
-        for name in ("candidates", "features", "epochs", "minibatches"):
+        for name in ("candidates", "target", "features", "epochs", "minibatches"):
             check_at_least(name, getattr(self, name), 1)
+        if self.predictor < self.target:
+            raise ValueError(
+                f"predictor must have at least the target's {self.target} units, or it can never learn what the target "
+                f"says, got {self.predictor}."
+            )
 
     def build(self, spaces: Spaces, seed: int) -> "RND":
         """See ``SelectorConfig.build``."""
@@ -64,16 +67,19 @@ class RND(GoalSelector):
         self.num_candidates = config.candidates
         inputs = spaces.state_dim + 2 * spaces.goal_dim
         with weights_from(seed, "rnd weights"):
-            self.target = mlp(inputs, config.target, config.features, config.activation)
-            self.predictor = mlp(inputs, config.predictor, config.features, config.activation)
+            self.target = mlp(inputs, (config.target,), config.features, config.activation)
+            self.predictor = mlp(inputs, (config.predictor,), config.features, config.activation)
             for layer in (*self.target, *self.predictor):
                 if isinstance(layer, nn.Linear):
                     nn.init.orthogonal_(layer.weight, 2**0.5)
         self.target.to(spaces.device)
         self.predictor.to(spaces.device)
         self._parameters, _ = flatten_parameters(self.predictor)
-        self._of_target = ManyCandidates(self.target, spaces.goal_dim)
-        self._of_predictor = ManyCandidates(self.predictor, spaces.goal_dim)
+        # The difference of two networks of one hidden layer is one such network, at half of the calls.
+        units = (config.target + config.predictor,)
+        self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
+        self._join()
+        self._error = ManyCandidates(self._difference, spaces.goal_dim)
         self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=spaces.device))
         self.generator = generator(seed, "rnd minibatches", spaces.device)
@@ -101,9 +107,24 @@ class RND(GoalSelector):
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
         context = self._whiten(torch.cat([state, goal], dim=1), self._context)
-        whitened = self._whiten(candidates, self._goal)
-        error = self._of_predictor(context, whitened).sub_(self._of_target(context, whitened))
-        return error.square_().mean(2)
+        scores = []
+        # Features of all candidates together would not fit a cache; fresh memory for them costs more than the products.
+        size = self._error.contexts_at_once(candidates.shape[1])
+        for known, part in zip(context.split(size), candidates.split(size), strict=True):
+            scores.append(self._error(known, self._whiten(part, self._goal)).square_().mean(2))
+        return scores[0] if len(scores) == 1 else torch.cat(scores)
+
+    @torch.no_grad()
+    def _join(self) -> None:
+        """Make the network of the difference from the two; call it whenever one of them has changed."""
+        (first, last), (t_first, t_last), (p_first, p_last) = (
+            [layer for layer in net if isinstance(layer, nn.Linear)]
+            for net in (self._difference, self.target, self.predictor)
+        )
+        torch.cat([t_first.weight, p_first.weight], out=first.weight.data)
+        torch.cat([t_first.bias, p_first.bias], out=first.bias.data)
+        torch.cat([-t_last.weight, p_last.weight], dim=1, out=last.weight.data)
+        torch.sub(p_last.bias, t_last.bias, out=last.bias.data)
 
     def _whiten(self, inputs: Tensor, part: slice) -> Tensor:
         return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-CLIP, CLIP)
@@ -151,11 +172,12 @@ class RND(GoalSelector):
                 mean_over_ranks(self._parameters.grad)
                 self.optimizer.step()
                 total += error.square().sum()
+        self._join()
         return (total / (len(inputs) * self.config.features)).item()
 
     def operations(self, decisions: float, transitions: int) -> float:
         """See ``GoalSelector.operations``."""
-        score = sum(net.operations(decisions, self.num_candidates) for net in (self._of_predictor, self._of_target))
+        score = self._error.operations(decisions, self.num_candidates)
         return score + decisions * (operations(self.target) + 3 * operations(self.predictor)) * self.config.epochs
 
     def check(self) -> None:
@@ -187,3 +209,4 @@ class RND(GoalSelector):
         for name in ("uniform", "moments", "mean", "scale"):
             getattr(self, f"_{name}").copy_(state[name])
         self._learnt_at, self.fitted = state["learnt_at"], state["fitted"]
+        self._join()
