@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from deimos.presets import preset as training_preset
 from deimos.run_folder import RunError
 from deimos.study import plan
 from deimos.study.presets import LEGGED_METHODS, PARTICLE_METHODS, PRESETS
@@ -86,6 +87,28 @@ def test_presets_are_the_thesis():
     assert (len(PARTICLE_METHODS), len(LEGGED_METHODS)) == (10, 12)
     for name in ("quad", "quad_arm"):
         assert (PRESETS[name]["seeds"], PRESETS[name]["environment"][0]["goal_periods"]) == (30, [100, 500])
+
+
+def test_environment_takes_a_training_preset(tmp_path):
+    """An environment may name a preset of the training; what the study says itself comes before it."""
+    (cell,) = plan.expand(PRESETS["quad"], seeds=[2], methods=["p25"])
+    base = training_preset("quad-thesis")
+    assert cell.config == dataclasses.replace(base, method="p25", seed=2, threads=1)
+    toml = """
+[[environment]]
+name = "hills"
+preset = "quad"
+env = { terrain = "rough" }
+methods = ["vds"]
+train = { num_envs = 8, ppo = { epochs = 2 } }
+"""
+    (cell,) = plan.expand(described(tmp_path, toml), seeds=[0])
+    base = training_preset("quad")
+    assert cell.config.env == dataclasses.replace(base.env, terrain="rough")
+    assert cell.config.ppo == dataclasses.replace(base.ppo, epochs=2)
+    assert (cell.config.num_envs, cell.config.eval) == (8, base.eval)
+    with pytest.raises(RunError, match=r"Environment 'hills': There is no preset 'quat'; there are: .*quad"):
+        plan.expand(described(tmp_path, toml.replace('"quad"', '"quat"')))
 
 
 def test_digest_is_a_function_of_all_that_matters():

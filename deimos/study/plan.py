@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from deimos import presets
 from deimos.config import from_dict, to_dict
 from deimos.env import EnvConfig
 from deimos.methods import method
@@ -18,7 +19,7 @@ from deimos.training import TrainConfig
 
 SCHEMA = 1  # of cell.json
 _KEYS = {"about", "preset", "seeds", "methods", "train", "environment"}
-_ENVIRONMENT_KEYS = {"name", "env", "methods", "train", "goal_periods"}
+_ENVIRONMENT_KEYS = {"name", "preset", "env", "methods", "train", "goal_periods"}
 _GRID = {"env", "method", "selector", "seed", "evaluation"}  # of TrainConfig: the grid's, not the settings'
 
 
@@ -103,7 +104,8 @@ def read(path: Path) -> dict:
 
     Its keys: ``seeds`` (a number of seeds, or a list of them), ``methods`` (names), ``train`` (fields of
     ``TrainConfig`` for all cells), and an ``[[environment]]`` for each environment or variant, with ``name``,
-    ``env`` (its ``kind`` and fields) and, if they differ there, ``methods``, ``train`` and ``goal_periods``.
+    ``env`` (its ``kind`` and fields) and, if they differ there, ``methods``, ``train`` and ``goal_periods``; its
+    ``preset`` is one of ``deimos.presets``, where its environment and settings come from that are not said.
     ``preset`` names a ready-made study, where everything comes from that is not said.
 
     Raises:
@@ -168,16 +170,19 @@ def _environment(
     if taken := sorted((set(shared) | set(own)) & _GRID):
         raise RunError(f"{', '.join(taken)} cannot stand in 'train': the grid of the study says it.")
     try:
-        env = from_dict(EnvConfig, table.get("env", {}))
+        ready = to_dict(presets.preset(table["preset"])) if "preset" in table else {"env": {}}
+        env = from_dict(EnvConfig, _merged(ready["env"], table.get("env", {})))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error
+    settings = {key: value for key, value in ready.items() if key not in _GRID | {"threads", "device"}}
     methods = list(chosen if chosen is not None else table.get("methods", default) or [])
     if not methods:
         raise RunError(f"Environment '{name}' has no methods.")
     for each in methods:
         method(each)
     _check_unique("method", methods)
-    return name, _merged(_merged(shared, own), last) | {"env": to_dict(env)}, methods, table.get("goal_periods")
+    fields = _merged(_merged(_merged(settings, shared), own), last) | {"env": to_dict(env)}
+    return name, fields, methods, table.get("goal_periods")
 
 
 def _cell(environment: tuple[str, dict, list[str], list[int] | None], method_name: str, seed: int) -> Cell:

@@ -12,9 +12,8 @@ def _particle(variant: str, env_steps: int = 2000, **more: Any) -> dict:
     return {"name": variant, "env": env, "train": {"env_steps": env_steps}, **more}
 
 
-def _legged(kind: str) -> dict:
-    train = {"num_envs": 4096, "env_steps": 3000 * 24, "eval": {"worlds": 4096, "steps": 2000}}
-    return {"name": kind, "env": {"kind": kind}, "train": train, "goal_periods": [100, 500]}  # 2 s and 10 s
+def _legged(name: str, preset: str) -> dict:
+    return {"name": name, "preset": preset, "goal_periods": [100, 500]}  # 2 s and 10 s
 
 
 _ABSOLUTE, _RELATIVE, _DIRECTIONAL = _particle("absolute", 5000), _particle("relative"), _particle("directional")
@@ -30,11 +29,11 @@ PRESETS: dict[str, dict] = {
     },
     "quad": {
         "about": "Figures 4.8, 4.9 and A.1; for a cluster", "seeds": 30, "methods": list(LEGGED_METHODS),
-        "environment": [_legged("quad")],
+        "environment": [_legged("quad", "quad-thesis")],
     },
     "quad_arm": {
         "about": "Figures 4.10, 4.11 and A.2; for a cluster", "seeds": 30, "methods": list(LEGGED_METHODS),
-        "environment": [_legged("quad_arm")],
+        "environment": [_legged("quad_arm", "quad-arm-thesis")],
     },
     "population": {
         "about": "The populations of docs/particle.md", "seeds": 5, "methods": ["uniform"],
