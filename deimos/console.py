@@ -78,6 +78,8 @@ def print_evaluation(rows: list[dict]) -> None:
         cells = [_cell(row.get(name), form) for row in rows]
         if set(cells) != {"-"}:
             table.add_row(label, *cells)
+    for name in rows[0].get("errors", {}):
+        table.add_row(f"median error, {name}", *[_cell(row["errors"][name], ".3f") for row in rows])
     groups = len(rows[0]["tracking"])
     for i in range(groups if groups > 1 else 0):  # a single one is the reward
         table.add_row(f"tracking of goal group {i}", *[_cell(row["tracking"][i], ".3f") for row in rows])

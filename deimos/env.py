@@ -6,8 +6,9 @@ resets a world and never changes a goal: ``deimos.goal_loop`` does both, between
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import torch
@@ -102,6 +103,9 @@ class Env(abc.ABC):
     """Whether the run goes on where a world becomes invalid; else ``check`` stops it."""
     goal_groups: tuple[slice, ...] = (slice(None),)
     """Components of a goal that are met or missed together."""
+    errors: Mapping[str, Tensor] = MappingProxyType({})
+    """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
+    shape (num_envs,). Empty where ``Step.tracking`` says enough."""
     episode_step: Tensor
     """Steps since the last reset, int32, shape (num_envs,); a view."""
     tensors: dict[str, Tensor]

@@ -101,7 +101,8 @@ def evaluate(
         between the policy that does nothing (0) and the environment's reference policy (1), both
         under the Naive goals; and for the Adversary the size of its collection and its AUROC on
         worlds that it did not learn from. ``tracking`` has the mean of every group of goal
-        components, ``strata`` the same and more by kind of world, where there are kinds.
+        components, ``strata`` the same and more by kind of world, where there are kinds, and ``errors``
+        the median of each of ``Env.errors`` over all goals that were survived, at the end of their period.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -168,12 +169,15 @@ def play(
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)
     strata = env.strata()
+    errors: dict[str, list[Tensor]] = {name: [] for name in env.errors}
     for t in range(steps):
         step = env.step(policy(env.obs))
         first = ~loop.interactions.active
         reward += step.reward
         tracking += step.reward.unsqueeze(1) if step.tracking is None else step.tracking
         crashes += step.terminated
+        for name, values in errors.items():
+            values.append(env.errors[name][step.goal_due & ~step.terminated])
         first_goal_steps += first
         first_goal_crashes += first & step.terminated
         loop.advance(step)
@@ -198,6 +202,7 @@ def play(
         "tracking": (tracking.mean(0) / steps).tolist(),
         "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
         "strata": _by_stratum(strata, crashes, tracking / steps, done),
+        "errors": {name: torch.cat(values).median().item() for name, values in errors.items()},
     }
 
 

@@ -91,6 +91,22 @@ def test_play_counts_what_a_plain_loop_counts():
     assert found["return_per_step"] == pytest.approx(sum(gain for *_, gain in in_time) / len(in_time), rel=1e-5)
 
 
+def test_errors_are_read_at_the_end_of_goals():
+    """What an environment calls an error is read where a goal has been in force for T steps, and not elsewhere."""
+    env = particle.Config(goal_period=7).for_evaluation().build(5, torch.device("cpu"), 0)
+    env.errors = {"clock [steps]": env.tensors["goal_clock"]}
+    row = play(env, lambda obs: torch.zeros(5, 3), uniform.Config().build(spaces(env), 0), 30)
+    assert row["errors"] == {"clock [steps]": 7}
+
+
+def test_errors_of_nobody_are_nan():
+    """Where no goal is survived there is no error to report."""
+    env = particle.Config(goal_period=7).for_evaluation().build(5, torch.device("cpu"), 0)
+    env.errors = {"clock [steps]": env.tensors["goal_clock"].float()}
+    row = play(env, lambda obs: torch.zeros(5, 3), uniform.Config().build(spaces(env), 0), 6)
+    assert math.isnan(row["errors"]["clock [steps]"])
+
+
 def test_the_adversary_finds_what_crashes_a_policy():
     """Against a follower with a blind side it learns to rank goals and crashes it more often than Naive does."""
     config = particle.Config()
