@@ -14,7 +14,8 @@ Where the numbers come from:
 
 from typing import TYPE_CHECKING
 
-from deimos.robots import COLLISION_GROUP, CONTACT_STIFFNESS, ROBOT_BIT, TERRAIN_BIT, VISUAL_GROUP, Robot
+from deimos.robots import ROBOT_BIT, TERRAIN_BIT, Robot
+from deimos.robots.primitives import add_actuator, add_hard_geom, add_inertia, add_look
 
 if TYPE_CHECKING:
     import mujoco
@@ -65,17 +66,15 @@ def build(*, stiffness: float = STIFFNESS, damping: float = DAMPING, action_scal
     spec.compiler.degree = False
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, 0.325))
     trunk.add_freejoint(name="base")
-    _add_inertia(trunk, TRUNK, 1, 1)
+    _add_mirrored(trunk, TRUNK, 1, 1)
     _add_trunk_geoms(trunk)
     for leg in LEGS:
         _add_leg(trunk, leg)
     for leg in LEGS:
         for joint in JOINTS:
-            actuator = spec.add_actuator(name=f"{leg}_{joint}", target=f"{leg}_{joint}")
-            actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
-            actuator.set_to_position(kp=stiffness, kv=damping)
-            actuator.forcerange = (-MAX_TORQUE[joint], MAX_TORQUE[joint])
-            actuator.forcelimited = True
+            add_actuator(
+                spec, f"{leg}_{joint}", stiffness=stiffness, damping=damping, max_torque=MAX_TORQUE[joint]
+            )  # fmt: skip
     return Robot(
         spec=spec,
         pose=tuple((_left(leg) if joint == "hip" else 1) * POSE[joint] for leg in LEGS for joint in JOINTS),
@@ -99,13 +98,11 @@ def _front(leg: str) -> int:
     return 1 if leg[0] == "F" else -1
 
 
-def _add_inertia(body: "mujoco.MjsBody", numbers: tuple, front: int, right: int) -> None:
+def _add_mirrored(body: "mujoco.MjsBody", numbers: tuple, front: int, right: int) -> None:
     """Set mass, centre and inertia, mirrored to the rear (front = -1) and to the left (right = -1)."""
     mass, (x, y, z), (xx, yy, zz, xy, xz, yz) = numbers
-    body.mass = mass
-    body.ipos = (front * x, right * y, z)
-    body.fullinertia = (xx, yy, zz, front * right * xy, front * xz, right * yz)
-    body.explicitinertial = True
+    inertia = (xx, yy, zz, front * right * xy, front * xz, right * yz)
+    add_inertia(body, mass, (front * x, right * y, z), inertia)
 
 
 def _add_leg(trunk: "mujoco.MjsBody", leg: str) -> None:
@@ -120,7 +117,7 @@ def _add_leg(trunk: "mujoco.MjsBody", leg: str) -> None:
         (calf, "calf", (0, 1, 0), CALF, (1, 1)),
     ):
         body.add_joint(name=f"{leg}_{joint}", axis=axis, range=RANGE[joint], limited=True, armature=ARMATURE[joint])
-        _add_inertia(body, numbers, *turned)
+        _add_mirrored(body, numbers, *turned)
     _collide(thigh, f"{leg}_thigh", 0.015, (-0.02, 0, -0.02), (-0.01, 0, -0.19))
     _collide(calf, f"{leg}_calf", 0.012, (0.01, 0, -0.03), (0.004, 0, -0.17))
     _collide(calf, f"{leg}_foot", FOOT_RADIUS, (0, 0, -LINK))
@@ -133,71 +130,30 @@ def _add_trunk_geoms(trunk: "mujoco.MjsBody") -> None:
         _collide(trunk, name, 0.05, (-0.08, y, 0.0), (0.08, y, 0.0))
     _collide(trunk, "head", 0.06, (0.24, 0.0, 0.0))
 
-    _show(trunk, "box", (0.185, 0.05, 0.05), (0.0, 0.0, 0.0), LIGHT)
-    _show(trunk, "box", (0.13, 0.08, 0.035), (0.0, 0.0, 0.005), DARK)
-    _show(trunk, "box", (0.15, 0.035, 0.012), (-0.01, 0.0, 0.055), DARK)
-    _show(trunk, "box", (0.045, 0.04, 0.035), (0.225, 0.0, 0.015), LIGHT)
-    _show(trunk, "ellipsoid", (0.035, 0.048, 0.042), (0.262, 0.0, 0.012), DARK)
-    _show(trunk, "ellipsoid", (0.006, 0.03, 0.008), (0.295, 0.0, 0.014), BLUE)
+    add_look(trunk, "box", (0.185, 0.05, 0.05), (0.0, 0.0, 0.0), LIGHT)
+    add_look(trunk, "box", (0.13, 0.08, 0.035), (0.0, 0.0, 0.005), DARK)
+    add_look(trunk, "box", (0.15, 0.035, 0.012), (-0.01, 0.0, 0.055), DARK)
+    add_look(trunk, "box", (0.045, 0.04, 0.035), (0.225, 0.0, 0.015), LIGHT)
+    add_look(trunk, "ellipsoid", (0.035, 0.048, 0.042), (0.262, 0.0, 0.012), DARK)
+    add_look(trunk, "ellipsoid", (0.006, 0.03, 0.008), (0.295, 0.0, 0.014), BLUE)
 
 
 def _add_leg_look(hip: "mujoco.MjsBody", thigh: "mujoco.MjsBody", calf: "mujoco.MjsBody", left: int) -> None:
     """Add what a leg looks like: two motor discs, a tapering thigh, a thin calf and a rubber foot."""
-    _show(hip, "cylinder", (0.046, 0.03, 0.0), (0.0, 0.0, 0.0), DARK, quat=(0.70711, 0.0, 0.70711, 0.0))
-    _show(hip, "cylinder", (0.046, 0.02, 0.0), (0.0, left * 0.035, 0.0), LIGHT, quat=(0.70711, 0.70711, 0.0, 0.0))
-    _show(thigh, "cylinder", (0.045, 0.022, 0.0), (0.0, -left * 0.005, 0.0), DARK, quat=(0.70711, 0.70711, 0.0, 0.0))
-    _show(thigh, "capsule", (0.026,), (-0.012, 0, -0.02), LIGHT, end=(-0.018, 0, -0.10))
-    _show(thigh, "capsule", (0.018,), (-0.018, 0, -0.10), LIGHT, end=(0.0, 0, -LINK))
-    _show(thigh, "cylinder", (0.022, 0.018, 0.0), (0.0, 0.0, -LINK), DARK, quat=(0.70711, 0.70711, 0.0, 0.0))
-    _show(calf, "capsule", (0.013,), (0.0, 0, 0.0), DARK, end=(0.012, 0, -0.10))
-    _show(calf, "capsule", (0.011,), (0.012, 0, -0.10), DARK, end=(0.0, 0, -LINK))
-    _show(calf, "sphere", (FOOT_RADIUS,), (0.0, 0.0, -LINK), (0.05, 0.05, 0.05, 1.0))
+    add_look(hip, "cylinder", (0.046, 0.03, 0.0), (0.0, 0.0, 0.0), DARK, quat=(0.70711, 0.0, 0.70711, 0.0))
+    add_look(hip, "cylinder", (0.046, 0.02, 0.0), (0.0, left * 0.035, 0.0), LIGHT, quat=(0.70711, 0.70711, 0.0, 0.0))
+    add_look(thigh, "cylinder", (0.045, 0.022, 0.0), (0.0, -left * 0.005, 0.0), DARK, quat=(0.70711, 0.70711, 0.0, 0.0))
+    add_look(thigh, "capsule", (0.026,), (-0.012, 0, -0.02), LIGHT, end=(-0.018, 0, -0.10))
+    add_look(thigh, "capsule", (0.018,), (-0.018, 0, -0.10), LIGHT, end=(0.0, 0, -LINK))
+    add_look(thigh, "cylinder", (0.022, 0.018, 0.0), (0.0, 0.0, -LINK), DARK, quat=(0.70711, 0.70711, 0.0, 0.0))
+    add_look(calf, "capsule", (0.013,), (0.0, 0, 0.0), DARK, end=(0.012, 0, -0.10))
+    add_look(calf, "capsule", (0.011,), (0.012, 0, -0.10), DARK, end=(0.0, 0, -LINK))
+    add_look(calf, "sphere", (FOOT_RADIUS,), (0.0, 0.0, -LINK), (0.05, 0.05, 0.05, 1.0))
 
 
-def _collide(
-    body: "mujoco.MjsBody", name: str, radius: float, start: tuple, end: tuple | None = None
-) -> None:  # fmt: skip
+def _collide(body: "mujoco.MjsBody", name: str, radius: float, start: tuple, end: tuple | None = None) -> None:
     """Add a sphere, or a capsule from ``start`` to ``end``, that touches the terrain but not the robot itself."""
-    import mujoco
-
-    is_foot = name.endswith("foot")
-    geom = body.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_SPHERE if end is None else mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=(radius, 0.0, 0.0),
-        group=COLLISION_GROUP,
-        contype=ROBOT_BIT,
-        conaffinity=TERRAIN_BIT,
-        condim=3 if is_foot else 1,
-        priority=1 if is_foot else 0,  # so that the foot's own friction counts, not the larger of the two
-        friction=(1.0, 0.005, 0.0001),
-        solref=CONTACT_STIFFNESS,
-        mass=0.0,
-        rgba=(0.9, 0.3, 0.2, 0.4),
-    )
-    if end is None:
-        geom.pos = start
-    else:
-        geom.fromto = (*start, *end)
-
-
-def _show(
-    body: "mujoco.MjsBody", shape: str, size: tuple, pos: tuple, rgba: tuple,
-    *, quat: tuple = (1.0, 0.0, 0.0, 0.0), end: tuple | None = None,
-) -> None:  # fmt: skip
-    """Add a shape for the eye alone."""
-    import mujoco
-
-    geom = body.add_geom(
-        type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"),
-        size=(*size, 0.0, 0.0)[:3],
-        group=VISUAL_GROUP,
-        contype=0,
-        conaffinity=0,
-        mass=0.0,
-        rgba=rgba,
-    )
-    if end is None:
-        geom.pos, geom.quat = pos, quat
-    else:
-        geom.fromto = (*pos, *end)
+    geom = add_hard_geom(body, name, radius, start, end, contype=ROBOT_BIT, conaffinity=TERRAIN_BIT)
+    if name.endswith("foot"):
+        geom.condim = 3
+        geom.priority = 1  # so that the foot's own friction counts, not the larger of the two

@@ -1,0 +1,290 @@
+"""The ReactorX-150 on a Go1: masses, kinematics, servos, what touches what, and a trunk that is held."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from deimos.physics import Physics, PhysicsConfig
+from deimos.robots import COLLISION_GROUP, VISUAL_GROUP, go1, rx150
+from terrain import Grid, Share, build
+from terrain.shapes.stairs import Shape as Stairs
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """A Go1 with the arm."""
+    return rx150.mount(go1.build())
+
+
+@pytest.fixture(scope="module")
+def model(robot):
+    """Its compiled model."""
+    return robot.spec.compile()
+
+
+def pose_data(model, arm, base=(0, 0, 0, 1, 0, 0, 0)):
+    """The robot with its arm in a pose and its legs stretched."""
+    data = mujoco.MjData(model)
+    data.qpos[:7], data.qpos[19:] = base, arm
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def turn(axis, angle):
+    """Rotation about x, y or z."""
+    i = "xyz".index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    matrix = np.eye(3)
+    matrix[j, j] = matrix[k, k] = np.cos(angle)
+    matrix[k, j] = np.sin(angle)
+    matrix[j, k] = -matrix[k, j]
+    return matrix
+
+
+def end_effector(arm):
+    """Where the table of offsets puts the end effector, in the trunk."""
+    place, frame = np.array(rx150.MOUNT), np.eye(3)
+    for offset, axis, angle in zip(rx150.OFFSETS, rx150.AXES, arm, strict=False):
+        place = place + frame @ offset
+        frame = frame @ turn(axis, angle)
+    return place + frame @ rx150.OFFSETS[-1]
+
+
+def test_mass_and_tree(robot, model):
+    """14.515 kg in all; five joints and actuators come after the twelve of the legs, which stay as they were."""
+    # Twelve numbers are rounded to a tenth of a gram or better, the Go1's thirteen to a gram in all.
+    assert model.body_mass.sum() == pytest.approx(14.515, abs=1e-3)
+    arm = [body for body in range(model.nbody) if model.body(body).name.startswith("arm_")]
+    assert model.body_mass[arm].sum() == pytest.approx(rx150.MASS, abs=1e-3)
+    assert (model.nq, model.nv, model.nu) == (24, 23, 17)
+    joints = [f"{leg}_{joint}" for leg in go1.LEGS for joint in go1.JOINTS]
+    joints += ["waist", "shoulder", "elbow", "wrist_angle", "wrist_rotate"]
+    assert [model.joint(i).name for i in range(1, 18)] == joints
+    assert [model.actuator(i).name for i in range(17)] == joints
+    assert model.actuator_trnid[:, 0].tolist() == list(range(1, 18))
+    assert len(robot.pose) == len(robot.action_scale) == 17
+    bare = go1.build()
+    assert robot.pose[:12] == bare.pose
+    assert robot.action_scale[:12] == bare.action_scale
+
+
+def test_inertias_are_those_of_a_rigid_body_and_of_the_source(model):
+    """Every link has its table's principal inertias, which no dummy inertia swells."""
+    for name, numbers in zip(("arm_base", *rx150.BODIES), (rx150.BASE, *rx150.LINKS), strict=True):
+        mass, centre, (xx, yy, zz, xy, xz, yz) = numbers
+        body = model.body(name)
+        expected = np.sort(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        np.testing.assert_allclose(np.sort(body.inertia), expected, rtol=1e-9)
+        np.testing.assert_allclose(body.ipos, centre, atol=1e-12)
+        assert body.mass[0] == mass
+        assert 0 < expected[0] <= expected[1] <= expected[2] < expected[0] + expected[1]
+        # No link is longer than 0.25 m, so none is farther from its centre than that.
+        assert expected[2] < mass * 0.125**2, name
+    # The axis of least inertia of a slender link is that of the link; 6 degrees off in the table itself.
+    for name, (x, y, z) in (("arm_upper", rx150.OFFSETS[2]), ("arm_forearm", rx150.OFFSETS[3])):
+        data = pose_data(model, np.zeros(5))
+        body = model.body(name)
+        slender = data.ximat[body.id].reshape(3, 3)[:, np.argmin(body.inertia)]
+        assert abs(slender @ [x, y, z]) / np.hypot(np.hypot(x, y), z) > np.cos(np.radians(10)), name
+
+
+def test_joints_are_where_the_table_has_them(model):
+    """At the zero pose the end effector is (0.358575, 0, 0.25457) m from the arm's base, and axes are z, y, y, y, x."""
+    data = pose_data(model, np.zeros(5))
+    at = data.site("end_effector").xpos - data.body("arm_base").xpos
+    np.testing.assert_allclose(at, [0.358575, 0.0, 0.25457], atol=1e-12)
+    np.testing.assert_allclose(data.body("arm_base").xpos, rx150.MOUNT, atol=1e-12)
+    for name, axis in zip(rx150.JOINTS, rx150.AXES, strict=True):
+        np.testing.assert_allclose(data.joint(name).xaxis, np.eye(3)["xyz".index(axis)], atol=1e-12)
+    np.testing.assert_allclose(data.joint("shoulder").xanchor, rx150.SHOULDER, atol=1e-12)
+    degrees = [(-180, 180), (-106, 100), (-102, 95), (-100, 123), (-180, 180)]
+    np.testing.assert_allclose(model.jnt_range[13:], np.radians(degrees))
+    # The half folded pose, as published.
+    folded = pose_data(model, rx150.POSE).site("end_effector").xpos
+    np.testing.assert_allclose(folded, [0.245, 0.0, 0.247], atol=5e-4)
+
+
+def test_offsets_and_axes_give_the_end_effector(model):
+    """Chaining the table's offsets and rotations gives MuJoCo's own place of the site, wherever the base is."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        arm = rng.uniform(*model.jnt_range[13:].T)
+        base = rng.normal(size=7)
+        base[3:] /= np.linalg.norm(base[3:])
+        data = pose_data(model, arm, base)
+        expected = base[:3] + data.body("trunk").xmat.reshape(3, 3) @ end_effector(arm)
+        np.testing.assert_allclose(data.site("end_effector").xpos, expected, atol=1e-12)
+
+
+def test_reach(model):
+    """Within its joints' ranges the arm gets 0.467 m from its shoulder's axis, and no farther."""
+    rng = np.random.default_rng(0)
+    arms = rng.uniform(*model.jnt_range[13:].T, size=(5000, 5))
+    elbow = -np.arctan2(rx150.OFFSETS[2][2], rx150.OFFSETS[2][0])  # where forearm and upper arm are in line
+    arms[0] = 0.0, 0.0, elbow, 0.0, 0.0
+    distance = np.array([np.linalg.norm(end_effector(arm) - rx150.SHOULDER) for arm in arms])
+    assert model.joint("elbow").range[0] < elbow
+    assert distance.argmax() == 0
+    assert distance[0] == pytest.approx(rx150.REACH, abs=5e-4)
+    assert distance.min() < 0.05
+
+
+def test_stretched_arm_weighs_on_its_joints_as_published(model):
+    """Level and straight, gravity asks for 1.74, 0.72 and 0.19 N m of shoulder, elbow and wrist; servos have more."""
+    elbow = -np.arctan2(rx150.OFFSETS[2][2], rx150.OFFSETS[2][0])
+    data = pose_data(model, [0.0, -elbow, elbow, 0.0, 0.0])
+    torque = -data.qfrc_bias[19:22]
+    np.testing.assert_allclose(torque, [1.74, 0.72, 0.19], atol=1e-2)
+    assert np.all(torque < rx150.MAX_TORQUE[1:4])
+
+
+def test_actuators_are_limited_pd_controllers(robot, model):
+    """Torque is kp (target - angle) - kd speed, cut at what the servos give; the legs keep their own."""
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
+    limit = np.array([*[23.7, 23.7, 35.55] * 4, 4.1, 4.1, 4.1, 1.4, 1.0])
+    stiffness = np.array([*[30.0] * 12, *[15.0] * 3, *[5.0] * 2])
+    damping = np.array([*[0.8] * 12, *[0.25] * 3, 0.18, 0.24])
+    for scale in (0.02, 10.0):
+        data.qpos[7:] = robot.pose
+        data.ctrl[:] = np.array(robot.pose) + rng.normal(scale=scale, size=17)
+        data.qvel[6:] = rng.normal(scale=scale, size=17)
+        mujoco.mj_forward(model, data)
+        wanted = stiffness * (data.ctrl - data.qpos[7:]) - damping * data.qvel[6:]
+        np.testing.assert_allclose(data.actuator_force, np.clip(wanted, -limit, limit), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(data.qfrc_passive[18:], -np.array(rx150.DRAG) * data.qvel[18:], rtol=1e-9)
+    np.testing.assert_allclose(np.add(rx150.DRAG, rx150.DAMPING), [1.1, 1.1, 1.1, 0.4, 0.4])
+    np.testing.assert_allclose(np.abs(data.actuator_force[12:]), limit[12:])
+    np.testing.assert_allclose(model.dof_armature[18:], [0.02, 0.02, 0.02, 0.005, 0.005])
+    assert not model.dof_frictionloss.any()
+
+
+def test_what_touches_what(robot, model):
+    """The arm's capsules touch the guards and are watched as the base is; guards touch nothing else."""
+    sphere_or_capsule = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
+    hard = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
+    assert {int(model.geom_type[i]) for i in hard} <= sphere_or_capsule
+    assert {model.geom_group[i] for i in hard} == {COLLISION_GROUP}
+    assert {model.geom_group[i] for i in range(model.ngeom) if i not in hard} == {VISUAL_GROUP}
+    watched = [name for part in robot.parts for name in part]
+    assert sorted(model.geom(i).name for i in hard) == sorted([*watched, *rx150.GUARDS])
+    assert len(robot.parts) == 13
+    assert robot.parts[0] == (*go1.build().parts[0], "forearm", "gripper")
+    pairs = set()
+    for a in hard:
+        for b in hard:
+            if model.geom_contype[a] & model.geom_conaffinity[b] and model.geom_bodyid[a] != model.geom_bodyid[b]:
+                pairs.add(frozenset(model.geom(i).name for i in (a, b)))
+    assert pairs == {frozenset((arm, guard)) for arm in ("forearm", "gripper") for guard in rx150.GUARDS}
+
+
+def test_guards_fill_the_trunk(model):
+    """The trunk's top is nowhere more than 1.5 cm above what the arm touches."""
+    data = pose_data(model, rx150.POSE)
+    guards = [model.geom(name).id for name in ("guard_left", "guard_right")]
+    for x in np.linspace(-0.185, 0.235, 30):
+        for y in np.linspace(-0.05, 0.05, 11):
+            probe = np.array([x, y, 0.05])
+            distance = []
+            for guard in guards:
+                local = data.geom_xmat[guard].reshape(3, 3).T @ (probe - data.geom_xpos[guard])
+                radius, half = model.geom_size[guard, :2]
+                local[2] -= np.clip(local[2], -half, half)
+                distance.append(np.linalg.norm(local) - radius)
+            assert min(distance) < 0.015  # between the two it is 14 mm: hypot(40 mm, 50 mm) less the radius of 50 mm
+
+
+def test_arm_stays_out_of_the_trunk():
+    """Driven into the trunk with all its torque, the arm rests on it within 2 mm, and never gets halfway through."""
+    robot = rx150.mount(go1.build(), hold_trunk=True)
+    model = robot.spec.compile()
+    model.opt.timestep = 0.005
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    data = pose_data(model, rx150.POSE)
+    rng = np.random.default_rng(0)
+    rests, deepest = [], 0.0
+    for _ in range(60):
+        low, high = model.jnt_range[13:].T
+        data.ctrl[:12] = robot.pose[:12]
+        data.ctrl[12:] = rng.uniform(low, high)
+        data.ctrl[13:15] = rng.choice([0.5, 1.0, 1.7]), rng.choice([0.5, 1.6, -1.7])
+        for _ in range(300):
+            mujoco.mj_step(model, data)
+            deepest = min([deepest, *data.contact.dist])
+        if len(data.contact.dist) and np.abs(data.qvel[18:]).max() < 0.1:
+            rests.append(data.contact.dist.min())
+    assert len(rests) > 10
+    assert min(rests) > -2e-3
+    # The thinnest pair: a forearm of 25 mm and a guard of 50 mm pass each other at a depth of 75 mm.
+    assert deepest > -0.0375
+
+
+def test_no_geom_of_the_arm_covers_too_many_prisms(device):
+    """Pressed on stairs at 64 yaws and four pitches, forearm and gripper lose no contact with the height field."""
+    robot = rx150.mount(go1.build())
+    for geom in robot.spec.geoms:
+        if geom.name not in rx150.CAPSULES:
+            geom.contype = geom.conaffinity = 0
+    model = robot.spec.compile()
+    ground = build(
+        Grid(shapes=(Share(shape=Stairs(tile=4.0, platform=1.0)),), levels=1, columns=1, tile=4.0, border=1.0)
+    )
+    straight = pose_data(model, np.zeros(5))
+    trunk = np.zeros((64 * 4 * 2, 24), np.float32)
+    rng = np.random.default_rng(2)
+    half = ground.size[0] / 2 - 1.2
+    for world, row in enumerate(trunk):
+        geom = model.geom(("forearm", "gripper")[world % 2])
+        pitch = (0.0, 0.35, 0.8, np.pi / 2)[world // 2 % 4]
+        x, y = rng.uniform(-half, half, 2)
+        i, j = (round((value - ground.corner[0]) / ground.cell) for value in (x, y))
+        depth = rng.uniform(0.005, 0.03)
+        z = ground.heights[i, j] + geom.size[0] + geom.size[1] * np.sin(pitch) - depth
+        frame = turn("z", 2 * np.pi * (world // 8) / 64) @ turn("y", pitch)
+        # The straight arm's frames are those of the trunk, so the trunk goes where the geom's place in it asks for.
+        row[:3] = np.array([x, y, z]) - frame @ straight.geom_xpos[geom.id]
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, frame.ravel())
+        row[3:7] = quat
+    physics = Physics(robot, ground, len(trunk), torch.device(device), PhysicsConfig(substeps=1, contacts=40))
+    physics.qpos.assign(trunk)
+    physics.step()
+    lost = physics.overflow.numpy() & physics.lost_contacts
+    assert not lost.any(), np.unique(lost)
+    assert (physics.part_force.numpy()[0, :, 0] > 0).mean() > 0.9
+    wp.synchronize()
+
+
+def test_trunk_is_held(device):
+    """With the arm swinging between its limits for 2 s, a held trunk that was thrown stays where it was put."""
+    robot = rx150.mount(go1.build(), hold_trunk=True)
+    physics = Physics(robot, None, 2, torch.device(device), PhysicsConfig())
+    assert physics.qpos.shape[1] == 24
+    assert physics.qvel.shape[1] == 23
+    rng = np.random.default_rng(3)
+    start = np.zeros((2, 24), np.float32)
+    start[:, :4] = [[3.0, -2.0, robot.spawn_height, 1.0], [-40.0, 7.0, robot.spawn_height + 0.2, 1.0]]
+    start[:, 7:] = robot.pose
+    throw = np.zeros((2, 23), np.float32)
+    throw[:, :6] = rng.uniform(-0.5, 0.5, (2, 6))
+    physics.qpos.assign(start)
+    physics.qvel.assign(throw)
+    data = physics.to_mujoco(0)
+    low, high = physics.joint_range.T
+    for step in range(100):
+        if step % 20 == 0:
+            target = np.where(rng.random(17) < 0.5, low, high)
+        physics.ctrl.assign(np.tile(target, (2, 1)).astype(np.float32))
+        physics.step()
+        data.ctrl[:] = target
+        mujoco.mj_step(physics.model, data, physics.config.substeps)
+        # An episode is ten times as long: 2 mm and 0.5 degrees for it.
+        for qpos, origin in ((physics.qpos.numpy(), start), (data.qpos[None], start[:1])):
+            assert np.abs(qpos[:, :3] - origin[:, :3]).max() < 2e-3 / 10
+            assert 2 * np.linalg.norm(qpos[:, 4:7], axis=1).max() < np.radians(0.5) / 10
+        assert not physics.part_force.numpy().any(), "nothing touches the ground"
+    # The arms of both simulators have gone the same way, in spite of the huge forces that hold.
+    np.testing.assert_allclose(physics.qpos.numpy()[0, 7:], data.qpos[7:], rtol=0, atol=5e-3)
+    assert robot.spawn_height == robot.standing_height
