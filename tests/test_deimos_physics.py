@@ -1,5 +1,6 @@
 """The simulator behind its face: agreement with MuJoCo C, resets, friction, payload, contact forces."""
 
+import math
 import time
 
 import mujoco
@@ -9,11 +10,13 @@ import torch
 import warp as wp
 
 from deimos.physics import Captured, Physics, PhysicsConfig
-from deimos.robots import go1
+from deimos.robots import go1, rx150
 from terrain import Grid, Share, build
 from terrain.shapes.stairs import Shape as Stairs
 
 ROBOT = go1.build()
+ROBOTS = {"go1": ROBOT, "go1_rx150": rx150.mount(go1.build())}
+MASS = {"go1": go1.MASS, "go1_rx150": go1.MASS + rx150.MASS}  # [kg]
 
 
 @pytest.fixture(scope="module")
@@ -25,19 +28,19 @@ def stairs():
     )  # fmt: skip
 
 
-def make(n, device, terrain=None, **options):
+def make(n, device, terrain=None, robot=ROBOT, **options):
     """Worlds with robots in their default pose, high above the ground."""
     config = options.pop("config", PhysicsConfig())
-    physics = Physics(ROBOT, terrain, n, torch.device(device), config, **options)
-    place(physics, 5.0)
+    physics = Physics(robot, terrain, n, torch.device(device), config, **options)
+    place(physics, 5.0, robot=robot)
     return physics
 
 
-def place(physics, z, quat=(1, 0, 0, 0)):
+def place(physics, z, quat=(1, 0, 0, 0), robot=ROBOT):
     """Put every robot into its default pose at the origin."""
-    qpos = np.zeros((physics.num_envs, 19), np.float32)
+    qpos = np.zeros((physics.num_envs, 7 + len(robot.pose)), np.float32)
     qpos[:, 2:7] = [z, *quat]
-    qpos[:, 7:] = ROBOT.pose
+    qpos[:, 7:] = robot.pose
     physics.qpos.assign(qpos)
     physics.ctrl.assign(qpos[:, 7:])
     physics.qvel.zero_()
@@ -49,7 +52,7 @@ def reference(physics, world=0):
 
 
 def run_both(physics, targets):
-    """Step both simulators with the same targets; gives positions and velocities of both, (steps, 19 + 18) each."""
+    """Step both simulators with the same targets; gives positions and velocities of both, (steps, nq + nv) each."""
     data = reference(physics)
     ours, theirs = [], []
     for target in targets:
@@ -64,35 +67,50 @@ def run_both(physics, targets):
 
 
 def wave(steps, size, seed=0):
-    """Smooth random targets around the default pose."""
+    """Smooth random targets of the legs around the default pose."""
     rng = np.random.default_rng(seed)
     t, phase = np.arange(steps)[:, None] * 0.02, rng.uniform(0, 2 * np.pi, 12)
     return np.array(ROBOT.pose) + size * np.sin(2 * np.pi * 1.5 * t + phase)
 
 
-def test_free_flight_agrees_with_mujoco(device):
-    """Half a second of tumbling with moving legs: every angle to 1e-4, as float32 integration allows."""
-    physics = make(1, device)
-    qvel = np.random.default_rng(1).normal(size=(1, 18)).astype(np.float32)
+def swing(steps, joints, seed=0):
+    """Targets of the arm's first joints that jump between the ends of their ranges every 0.4 s, (steps, joints)."""
+    high = np.random.default_rng(seed).integers(0, 2, (-(-steps // 20), joints)).repeat(20, axis=0)[:steps]
+    return np.radians([rx150.RANGE[i][end] for row in high for i, end in enumerate(row)]).reshape(steps, joints)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_free_flight_agrees_with_mujoco(name, device):
+    """Half a second of tumbling with moving legs and an arm at its limits: every angle to 1e-4, as float32 allows."""
+    robot = ROBOTS[name]
+    physics = make(1, device, robot=robot)
+    nq, nv = physics.model.nq, physics.model.nv
+    qvel = np.random.default_rng(1).normal(size=(1, nv)).astype(np.float32)
     physics.qvel.assign(qvel)
-    ours, theirs = run_both(physics, wave(25, 0.4))
+    ours, theirs = run_both(physics, np.hstack([wave(25, 0.4), swing(25, nv - 18)]))
     # 100 substeps, each with rounding of about 1e-7 in numbers of order 5, and forces of 30 N m/rad that bind them.
-    np.testing.assert_allclose(ours[:, :19], theirs[:, :19], rtol=0, atol=1e-4)
-    np.testing.assert_allclose(ours[:, 19:], theirs[:, 19:], rtol=0, atol=2e-3)
+    np.testing.assert_allclose(ours[:, :nq], theirs[:, :nq], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(ours[:, nq:], theirs[:, nq:], rtol=0, atol=2e-3)
 
 
-def test_standing_agrees_with_mujoco(device):
-    """Set down on flat ground and swaying for a second: base to a millimetre, joints to 5 mrad."""
-    physics = make(1, device)
-    place(physics, ROBOT.standing_height)
-    ours, theirs = run_both(physics, wave(50, 0.1))
+@pytest.mark.parametrize("name", ROBOTS)
+def test_standing_agrees_with_mujoco(name, device):
+    """Set down on flat ground, swaying, an arm swinging between its limits: base to a millimetre, joints to 5 mrad."""
+    robot = ROBOTS[name]
+    physics = make(1, device, robot=robot)
+    place(physics, robot.standing_height, robot=robot)
+    nq, joints = physics.model.nq, physics.model.nu - 12
+    ours, theirs = run_both(physics, np.hstack([wave(50, 0.1), swing(50, joints, seed=1)]))
     np.testing.assert_allclose(ours[:, :3], theirs[:, :3], rtol=0, atol=1e-3)
-    np.testing.assert_allclose(ours[:, 3:19], theirs[:, 3:19], rtol=0, atol=5e-3)
+    np.testing.assert_allclose(ours[:, 3:nq], theirs[:, 3:nq], rtol=0, atol=5e-3)
     assert 0.2 < theirs[-1, 2] < 0.33
+    low, high = np.radians(rx150.RANGE[:joints]).reshape(-1, 2).T
+    at_limit = np.abs(theirs[:, 19:nq] - np.clip(theirs[:, 19:nq], low + 0.02, high - 0.02)) > 0
+    assert at_limit.any(axis=0).sum() >= min(joints, 3), "the arm must have been at its limits"
 
 
 def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
-    """Dropped askew onto stairs: the same until shortly after the first contacts, and at rest at the same height."""
+    """Dropped askew onto stairs: the same until shortly after the first contacts; later on the stairs, nothing lost."""
     physics = make(1, device, stairs)
     tilt = np.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0])
     place(physics, stairs.heights.max() + 0.45, tilt)
@@ -111,16 +129,17 @@ def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
     assert not physics.overflow.numpy()[0] & physics.lost_contacts
 
 
-def test_part_forces_carry_the_robot(device):
+@pytest.mark.parametrize("name", ROBOTS)
+def test_part_forces_carry_the_robot(name, device):
     """Standing still, the feet's normal forces add up to the weight, and no other part touches the ground."""
-    physics = make(3, device)
-    place(physics, 0.29)
+    physics = make(3, device, robot=ROBOTS[name])
+    place(physics, 0.29, robot=ROBOTS[name])
     for _ in range(150):
         physics.step()
     force = physics.part_force.numpy()
     assert force.shape == (4, 3, 13)
     # What remains of the swaying after 3 s moves the forces by less than 2 %.
-    np.testing.assert_allclose(force[:, :, 1:5].sum(axis=2), go1.MASS * 9.81, rtol=0.02)
+    np.testing.assert_allclose(force[:, :, 1:5].sum(axis=2), MASS[name] * 9.81, rtol=0.02)
     assert not force[:, :, [0, *range(5, 13)]].any()
 
 
@@ -249,6 +268,28 @@ def test_buffers_tell_their_use(device):
     small.step()
     assert np.all(small.overflow.numpy() & small.lost_contacts)
     assert small.rows.numpy().max() > 8
+
+
+def test_buffers_hold_an_arm_that_touches_everything(device, stairs):
+    """Room is made for the arm's contacts with ground and guards, and an arm that swings into both loses none."""
+    robot = ROBOTS["go1_rx150"]
+    physics = make(4, device, robot=robot)
+    # Beside the Go1's 49: five limits, two capsules on the ground and on two guards, twice each, and on a ball.
+    among_itself = 2 * 2 * 2 + 2
+    assert physics.max_rows == 49 + 5 + 2 * 2 + among_itself
+    # On a height field four fifths of what four contacts of each need: four rows for four feet, one for 13 others.
+    assert make(1, device, stairs, robot).max_rows == math.ceil(0.8 * (4 * 4 * 4 + 13 * 4 + 12 + 5 + among_itself))
+    place(physics, 0.1, (0, 1, 0, 0), robot=robot)  # on its back, upon the arm
+    touched = set()
+    for target in swing(60, 5, seed=1):
+        physics.ctrl.assign(np.tile([*ROBOT.pose, *target], (4, 1)).astype(np.float32))
+        physics.step()
+        touched |= {physics.model.geom(geom).name for pair in physics.to_mujoco(0).contact.geom for geom in pair}
+    assert {"ground", "guard_left", "guard_right", "forearm", "gripper"} <= touched
+    use = physics.buffer_use()
+    assert use["rows"] < use["max_rows"]
+    assert use["contacts"] < use["max_contacts"]
+    assert not (physics.overflow.numpy() & physics.lost_contacts).any()
 
 
 def test_to_mujoco_shows_the_state(device):
