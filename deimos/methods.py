@@ -17,7 +17,7 @@ METHODS: dict[str, SelectorConfig] = {
     "vds": vds.Config(),
     "cl": cl.Config(),
     # What its critics would ask for.
-    "vds-auxiliary": vds.Config(role="auxiliary", data="share", epochs=3),
+    "vds-auxiliary": vds.Config(role="auxiliary", data="share", epochs=2),
     "learnability": learnability.Config(),
     "learnability-top": learnability.Config(rule="percentile"),
     "band": learnability.Config(rule="band"),

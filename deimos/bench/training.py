@@ -33,11 +33,9 @@ TABLE_4_1 = {  # thesis, Table 4.1: thousands of frames per second
 
 def measure_training(
     config: TrainConfig, methods: Mapping[str, SelectorConfig], thesis: Mapping[str, int], device: torch.device,
-    rounds: int, *, beside_rsl_rl: bool = False,
+    rounds: int, *, length: int | None = None, beside_rsl_rl: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Training speed of every method on one environment, iteration by iteration in turn.
-
-    A round is as many iterations as it takes for every world to get at least one goal.
 
     Args:
         config: What to train; its method does not count.
@@ -45,10 +43,13 @@ def measure_training(
         thesis: Thousands of frames per second in the thesis, by name.
         device: Where.
         rounds: Rounds that a ratio is the median of.
+        length: Iterations of a round; ``None`` for as many as it takes for every world to get at least one goal. 1 is
+            enough where goals fall due at a different time in every world.
         beside_rsl_rl: Whether to time rsl_rl's own loop on the same environment too, if it is installed.
     """
     config = replace(config, method=None, device="cuda" if device.type == "cuda" else "cpu")
-    length = math.ceil(config.env.goal_period / config.ppo.num_steps)
+    period = math.ceil(config.env.goal_period / config.ppo.num_steps)
+    length = period if length is None else length
     trainers = {name: Trainer(replace(config, selector=selector), device) for name, selector in methods.items()}
 
     work: dict[str, Callable[[], Any]] = {name: trainer.iterate for name, trainer in trainers.items()}
@@ -56,7 +57,7 @@ def measure_training(
     if learn is not None:
         work["rsl_rl"] = lambda: learn(1)
     for trainer in trainers.values():  # let every fear network see both classes before anything is timed
-        for _ in range(4 * length):
+        for _ in range(4 * period):
             trainer.iterate()
         trainer.synchronise = True
         trainer.seconds.update(dict.fromkeys(trainer.seconds, 0.0))
