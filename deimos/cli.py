@@ -81,6 +81,7 @@ def _take_preset(arguments: list[str]) -> tuple[list[str], Any]:
     except argparse.ArgumentError as error:
         raise RunError(f"--preset needs a name; there are: {', '.join(presets.names())}.") from error
     env = next((argument.removeprefix("env:") for argument in rest if argument.startswith("env:")), None)
+    env = env and env.replace("-", "_")  # the name of its module
     name = found.preset or env or "particle"
     try:
         if env is not None and presets.environment(name) != env:
@@ -91,11 +92,14 @@ def _take_preset(arguments: list[str]) -> tuple[list[str], Any]:
 
 
 def _check_names(arguments: list[str]) -> None:
-    """Refuse an unknown ``env:NAME`` or ``selector:NAME``; tyro would list the choices of the other."""
+    """Refuse an unknown ``env:NAME`` or ``selector:NAME``; tyro would list the choices of the other.
+
+    Names are spelled with hyphens; tyro takes underscores too.
+    """
     for kind, names in (("env", plugins.names(envs)), ("selector", ["none", *plugins.names(selectors)])):
-        known = [f"{kind}:{name}" for name in names]
+        known = [f"{kind}:{name.replace('_', '-')}" for name in names]
         for argument in arguments:
-            if argument.startswith(f"{kind}:") and argument not in known:
+            if argument.startswith(f"{kind}:") and argument.replace("_", "-") not in known:
                 raise RunError(f"There is no '{argument}'; there are: {', '.join(known)}.")
 
 

@@ -4,11 +4,9 @@ The task is Legged Gym's (Rudin et al. 2021) as Gauthier's thesis uses it (4.1.2
 rise and fall with the reward.
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,9 +14,10 @@ import warp as wp
 from torch import Tensor
 
 import terrain
-from deimos.checks import SimulationError, check_at_least, check_choice, check_positive, check_range
-from deimos.env import Env, EnvConfig, ObsField, Step
-from deimos.physics import Captured, Physics, PhysicsConfig
+from deimos.checks import SimulationError
+from deimos.env import Env, ObsField, Step
+from deimos.locomotion_config import LocomotionConfig
+from deimos.physics import Captured, Physics
 from deimos.robots import Robot
 from deimos.shared import Shared, warp_device
 from kernels.goals import draw_candidates
@@ -26,13 +25,12 @@ from kernels.height_scan import scan_points
 from kernels.locomotion import apply_actions, judge_step
 from kernels.locomotion_episodes import reset_worlds, set_goals, update_levels
 from kernels.locomotion_obs import finish_obs
-from kernels.locomotion_rewards import LEG_JOINTS, RewardWeights, vec12, vecT
+from kernels.locomotion_rewards import LEG_JOINTS, vec12, vecT
 from kernels.locomotion_state import (
     BROKEN,
     COLUMNS,
     HEIGHT_SCALE,
     JOINT_SPEED_SCALE,
-    NUM_COLUMNS,
     NUM_FEET,
     RATE_SCALE,
     VELOCITY_SCALE,
@@ -63,92 +61,12 @@ NOISE = {
 }  # half widths, in the unit of each field; Legged Gym's  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class LocomotionConfig(EnvConfig):
-    """A legged robot on a terrain. Defaults are Legged Gym's but for those that say otherwise."""
-
-    terrain: str = "flat"
-    """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a saved terrain."""
-    goal_period: int = 500
-    """T: steps that a goal is in force, at least 1 and at most an episode."""
-    episode_steps: int = 1000
-    """Steps after which an episode is truncated, at least 1."""
-    levels: Literal["reward", "displacement", "frozen"] = "reward"
-    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far it got (Legged
-    Gym), or nothing."""
-    start_levels: int = 6
-    """Levels that first episodes are drawn from, at least 1."""
-    rewards: RewardWeights = field(default_factory=RewardWeights)
-    """Weights of the reward's terms."""
-    air_time_target: float = 0.3
-    """Time in the air from which on a step is rewarded [s], at least 0. Legged Gym has 0.5 s, for larger robots."""
-    friction: tuple[float, float] = (0.5, 1.25)
-    """Range of the feet's friction, drawn once per world; at least 0.05, below which contacts are ill-conditioned."""
-    payload: float = 1.0
-    """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0."""
-    push_interval: float = 15.0
-    """Time from push to push, each robot in a phase of its own [s], at least 0; 0 for none."""
-    push_speed: float = 1.0
-    """Bound of the horizontal velocity that a push sets [m/s], at least 0."""
-    noise: bool = True
-    """Whether observations are noisy."""
-    stagger: bool = True
-    """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
-    stiffness: float = 30.0
-    """Position gain of the legs' joints [N m/rad], positive."""
-    damping: float = 0.8
-    """Velocity gain of the legs' joints [N m s/rad], positive."""
-    action_scale: float = 0.25
-    """What an action of one adds to a target angle [rad], positive."""
-    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
-    """The simulator's settings."""
-
-    def __post_init__(self) -> None:
-        for name in ("goal_period", "episode_steps", "start_levels"):
-            check_at_least(name, getattr(self, name), 1)
-        if self.goal_period > self.episode_steps:
-            raise ValueError(
-                f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
-            )
-        check_choice("levels", self.levels, [rule.name.lower() for rule in LevelRule])
-        for name in ("stiffness", "damping", "action_scale"):
-            check_positive(name, getattr(self, name), finite=True)
-        for name in ("air_time_target", "payload", "push_interval", "push_speed"):
-            check_range(name, getattr(self, name), 0, 1e6)
-        for weight in fields(self.rewards):
-            if not math.isfinite(getattr(self.rewards, weight.name)):
-                raise ValueError(f"rewards.{weight.name} must be finite, got {getattr(self.rewards, weight.name)}.")
-        low, high = self.friction
-        if not 0.05 <= low <= high < math.inf:
-            raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
-
-    def with_goal_period(self, goal_period: int) -> "LocomotionConfig":
-        """See ``EnvConfig.with_goal_period``."""
-        return replace(self, goal_period=goal_period)
-
-    def for_evaluation(self) -> "LocomotionConfig":
-        """See ``EnvConfig.for_evaluation``. World i stands on level (i // columns) % levels of column i % columns."""
-        return replace(
-            self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
-        )
-
-    def load_terrain(self) -> Terrain | None:
-        """The terrain; ``None`` for flat ground.
-
-        Raises:
-            ValueError: If there is none of this name, or the file is not one.
-        """
-        if self.terrain == "flat":
-            return None
-        if self.terrain == "rough":
-            return terrain.rough()
-        if not Path(self.terrain).is_file():
-            raise ValueError(f"terrain must be flat, rough or the path of a saved terrain, got '{self.terrain}'.")
-        return terrain.load(self.terrain)
-
-
 class Locomotion(Env):
     """A legged robot in many worlds; see ``LocomotionConfig``.
+
+    What the robot carries has its joints after those of the legs and may add components to the goal, fields to the
+    observation and terms to the reward: set the class's attributes and override ``_judge_carried``,
+    ``_reset_carried`` and ``_record_candidates``.
 
     Args:
         config: The task.
@@ -162,8 +80,16 @@ class Locomotion(Env):
     """
 
     config: LocomotionConfig
-    goal_groups = (slice(0, 2), slice(2, 3))
+    goal_groups: tuple[slice, ...] = (slice(0, 2), slice(2, 3))
     may_go_on_invalid = True
+    goal_unit = "m/s, m/s, rad/s"
+    """Units of the goal's components."""
+    carried_fields: tuple[ObsField, ...] = ()
+    """What the observation has between the last action and the heights."""
+    noise = NOISE
+    """Half width of the noise of every noisy field of the observation, in its unit."""
+    columns: tuple[str, ...] = COLUMNS
+    """What the reward is the sum of: those of ``kernels.locomotion``, then the terms of what is carried."""
 
     def __init__(
         self,
@@ -186,7 +112,7 @@ class Locomotion(Env):
         self.goal_period = config.goal_period
         self.time_limit = config.episode_steps
         self.points = scan_points()
-        self.layout = _layout(self.action_dim, goal_scale, len(self.points))
+        self.layout = self._make_layout(goal_scale)
         ground = config.load_terrain()
         self.terrain = ground or terrain.flat()
         self._goal_scale = wp.array(goal_scale, dtype=wp.float32, device=warp_device(device))
@@ -246,6 +172,21 @@ class Locomotion(Env):
             setattr(params, name, values[name])
         return params
 
+    def _make_layout(self, goal_scale: tuple[float, ...]) -> tuple[ObsField, ...]:
+        """Legged Gym's observation, with what is carried before the heights."""
+        joints = self.action_dim
+        return (
+            ObsField("linear_velocity", 3, "m/s", VELOCITY_SCALE),
+            ObsField("angular_velocity", 3, "rad/s", RATE_SCALE),
+            ObsField("gravity", 3, "1", 1.0),
+            ObsField("goal", len(goal_scale), self.goal_unit, goal_scale),
+            ObsField("joint_position", joints, "rad", 1.0),
+            ObsField("joint_velocity", joints, "rad/s", JOINT_SPEED_SCALE),
+            ObsField("last_action", joints, "1", 1.0),
+            *self.carried_fields,
+            ObsField("heights", len(self.points), "m", HEIGHT_SCALE),
+        )
+
     def _allocate(self, goal_dim: int) -> None:
         """Allocate every array once; nothing is allocated or rebound later."""
         n, joints, device = self.num_envs, self.action_dim, self.device
@@ -257,7 +198,9 @@ class Locomotion(Env):
         rows = {"goal": goal_dim, "action": joints, "joint_speed": joints, "air_time": NUM_FEET}
         state = zeros({name: (n, width) for name, width in rows.items()}, wp.float32)
         state |= zeros(dict.fromkeys(counters, (n,)), wp.int32) | zeros({"tracked": (n,)}, wp.vec2)
-        out = zeros({"obs": (n, self.obs_dim), "term": (n, NUM_COLUMNS), "reward": (n,), "value": (n,)}, wp.float32)
+        out = zeros(
+            {"obs": (n, self.obs_dim), "term": (n, len(self.columns)), "reward": (n,), "value": (n,)}, wp.float32
+        )
         out |= zeros({"tracking": (n, len(self.goal_groups))}, wp.float32)
         out |= zeros(dict.fromkeys(("terminated", "truncated", "goal_due", "invalid"), (n,)), wp.bool)
         out |= zeros({"count": (2,), "fault": (3,), "cause": (n,)}, wp.int32)
@@ -267,12 +210,12 @@ class Locomotion(Env):
                 setattr(struct, name, shared.array)
         self.obs = out["obs"].tensor
         self.term = out["term"].tensor
-        """What the last reward is the sum of, shape (num_envs, len(COLUMNS)); see ``COLUMNS``."""
+        """What the last reward is the sum of, shape (num_envs, len(columns))."""
         self._out = {name: shared.tensor for name, shared in out.items()}
         self.tensors = {name: shared.tensor for name, shared in state.items()} | {"obs": self.obs}
         self.episode_step = self.tensors["episode_step"]
         self._step = Step(**{name: self._out[name] for name in Step.__dataclass_fields__})
-        self._sums = torch.zeros(NUM_COLUMNS, dtype=torch.float64, device=device)
+        self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=device)
         self._steps_reported = self._steps_checked = self.invalid_steps = 0
         self.action = Shared.zeros((n, joints), wp.float32, device)
         self._mask = Shared.zeros(n, wp.bool, device)
@@ -280,7 +223,7 @@ class Locomotion(Env):
         self._new_goal = Shared.zeros((n, goal_dim), wp.float32, device)
         self._draw = Shared.zeros(n, wp.vec4, device)
         self._candidate_scale = Shared.zeros(goal_dim, wp.float32, device)
-        self._candidates: dict[int, tuple[Shared, wp.Launch]] = {}
+        self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
 
     def _wire(self) -> None:
         """Join the simulator's arrays and the robot's numbers to the kernels."""
@@ -296,7 +239,7 @@ class Locomotion(Env):
             setattr(self._sim, key, getattr(physics, key))
         self._points = wp.array(self.points, dtype=wp.vec2, device=name)
         noise = [
-            NOISE.get(entry.name, 0.0) * scale
+            self.noise.get(entry.name, 0.0) * scale
             for entry in self.layout
             for scale in np.broadcast_to(entry.scale, entry.size)
         ]
@@ -319,6 +262,7 @@ class Locomotion(Env):
         params, state, out, sim = self._params, self.state_arrays, self.step_arrays, self._sim
         apply_actions(params, self._joints, self.action.array, state, sim, out.fault)
         self.physics.step()
+        self._judge_carried()
         judge_step(params, self._joints, self.action.array, self._goal_scale, sim, state, out)
         self._run_scan(out.invalid, wanted=False)
 
@@ -340,7 +284,22 @@ class Locomotion(Env):
             params, self._joints, self._ground, mask, self._goal_range.array, self._goal_scale, state, sim.qpos,
             sim.qvel, out.obs,
         )  # fmt: skip
+        self._reset_carried()
         self._run_scan(mask, wanted=True)
+
+    def _judge_carried(self) -> None:
+        """Launch what judges the robot's burden, before the whole step is judged."""
+
+    def _reset_carried(self) -> None:
+        """Launch what else the worlds of ``_mask`` need to begin an episode."""
+
+    def _record_candidates(self, candidates: wp.array) -> list[wp.Launch]:
+        """The launches that draw valid goals, uniform within ``_candidate_scale``, for the worlds of ``_row``."""
+        launch = draw_candidates(
+            self._row.array, self.state_arrays.goal_count, self._candidate_scale.array, candidates,
+            seed=self._seed, world_offset=self._offset, record=True,
+        )  # fmt: skip
+        return [launch]
 
     def _reset_all(self) -> None:
         """Begin every world's first episode; what recording has done before is undone."""
@@ -375,16 +334,13 @@ class Locomotion(Env):
         """See ``Env.sample_goals``."""
         if count not in self._candidates:
             candidates = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device)
-            launch = draw_candidates(
-                self._row.array, self.state_arrays.goal_count, self._candidate_scale.array, candidates.array,
-                seed=self._seed, world_offset=self._offset, record=True,
-            )  # fmt: skip
-            self._candidates[count] = candidates, launch
-        candidates, launch = self._candidates[count]
+            self._candidates[count] = candidates, self._record_candidates(candidates.array)
+        candidates, launches = self._candidates[count]
         self._set_rows(rows)
         torch.mul(self._seen_range, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
-        launch.set_dim((len(rows), count))
-        launch.launch()
+        for launch in launches:
+            launch.set_dim((len(rows), count))
+            launch.launch()
         return candidates.tensor[: len(rows)]
 
     def draw(self, rows: Tensor) -> Tensor:
@@ -441,7 +397,7 @@ class Locomotion(Env):
         self._sums.zero_()
         use = self.physics.buffer_use()
         return {
-            **{f"reward/{name}": value for name, value in zip(COLUMNS, means, strict=True)},
+            **{f"reward/{name}": value for name, value in zip(self.columns, means, strict=True)},
             "level": self.tensors["level"].float().mean().item(),
             "invalid_steps": self.invalid_steps,
             "contact_use": use["contacts"] / use["max_contacts"],
@@ -471,17 +427,3 @@ class Locomotion(Env):
 
     def _set_rows(self, rows: Tensor) -> None:
         self._row.tensor[: len(rows)] = rows
-
-
-def _layout(num_joints: int, goal_scale: tuple[float, ...], num_heights: int) -> tuple[ObsField, ...]:
-    """Legged Gym's observation."""
-    return (
-        ObsField("linear_velocity", 3, "m/s", VELOCITY_SCALE),
-        ObsField("angular_velocity", 3, "rad/s", RATE_SCALE),
-        ObsField("gravity", 3, "1", 1.0),
-        ObsField("goal", len(goal_scale), "m/s, m/s, rad/s", goal_scale),
-        ObsField("joint_position", num_joints, "rad", 1.0),
-        ObsField("joint_velocity", num_joints, "rad/s", JOINT_SPEED_SCALE),
-        ObsField("last_action", num_joints, "1", 1.0),
-        ObsField("heights", num_heights, "m", HEIGHT_SCALE),
-    )

@@ -1,7 +1,8 @@
 """Ready configurations: what an environment is trained with unless somebody says otherwise.
 
 A module of ``deimos.envs`` may hold ``PRESETS``: by name, the fields of ``TrainConfig`` that differ from its
-defaults. The one with the environment's own name is what ``env:NAME`` starts from.
+defaults. The one with the environment's own name is what ``env:NAME`` starts from. As on the command line,
+hyphens and underscores in a name are the same.
 """
 
 from typing import Any
@@ -15,8 +16,8 @@ def _all() -> dict[str, tuple[str, dict[str, Any]]]:
     found: dict[str, tuple[str, dict[str, Any]]] = {}
     for env in plugins.names(envs):
         module = plugins.load(envs, env)
-        own = {env: {"env": module.Config()}} | getattr(module, "PRESETS", {})
-        found |= {name: (env, fields) for name, fields in own.items()}
+        own = {_spelled(env): {"env": module.Config()}} | getattr(module, "PRESETS", {})
+        found |= {_spelled(name): (env, fields) for name, fields in own.items()}
     return found
 
 
@@ -45,6 +46,10 @@ def preset(name: str) -> TrainConfig:
 
 def _get(name: str) -> tuple[str, dict[str, Any]]:
     found = _all()
-    if name not in found:
+    if _spelled(name) not in found:
         raise ValueError(f"There is no preset '{name}'; there are: {', '.join(sorted(found))}.")
-    return found[name]
+    return found[_spelled(name)]
+
+
+def _spelled(name: str) -> str:
+    return name.replace("_", "-")

@@ -226,6 +226,8 @@ def write_reward(m: LegMotion, params: LocomotionParams, env: int, out: Locomoti
     for k in range(wp.static(len(TERMS))):
         out.term[env, k] = terms[k]
         total += terms[k]
+    for k in range(wp.static(NUM_COLUMNS), out.term.shape[1]):  # those of what is carried, written before
+        total += out.term[env, k]
     reward = wp.max(total, 0.0)
     out.term[env, wp.static(len(TERMS))] = reward - total
     out.reward[env] = reward
@@ -266,7 +268,7 @@ def _judge_step(
         if broken:
             # The last sound observation stays: what follows a broken state must not reach a learner.
             out.reward[env] = 0.0
-            for k in range(wp.static(NUM_COLUMNS)):
+            for k in range(out.term.shape[1]):
                 out.term[env, k] = 0.0
             for k in range(out.tracking.shape[1]):
                 out.tracking[env, k] = 0.0
@@ -316,8 +318,9 @@ def judge_step(
         goal_scale: What the policy sees goals multiplied by, float32, shape (goal_dim,).
         sim: The simulator after its substeps.
         state: The worlds. Updated.
-        out: What the step gives back. Written, but for ``count`` (added to: zero it before) and
-            ``fault`` (added to; start it at 0, num_envs, num_envs).
+        out: What the step gives back. Written, but for ``count`` (added to: zero it before), ``fault`` (added to; start
+            it at 0, num_envs, num_envs) and what is carried: terms from column ``NUM_COLUMNS`` on count in the
+            reward as they are, unless the world is invalid, and ``tracking`` beyond linear and yaw stays.
 
     Raises:
         ValueError: If an array has another shape, dtype or device.
@@ -372,7 +375,8 @@ def _require_step(out: LocomotionStep, action: wp.array) -> None:
     n = action.shape[0]
     for name, shape, dtype in (
         ("obs", (n, out.obs.shape[1]), wp.float32), ("reward", (n,), wp.float32),
-        ("tracking", (n, out.tracking.shape[1]), wp.float32), ("term", (n, NUM_COLUMNS), wp.float32),
+        ("tracking", (n, out.tracking.shape[1]), wp.float32),
+        ("term", (n, max(NUM_COLUMNS, out.term.shape[1])), wp.float32),
         ("count", (2,), wp.int32), ("fault", (3,), wp.int32), ("cause", (n,), wp.int32), ("value", (n,), wp.float32),
         *((flag, (n,), wp.bool) for flag in ("terminated", "truncated", "goal_due", "invalid")),
     ):  # fmt: skip

@@ -5,6 +5,7 @@ import warp as wp
 from kernels.check import require, require_axes
 from kernels.height_scan import sample_height
 from kernels.locomotion_obs import write_goal, write_proprioception
+from kernels.locomotion_rewards import LEG_JOINTS
 from kernels.locomotion_state import (
     NUM_FEET,
     Ground,
@@ -19,6 +20,7 @@ from kernels.rotations import from_yaw
 wp.set_module_options({"enable_backward": False})
 
 PROMOTED, DEMOTED = 0.8, 0.5  # mean linear tracking that lifts and that lowers a world's level
+CARRIED_SPREAD = 0.2  # [rad] about the pose that joints of what is carried start in; more, and an arm may hit the trunk
 SPAWN_SAMPLES = 5  # heights along each side of the square below the base
 BLOCK_PLACE, BLOCK_SPEED, BLOCK_CLOCK, BLOCK_JOINTS = 0, 1, 3, 4  # of the draws of a reset
 
@@ -105,7 +107,10 @@ def place_robot(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
 ):
-    """Draw where and how a robot starts, as Legged Gym does: joints at 0.5 to 1.5 of their pose, within their range."""
+    """Draw where and how a robot starts, within its joints' ranges.
+
+    As in Legged Gym the legs' joints are at 0.5 to 1.5 of their pose; those of what is carried are near theirs.
+    """
     world = params.world_offset + env
     purpose = wp.static(int(Purpose.RESET))
     u = uniform4(params.seed, purpose, world, episode, 0, wp.static(BLOCK_PLACE))
@@ -127,7 +132,10 @@ def place_robot(
         v = uniform4(params.seed, purpose, world, episode, 0, wp.static(BLOCK_JOINTS) + block)
         for lane in range(wp.min(4, num_joints - 4 * block)):
             j = 4 * block + lane
-            qpos[env, 7 + j] = wp.clamp(joints.pose[j] * (0.5 + v[lane]), joints.low[j], joints.high[j])
+            angle = joints.pose[j] * (0.5 + v[lane])
+            if j >= wp.static(LEG_JOINTS):
+                angle = joints.pose[j] + (2.0 * v[lane] - 1.0) * wp.static(CARRIED_SPREAD)
+            qpos[env, 7 + j] = wp.clamp(angle, joints.low[j], joints.high[j])
             qvel[env, 6 + j] = 0.0
 
 

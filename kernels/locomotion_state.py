@@ -125,7 +125,7 @@ class LocomotionStep:
     obs: wp.array2d[float]  # (num_envs, obs_dim)
     reward: wp.array[float]  # at least 0, against the goal that was in force
     tracking: wp.array2d[float]  # (num_envs, groups of the goal): in [0, 1]; linear and yaw come first
-    term: wp.array2d[float]  # (num_envs, NUM_COLUMNS): what the reward is the sum of
+    term: wp.array2d[float]  # (num_envs, NUM_COLUMNS and those of what is carried): what the reward is the sum of
     terminated: wp.array[wp.bool]  # crashed
     truncated: wp.array[wp.bool]  # cut off without a crash: time limit, off the terrain, or invalid
     goal_due: wp.array[wp.bool]  # the goal has been in force for its whole period, and the state is valid

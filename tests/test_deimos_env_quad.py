@@ -1,4 +1,4 @@
-"""Quad: what an environment promises, shown on the Go1, and the task of the thesis."""
+"""Quad: what an environment promises, shown on the Go1 without and with its arm, and the task of the thesis."""
 
 import math
 from dataclasses import replace
@@ -11,6 +11,7 @@ import warp as wp
 import terrain
 from deimos.checks import SimulationError
 from deimos.env import Step
+from deimos.envs import quad_arm
 from deimos.envs.quad import Config
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.physics import PhysicsConfig
@@ -24,6 +25,10 @@ from terrain.shapes.stairs import Shape as Stairs
 
 U = 2.0**-24
 POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)
+TASKS = {"quad": Config, "quad-arm": quad_arm.Config}
+
+both = pytest.mark.parametrize("task", TASKS)
+"""Whatever the robot carries, it keeps what an environment promises."""
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +41,10 @@ def hills(tmp_path_factory):
     return str(path)
 
 
-def build(device, num_envs=6, seed=0, env_offset=0, **config):
+def build(device, num_envs=6, seed=0, env_offset=0, task="quad", **config):
     """An environment with short goals and episodes unless told otherwise."""
-    return Config(**({"goal_period": 5, "episode_steps": 40} | config)).build(num_envs, device, seed, env_offset)
+    config = TASKS[task](**({"goal_period": 5, "episode_steps": 40} | config))
+    return config.build(num_envs, device, seed, env_offset)
 
 
 def build_loop(env, candidates=3):
@@ -46,9 +52,10 @@ def build_loop(env, candidates=3):
     return GoalLoop(env, uniform.Config(candidates=candidates).build(spaces(env), seed=0))
 
 
-def actions(num_envs, device, seed=0, scale=0.6):
+def actions(num_envs, device, seed=0, scale=0.6, task="quad"):
     """Constant actions, other for every world: some robots fall early, some late."""
-    a = np.random.default_rng(seed).normal(scale=scale, size=(num_envs, 12))
+    joints = 12 if task == "quad" else 17
+    a = np.random.default_rng(seed).normal(scale=scale, size=(num_envs, joints))
     return torch.tensor(a, dtype=torch.float32, device=device)
 
 
@@ -169,24 +176,26 @@ def test_crash_is_the_trunk_on_the_ground(torch_device):
     assert stood
 
 
-def test_warp_and_torch_see_one_allocation_and_views_stay(torch_device):
+@both
+def test_warp_and_torch_see_one_allocation_and_views_stay(task, torch_device):
     """Every tensor keeps its address over steps, goals and resets, and a step gives back the very same views."""
-    env = build(torch_device, episode_steps=6)
+    env = build(torch_device, task=task, episode_steps=6)
     loop = build_loop(env)
-    first = env.step(actions(6, torch_device))
+    first = env.step(actions(6, torch_device, task=task))
     addresses = [t.data_ptr() for t in (*env.tensors.values(), *vars(first).values())]
     for _ in range(12):
-        last = env.step(actions(6, torch_device))
+        last = env.step(actions(6, torch_device, task=task))
         loop.advance(last)
     assert last is first
     assert addresses == [t.data_ptr() for t in (*env.tensors.values(), *vars(last).values())]
     assert env.tensors["qpos"].data_ptr() == env.physics.qpos.ptr
 
 
-def test_reset_of_one_world_leaves_the_others(torch_device, hills):
+@both
+def test_reset_of_one_world_leaves_the_others(task, torch_device, hills):
     """Resetting world 0 changes world 0 and no bit of any other, now and over the steps that follow."""
-    env, twin = (build(torch_device, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
-    action = actions(6, torch_device)
+    env, twin = (build(torch_device, task=task, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
+    action = actions(6, torch_device, task=task)
     for _ in range(8):
         env.step(action)
         twin.step(action)
@@ -200,16 +209,17 @@ def test_reset_of_one_world_leaves_the_others(torch_device, hills):
         twin.step(action)
 
 
-def test_copied_worlds_are_exact_clones(torch_device):
+@both
+def test_copied_worlds_are_exact_clones(task, torch_device):
     """Clones, also into another environment, go on exactly as their originals, warm starts and payloads included."""
     config = {"noise": False, "push_interval": 0.0, "episode_steps": 300, "goal_period": 100}
-    origin, env = build(torch_device, **config), build(torch_device, seed=3, **config)
-    action = actions(6, torch_device)
+    origin, env = build(torch_device, task=task, **config), build(torch_device, task=task, seed=3, **config)
+    action = actions(6, torch_device, task=task)
     for _ in range(9):
         origin.step(action)
     source, target = rows_of(origin, 4, 1), rows_of(env, 0, 5)
     env.copy_worlds(source, target, origin)
-    everyone = actions(6, torch_device, seed=1)
+    everyone = actions(6, torch_device, task=task, seed=1)
     everyone[target] = action[source]
     for _ in range(12):
         for name, tensor in env.tensors.items():
@@ -218,12 +228,13 @@ def test_copied_worlds_are_exact_clones(torch_device):
         origin.step(action)
 
 
-def test_resume_is_exact(torch_device, hills):
+@both
+def test_resume_is_exact(task, torch_device, hills):
     """A new environment with the saved state goes on bit for bit, over goals, pushes, crashes, resets and levels."""
     config = {"terrain": hills, "push_interval": 0.2}
-    env = build(torch_device, **config)
+    env = build(torch_device, task=task, **config)
     loop = build_loop(env)
-    action = actions(6, torch_device)
+    action = actions(6, torch_device, task=task)
     for _ in range(30):
         loop.advance(env.step(action))
     saved = loop.state_dict()
@@ -232,7 +243,7 @@ def test_resume_is_exact(torch_device, hills):
         step = env.step(action)
         loop.advance(step)
         expected.append(tensors_of(env, step))
-    resumed_env = build(torch_device, **config)
+    resumed_env = build(torch_device, task=task, **config)
     resumed = build_loop(resumed_env)
     resumed.load_state_dict(saved)
     for want in expected:
@@ -242,13 +253,14 @@ def test_resume_is_exact(torch_device, hills):
     assert bool((env.tensors["episode_count"] > saved["env"]["episode_count"]).any())
 
 
-def test_two_shards_equal_the_whole(torch_device, hills):
+@both
+def test_two_shards_equal_the_whole(task, torch_device, hills):
     """Two environments of 4 worlds, the second with an offset of 4, do what one of 8 does, bit for bit."""
     config = {"terrain": hills, "push_interval": 0.2}
-    whole = build(torch_device, num_envs=8, **config)
-    shards = [build(torch_device, num_envs=4, env_offset=offset, **config) for offset in (0, 4)]
+    whole = build(torch_device, task=task, num_envs=8, **config)
+    shards = [build(torch_device, task=task, num_envs=4, env_offset=offset, **config) for offset in (0, 4)]
     loops = [build_loop(env) for env in (whole, *shards)]
-    action = actions(8, torch_device)
+    action = actions(8, torch_device, task=task)
     for _ in range(50):
         loops[0].advance(whole.step(action))
         for i, shard in enumerate(shards):
@@ -434,12 +446,13 @@ def test_walking_off_the_terrain_cuts_the_episode_off(torch_device, hills):
     assert not step.invalid.any()
 
 
+@both
 @pytest.mark.parametrize(("name", "index", "value"), [("qpos", 8, math.nan), ("qvel", 0, 1e6), ("qvel", 12, math.inf)])
-def test_a_broken_world_is_reset_and_touches_nobody(torch_device, hills, name, index, value):
+def test_a_broken_world_is_reset_and_touches_nobody(task, torch_device, hills, name, index, value):
     """NaN or a huge speed in one world: it is flagged, cut off and begins anew, and no bit of the others changes."""
-    env, twin = (build(torch_device, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
+    env, twin = (build(torch_device, task=task, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
     loops = [build_loop(e) for e in (env, twin)]
-    action = actions(6, torch_device, scale=0.2)
+    action = actions(6, torch_device, task=task, scale=0.2)
     for _ in range(4):
         for e, loop in zip((env, twin), loops, strict=True):
             loop.advance(e.step(action))

@@ -198,6 +198,27 @@ def test_columns_add_up_to_the_reward(device):
     assert np.all(out["reward"][clipped] == 0)
 
 
+def test_terms_of_what_is_carried_count_before_the_clip(device):
+    """Columns beyond the legs', written before, are kept, join the sum that is clipped, and go where a world breaks."""
+    arrays = make_world(300)
+    arrays["qvel"] *= 0.3
+    arrays["qvel"][7, 0] = np.nan
+    alone = World(arrays, device).judge(make_params())
+    world = World(arrays, device)
+    carried = np.random.default_rng(0).normal(scale=0.3, size=(300, 2)).astype(np.float32)
+    term = np.concatenate([np.full((300, NUM_COLUMNS), np.nan, np.float32), carried], axis=1)
+    world.out.term = wp.array(term, dtype=wp.float32, device=device)
+    out = world.judge(make_params())
+    carried[7] = 0
+    np.testing.assert_array_equal(out["term"][:, NUM_COLUMNS:], carried)
+    np.testing.assert_array_equal(out["term"][:, : len(TERMS)], alone["term"][:, : len(TERMS)])
+    total = out["term"][:, : len(TERMS)].astype(np.float64).sum(1) + carried.sum(1, dtype=np.float64)
+    bound = 15 * 2.0**-24 * np.abs(out["term"]).sum(1)
+    assert np.all(np.abs(out["reward"] - np.maximum(total, 0)) <= bound)
+    assert np.all(np.abs(out["term"].astype(np.float64).sum(1) - out["reward"]) <= bound)
+    assert 0 < ((out["reward"] > 0) & (alone["reward"] == 0)).sum() < 300
+
+
 def test_crash_needs_more_than_a_newton_on_the_base_in_any_substep(device):
     """1 N on the base is no crash, the next float32 is, in whichever substep; other parts never are."""
     arrays = make_world(2 * SUBSTEPS + NUM_PARTS)

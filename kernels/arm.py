@@ -1,0 +1,413 @@
+"""An arm on a legged robot: where its end effector is, what it is asked for, and how well it does.
+
+The arm's joints follow those of the legs, and the last three components of a goal are the arm's: where the end
+effector should be, relative to an origin that is ``Arm.origin`` above the ground below the robot and
+turns with the base's yaw alone. They are its distance, pitch (up positive) and yaw, each mapped linearly to [-1, 1]::
+
+    distance = 0.30 m + 0.15 m g_0        in [0.15, 0.45] m
+    pitch    = 7.5 deg + 52.5 deg g_1     in [-45, 60] deg
+    yaw      = 108 deg g_2                in [-108, 108] deg
+
+and the wanted place is distance (cos pitch cos yaw, cos pitch sin yaw, sin pitch). The numbers of a goal do not
+change while it is in force. Goals inside the robot's own body are not valid and are drawn again; the lowest are
+0.17 m above level ground, so none is inside that.
+
+The end effector comes from the joints' angles by forward kinematics, since the simulator's own lags them by a substep.
+"""
+
+import math
+
+import warp as wp
+
+from kernels.arm_rewards import ARM_TERMS, ArmMotion, reach, vecA, weighted_arm_terms
+from kernels.check import require, require_axes
+from kernels.height_scan import sample_height
+from kernels.locomotion import find_fault
+from kernels.locomotion_obs import base_quaternion, write_goal
+from kernels.locomotion_rewards import LEG_JOINTS
+from kernels.locomotion_state import NUM_COLUMNS, LocomotionParams, LocomotionState, LocomotionStep, Simulation
+from kernels.random import Purpose, uniform4
+from kernels.rotations import heading, rotate, rotate_by_heading
+
+wp.set_module_options({"enable_backward": False})
+
+SHELL_LOW = (0.15, math.radians(-45), math.radians(-108))  # distance [m], pitch and yaw [rad] of the goals
+SHELL_HIGH = (0.45, math.radians(60), math.radians(108))
+_MIDDLE = wp.constant(wp.vec3(*((low + high) / 2 for low, high in zip(SHELL_LOW, SHELL_HIGH, strict=True))))
+_HALF = wp.constant(wp.vec3(*((high - low) / 2 for low, high in zip(SHELL_LOW, SHELL_HIGH, strict=True))))
+GOAL_COMPONENT = 3  # of a goal: where the arm's begin
+GROUP = 2  # of the goal's components: the arm's
+SEEN_BOUND = 2.0  # what the policy sees of the end effector is clipped to this on either side
+FOOTPRINT = (0.38, 0.25)  # [m] along and across a Go1's trunk: what counts as below the robot
+MAX_DRAWS = 64  # of a goal; one in eight is not valid, so all of them fail once in 10^57
+FIRST_REDRAW = 2  # block of the draws of a goal that redraws begin with; six components take two
+
+
+@wp.struct
+class Arm:
+    """The arm and what it is asked for."""
+
+    offset: wp.array[wp.vec3]  # (num_joints + 1,): of every joint, and of the end effector, in the frame before it [m]
+    axis: wp.array[wp.vec3]  # (num_joints,): of every joint
+    origin: wp.vec3  # of the goals, in the frame of the base's yaw, above the ground below the robot [m]
+    body_low: wp.vec3  # corners of what goals keep out of, relative to the origin [m]
+    body_high: wp.vec3
+    weight: vecA  # of the reward's terms
+    obs_start: int  # where the end effector starts in the observation
+
+
+@wp.func
+def turn(v: wp.vec3, axis: wp.vec3, angle: float) -> wp.vec3:
+    """``v`` turned about the unit vector ``axis`` (Rodrigues's formula)."""
+    c = wp.cos(angle)
+    return c * v + wp.sin(angle) * wp.cross(axis, v) + (1.0 - c) * wp.dot(axis, v) * axis
+
+
+@wp.func
+def end_effector(arm: Arm, qpos: wp.array2d[float], env: int) -> wp.vec3:
+    """The end effector relative to the base, in the base's frame [m]."""
+    last = arm.axis.shape[0]
+    point = arm.offset[last]
+    for k in range(last):
+        j = last - 1 - k
+        point = arm.offset[j] + turn(point, arm.axis[j], qpos[env, 7 + wp.static(LEG_JOINTS) + j])
+    return point
+
+
+@wp.func
+def ground_below(params: LocomotionParams, heights: wp.array2d[float], direction: wp.vec2, x: float, y: float) -> float:
+    """Mean of the ground at 3 x 3 points below the trunk [m], so that a step does not count all at once."""
+    total = float(0.0)
+    for i in range(3):
+        for j in range(3):
+            along = wp.static(FOOTPRINT[0]) * 0.5 * float(i - 1)
+            across = wp.static(FOOTPRINT[1]) * 0.5 * float(j - 1)
+            offset = rotate_by_heading(direction, along, across)
+            total += sample_height(heights, params.cell, params.corner, x + offset[0], y + offset[1])
+    return total / 9.0
+
+
+@wp.func
+def place_of_end_effector(
+    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], qpos: wp.array2d[float], env: int
+) -> wp.vec3:
+    """The end effector relative to the goals' origin, in the frame of the base's yaw [m]."""
+    quat = base_quaternion(qpos, env)
+    direction = heading(quat)
+    offset = rotate(quat, end_effector(arm, qpos, env))
+    level = rotate_by_heading(wp.vec2(direction[0], -direction[1]), offset[0], offset[1])
+    ground = ground_below(params, heights, direction, qpos[env, 0], qpos[env, 1])
+    return wp.vec3(level[0], level[1], qpos[env, 2] - ground + offset[2]) - arm.origin
+
+
+@wp.func
+def place_of_goal(goal: wp.vec3) -> wp.vec3:
+    """Where the arm's part of a goal is, relative to the origin [m]."""
+    s = _MIDDLE + wp.cw_mul(goal, _HALF)
+    level = s[0] * wp.cos(s[1])
+    return wp.vec3(level * wp.cos(s[2]), level * wp.sin(s[2]), s[0] * wp.sin(s[1]))
+
+
+@wp.func
+def goal_of_place(place: wp.vec3) -> wp.vec3:
+    """The arm's part of the goal that is at ``place``; the inverse of ``place_of_goal``."""
+    level = wp.sqrt(place[0] * place[0] + place[1] * place[1])
+    s = wp.vec3(wp.length(place), wp.atan2(place[2], level), wp.atan2(place[1], place[0]))
+    return wp.cw_div(s - _MIDDLE, _HALF)
+
+
+@wp.func
+def is_clear(arm: Arm, goal: wp.vec3) -> wp.bool:
+    """Whether a goal is outside the robot's body."""
+    place = place_of_goal(goal)
+    for i in range(3):
+        if place[i] < arm.body_low[i] or place[i] > arm.body_high[i]:
+            return True
+    return False
+
+
+@wp.func
+def draw_again(
+    arm: Arm, seed: wp.uint32, purpose: int, world: int, count: int, index: int, scale: wp.array[float], first: wp.vec3
+) -> wp.vec3:
+    """``first`` if it is valid, else the first valid one of further draws from the same box, else the middle."""
+    goal = first
+    draws = int(1)
+    while not is_clear(arm, goal):
+        if draws == wp.static(MAX_DRAWS):
+            return wp.vec3(0.0)
+        u = uniform4(seed, purpose, world, count, index, wp.static(FIRST_REDRAW - 1) + draws)
+        for i in range(3):
+            goal[i] = (2.0 * u[i] - 1.0) * scale[wp.static(GOAL_COMPONENT) + i]
+        draws += 1
+    return goal
+
+
+@wp.func
+def goal_in_force(state: LocomotionState, env: int) -> wp.vec3:
+    """The arm's part of the goal."""
+    g = wp.static(GOAL_COMPONENT)
+    return wp.vec3(state.goal[env, g], state.goal[env, g + 1], state.goal[env, g + 2])
+
+
+@wp.func
+def write_end_effector(arm: Arm, seen: wp.vec3, env: int, obs: wp.array2d[float]):
+    """Write where the end effector is, as a goal there would be written."""
+    bound = wp.static(SEEN_BOUND)
+    for i in range(3):
+        obs[env, arm.obs_start + i] = wp.clamp(seen[i], -bound, bound)
+
+
+@wp.func
+def arm_effort(
+    params: LocomotionParams, sim: Simulation, action: wp.array2d[float], env: int, state: LocomotionState
+) -> wp.vec2:
+    """(power [W], squared change of the action), summed over the arm's joints."""
+    power = float(0.0)
+    change = float(0.0)
+    for j in range(wp.static(LEG_JOINTS), action.shape[1]):
+        power += wp.abs(sim.torque[env, j] * sim.qvel[env, 6 + j])
+        a = wp.clamp(action[env, j], -params.action_bound, params.action_bound) - state.action[env, j]
+        change += a * a
+    return wp.vec2(power, change)
+
+
+@wp.kernel
+def _judge_arms(
+    # In
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array2d[float],
+    num_threads: int,
+    action: wp.array2d[float],
+    sim: Simulation,
+    state: LocomotionState,
+    # Out
+    out: LocomotionStep,
+    error: wp.array[float],
+):
+    for env in range(wp.tid(), action.shape[0], num_threads):
+        if find_fault(params, sim, env)[0] == 0.0:
+            place = place_of_end_effector(params, arm, heights, sim.qpos, env)
+            seen = goal_of_place(place)
+            goal = goal_in_force(state, env)
+            effort = arm_effort(params, sim, action, env, state)
+            m = ArmMotion()
+            m.error = seen - goal
+            m.distance = wp.length(place - place_of_goal(goal))
+            m.power = effort[0]
+            m.action_change = effort[1]
+            m.dt = params.dt
+            terms = weighted_arm_terms(m, arm.weight)
+            for k in range(wp.static(len(ARM_TERMS))):
+                out.term[env, wp.static(NUM_COLUMNS) + k] = terms[k]
+            out.tracking[env, wp.static(GROUP)] = reach(m)
+            write_end_effector(arm, seen, env, out.obs)
+            error[env] = m.distance
+
+
+def judge_arms(
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array,
+    action: wp.array,
+    sim: Simulation,
+    state: LocomotionState,
+    out: LocomotionStep,
+    error: wp.array,
+) -> None:
+    """Judge what the arms have done: their terms, tracking and part of the observation.
+
+    To be followed by ``judge_step``, which adds the terms to the legs' and clears them in worlds that are not physical
+    any more; nothing else is written in such a world.
+
+    Args:
+        params: What all worlds share.
+        arm: The arm.
+        heights: The height grid [m], float32, shape (nx, ny).
+        action: The actions of this step, float32, shape (num_envs, num_joints).
+        sim: The simulator after its substeps.
+        state: The worlds, as they were before this step; only read.
+        out: What the step gives back. ``term`` is written from column ``NUM_COLUMNS`` on, ``tracking`` in column
+            ``GROUP``, ``obs`` at ``arm.obs_start``.
+        error: Distance of the end effector from its goal [m], float32, shape (num_envs,). Written.
+
+    Raises:
+        ValueError: If an array has another shape, dtype or device.
+    """
+    require_axes("action", action, 2)
+    require("action", action, dtype=wp.float32)
+    n, num_joints = action.shape
+    _require_arm(arm, heights, num_joints, action)
+    for name, width in (("qpos", 7 + num_joints), ("qvel", 6 + num_joints), ("torque", num_joints)):
+        require(f"sim.{name}", getattr(sim, name), dtype=wp.float32, shape=(n, width), like=action)
+    require("state.goal", state.goal, dtype=wp.float32, shape=(n, GOAL_COMPONENT + 3), like=action)
+    require("state.action", state.action, like=action)
+    require("out.obs", out.obs, dtype=wp.float32, shape=(n, max(out.obs.shape[1], arm.obs_start + 3)), like=action)
+    require("out.term", out.term, dtype=wp.float32, shape=(n, NUM_COLUMNS + len(ARM_TERMS)), like=action)
+    require("out.tracking", out.tracking, dtype=wp.float32, shape=(n, GROUP + 1), like=action)
+    require("error", error, dtype=wp.float32, shape=(n,), like=action)
+    num_threads = 1 if action.device.is_cpu else n
+    wp.launch(
+        _judge_arms,
+        dim=num_threads,
+        inputs=[params, arm, heights, num_threads, action, sim, state],
+        outputs=[out, error],
+        device=action.device,
+    )
+
+
+@wp.kernel
+def _reset_arms(
+    # In
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array2d[float],
+    mask: wp.array[wp.bool],
+    goal_range: wp.array[float],
+    goal_scale: wp.array[float],
+    qpos: wp.array2d[float],
+    # In and out
+    state: LocomotionState,
+    obs: wp.array2d[float],
+    # Out
+    error: wp.array[float],
+):
+    env = wp.tid()
+    if not mask[env]:
+        return
+    goal = draw_again(
+        arm, params.seed, wp.static(int(Purpose.FIRST_GOAL)), params.world_offset + env,
+        state.episode_count[env] - 1, 0, goal_range, goal_in_force(state, env),
+    )  # fmt: skip
+    for i in range(3):
+        state.goal[env, wp.static(GOAL_COMPONENT) + i] = goal[i]
+    write_goal(env, state.goal, goal_scale, obs)
+    place = place_of_end_effector(params, arm, heights, qpos, env)
+    write_end_effector(arm, goal_of_place(place), env, obs)
+    error[env] = wp.length(place - place_of_goal(goal))
+
+
+def reset_arms(
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array,
+    mask: wp.array,
+    goal_range: wp.array,
+    goal_scale: wp.array,
+    qpos: wp.array,
+    state: LocomotionState,
+    obs: wp.array,
+    error: wp.array,
+) -> None:
+    """Finish what ``reset_worlds`` has begun in every world of ``mask``: a valid first goal, the arm's observation.
+
+    Args:
+        params: What all worlds share.
+        arm: The arm.
+        heights: The height grid [m], float32, shape (nx, ny).
+        mask: Worlds that were reset, bool, shape (num_envs,).
+        goal_range: Half side of the box of first goals along every component, float32, shape (goal_dim,).
+        goal_scale: What the policy sees goals multiplied by, float32, shape (goal_dim,).
+        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
+        state: The worlds. Their goals are updated where ``mask`` is true.
+        obs: Observations, float32, shape (num_envs, obs_dim). Likewise.
+        error: Distance of the end effector from its goal [m], float32, shape (num_envs,). Likewise.
+
+    Raises:
+        ValueError: If an array has another shape, dtype or device.
+    """
+    require("mask", mask, dtype=wp.bool)
+    n = mask.shape[0]
+    require_axes("qpos", qpos, 2)
+    require("qpos", qpos, dtype=wp.float32, shape=(n, qpos.shape[1]), like=mask)
+    _require_arm(arm, heights, qpos.shape[1] - 7, mask)
+    require("goal_range", goal_range, dtype=wp.float32, shape=(GOAL_COMPONENT + 3,), like=mask)
+    require("goal_scale", goal_scale, like=goal_range)
+    require("state.goal", state.goal, dtype=wp.float32, shape=(n, GOAL_COMPONENT + 3), like=mask)
+    require_axes("obs", obs, 2)
+    require("obs", obs, dtype=wp.float32, shape=(n, max(obs.shape[1], arm.obs_start + 3)), like=mask)
+    require("error", error, dtype=wp.float32, shape=(n,), like=mask)
+    wp.launch(
+        _reset_arms,
+        dim=n,
+        inputs=[params, arm, heights, mask, goal_range, goal_scale, qpos],
+        outputs=[state, obs, error],
+        device=mask.device,
+    )
+
+
+@wp.kernel
+def _redraw_candidates(
+    # In
+    arm: Arm,
+    seed: wp.uint32,
+    world_offset: int,
+    row: wp.array[int],
+    goal_count: wp.array[int],
+    scale: wp.array[float],
+    # In and out
+    candidate: wp.array3d[float],
+):
+    i, k = wp.tid()
+    env = row[i]
+    g = wp.static(GOAL_COMPONENT)
+    first = wp.vec3(candidate[i, k, g], candidate[i, k, g + 1], candidate[i, k, g + 2])
+    goal = draw_again(
+        arm, seed, wp.static(int(Purpose.CANDIDATE)), world_offset + env, goal_count[env], k, scale, first
+    )  # fmt: skip
+    for c in range(3):
+        candidate[i, k, g + c] = goal[c]
+
+
+def redraw_candidates(
+    arm: Arm,
+    row: wp.array,
+    goal_count: wp.array,
+    scale: wp.array,
+    candidate: wp.array,
+    *,
+    seed: int,
+    world_offset: int,
+    record: bool = False,
+) -> wp.Launch | None:
+    """Put valid goals in the place of those of ``draw_candidates`` that are not.
+
+    The arm's part of such a candidate is drawn again from the same box until it is valid, which makes it uniform over
+    the valid goals. What comes out depends on (seed, world, the number of the goal, k) alone.
+
+    Args:
+        arm: The arm.
+        row: Worlds that need a goal, int32, shape (n,), each in [0, num_envs).
+        goal_count: Goals that each world has received so far, int32, shape (num_envs,).
+        scale: Half side of the box along every component, float32, shape (goal_dim,).
+        candidate: Candidates, float32, shape (n, count, goal_dim). Updated.
+        seed: Seed of the run, in [0, 2^32).
+        world_offset: Global number of world 0, at least 0.
+        record: Return the launch, to be replayed with ``launch()``, instead of making it.
+
+    Raises:
+        ValueError: If an array has another shape, dtype or device.
+    """
+    require("row", row, dtype=wp.int32)
+    require_axes("candidate", candidate, 3)
+    shape = (row.shape[0], candidate.shape[1], GOAL_COMPONENT + 3)
+    require("candidate", candidate, dtype=wp.float32, shape=shape, like=row)
+    require("goal_count", goal_count, dtype=wp.int32, shape=goal_count.shape, like=row)
+    require("scale", scale, dtype=wp.float32, shape=shape[2:], like=row)
+    return wp.launch(
+        _redraw_candidates,
+        dim=shape[:2],
+        inputs=[arm, wp.uint32(seed), world_offset, row, goal_count, scale],
+        outputs=[candidate],
+        device=row.device,
+        record_cmd=record,
+    )
+
+
+def _require_arm(arm: Arm, heights: wp.array, num_joints: int, like: wp.array) -> None:
+    joints = num_joints - LEG_JOINTS
+    require("arm.axis", arm.axis, dtype=wp.vec3, shape=(joints,), like=like)
+    require("arm.offset", arm.offset, dtype=wp.vec3, shape=(joints + 1,), like=like)
+    require_axes("heights", heights, 2)
+    require("heights", heights, dtype=wp.float32, shape=heights.shape, like=like)

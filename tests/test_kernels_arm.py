@@ -1,0 +1,413 @@
+"""An arm on a legged robot: kinematics, goals and their validity, judgement, resets."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy import stats
+
+from deimos.robots import rx150
+from kernels.arm import (
+    SHELL_HIGH,
+    SHELL_LOW,
+    Arm,
+    end_effector,
+    goal_of_place,
+    is_clear,
+    judge_arms,
+    place_of_goal,
+    redraw_candidates,
+    reset_arms,
+)
+from kernels.arm_rewards import ARM_TERMS, ArmWeights, vecA
+from kernels.goals import draw_candidates
+from kernels.locomotion_state import (
+    COLUMNS,
+    NUM_COLUMNS,
+    LocomotionParams,
+    LocomotionState,
+    LocomotionStep,
+    Simulation,
+)
+from kernels.random import Purpose
+
+J, G, OBS_START, OBS = 17, 6, 60, 70
+DT, CELL, CORNER = 0.02, 0.1, (-6.0, -8.0)
+GARBAGE = 7.0
+OFFSETS = np.array(rx150.OFFSETS) + np.array([rx150.MOUNT, *[(0.0, 0.0, 0.0)] * 5])
+AXES = np.array([[float(axis == each) for each in "xyz"] for axis in rx150.AXES])
+ORIGIN = np.add(rx150.SHOULDER, (0.0, 0.0, 0.325))
+BODY_LOW, BODY_HIGH = np.array([-0.3, -0.2, -9.0]), np.array([0.3, 0.2, -0.06])
+MIDDLE, HALF = (np.array(SHELL_HIGH) + SHELL_LOW) / 2, (np.array(SHELL_HIGH) - SHELL_LOW) / 2
+MOST = 64  # draws of one goal
+INTEGERS = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count", "overflow", "rows")
+
+
+@wp.kernel
+def _geometry(
+    arm: Arm,
+    qpos: wp.array2d[float],
+    goal: wp.array[wp.vec3],
+    tip: wp.array[wp.vec3],
+    place: wp.array[wp.vec3],
+    back: wp.array[wp.vec3],
+    clear: wp.array[wp.bool],
+):
+    i = wp.tid()
+    tip[i] = end_effector(arm, qpos, i)
+    place[i] = place_of_goal(goal[i])
+    back[i] = goal_of_place(place[i])
+    clear[i] = is_clear(arm, goal[i])
+
+
+def make_arm(device, low=BODY_LOW, high=BODY_HIGH):
+    """The ReactorX-150 on a Go1, with some box to keep out of."""
+    arm = Arm()
+    arm.offset = wp.array(OFFSETS, dtype=wp.vec3, device=device)
+    arm.axis = wp.array(AXES, dtype=wp.vec3, device=device)
+    arm.origin, arm.body_low, arm.body_high = wp.vec3(*ORIGIN), wp.vec3(*low), wp.vec3(*high)
+    arm.weight, arm.obs_start = vecA(*dataclasses.astuple(ArmWeights())), OBS_START
+    return arm
+
+
+def geometry(qpos, goal, device):
+    """Everything that ``_geometry`` writes."""
+    n = len(goal)
+    out = [wp.full(n, wp.vec3(np.nan), dtype=wp.vec3, device=device) for _ in range(3)]
+    out.append(wp.zeros(n, dtype=wp.bool, device=device))
+    inputs = [make_arm(device), to_array(qpos, device), wp.array(goal, dtype=wp.vec3, device=device)]
+    wp.launch(_geometry, dim=n, inputs=inputs, outputs=out, device=device)
+    return [array.numpy() for array in out]
+
+
+def to_array(value, device):
+    """A float32 array."""
+    return wp.array(np.asarray(value, np.float32), dtype=wp.float32, device=device)
+
+
+def rotation(axis, angle):
+    """The matrix of a turn about a coordinate axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[j, i], matrix[i, j] = s, -s
+    return matrix
+
+
+def tip_reference(angles):
+    """The end effector in the trunk's frame, from the base to the tip, frame by frame."""
+    position, turned = np.array(rx150.MOUNT), np.eye(3)
+    for offset, axis, angle in zip(rx150.OFFSETS, rx150.AXES, angles, strict=False):
+        position = position + turned @ offset
+        turned = turned @ rotation(axis, angle)
+    return position + turned @ rx150.OFFSETS[-1]
+
+
+def place_reference(goal):
+    """Spherical to Cartesian."""
+    distance, pitch, yaw = MIDDLE + np.asarray(goal, np.float64) * HALF
+    level = distance * math.cos(pitch)
+    return np.array([level * math.cos(yaw), level * math.sin(yaw), distance * math.sin(pitch)])
+
+
+def goal_reference(place):
+    """Cartesian to spherical."""
+    x, y, z = place
+    return (np.array([math.dist(place, (0, 0, 0)), math.atan2(z, math.hypot(x, y)), math.atan2(y, x)]) - MIDDLE) / HALF
+
+
+def clear_reference(goals):
+    """Whether goals are outside the box, shape (n,)."""
+    places = np.array([place_reference(goal) for goal in goals])
+    return ((places < BODY_LOW) | (places > BODY_HIGH)).any(axis=1)
+
+
+def heights_reference():
+    """A plane, so that what is bilinear is exact."""
+    x, y = CORNER[0] + CELL * np.arange(121), CORNER[1] + CELL * np.arange(161)
+    return 0.1 * x[:, None] - 0.05 * y[None, :] + 0.3
+
+
+def make_world(n, seed=0):
+    """A random moment of n worlds."""
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=(n, 4))
+    return {
+        "qpos": np.concatenate([
+            rng.uniform(-4, 4, (n, 2)), rng.uniform(0.2, 0.5, (n, 1)),
+            quat / np.linalg.norm(quat, axis=1, keepdims=True),
+            rng.uniform(-1.5, 1.5, (n, J)),
+        ], axis=1),
+        "qvel": rng.normal(size=(n, 6 + J)), "ctrl": rng.normal(size=(n, J)), "torque": rng.normal(size=(n, J)),
+        "part_force": np.zeros((4, n, 13)), "overflow": np.zeros(n), "rows": np.zeros(n),
+        "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": np.zeros((n, J)),
+        "air_time": np.zeros((n, 4)), "tracked": np.zeros((n, 2)), "wanted": rng.normal(size=(n, J)),
+        "foot_contact": np.zeros(n), "level": np.zeros(n), "goal_clock": np.zeros(n), "episode_step": np.zeros(n),
+        "episode_count": rng.integers(1, 5, n), "goal_count": np.zeros(n),
+    }  # fmt: skip
+
+
+class World:
+    """The same on a device, with outputs that no kernel has written yet."""
+
+    def __init__(self, arrays, device):
+        n = len(arrays["qpos"])
+        self.device, self.arm = device, make_arm(device)
+        self.params = LocomotionParams()
+        self.params.dt, self.params.action_bound, self.params.max_speed, self.params.max_rate = DT, 100.0, 20.0, 500.0
+        self.params.cell, self.params.corner, self.params.seed, self.params.world_offset = CELL, wp.vec2(*CORNER), 9, 50
+        self.sim, self.state, self.out = Simulation(), LocomotionState(), LocomotionStep()
+        for struct, names in ((self.sim, Simulation.vars), (self.state, LocomotionState.vars)):
+            for name in names:
+                dtype = wp.vec2 if name == "tracked" else wp.int32 if name in INTEGERS else wp.float32
+                setattr(struct, name, wp.array(arrays[name], dtype=dtype, device=device))
+        for name, width in (("obs", OBS), ("tracking", 3), ("term", NUM_COLUMNS + len(ARM_TERMS))):
+            setattr(self.out, name, wp.full((n, width), GARBAGE, dtype=wp.float32, device=device))
+        self.action = to_array(arrays["wanted"], device)
+        self.heights = to_array(heights_reference(), device)
+        self.error = wp.full(n, GARBAGE, dtype=wp.float32, device=device)
+
+    def judge(self):
+        """One ``judge_arms``."""
+        judge_arms(
+            self.params, self.arm, self.heights, self.action, self.sim, self.state, self.out, self.error
+        )  # fmt: skip
+        return {name: getattr(self.out, name).numpy() for name in ("obs", "tracking", "term")} | {
+            "error": self.error.numpy()
+        }
+
+    def reset(self, mask, goal_range):
+        """One ``reset_arms``."""
+        scale = to_array([2.0, 2.0, 0.25, 1.0, 1.0, 1.0], self.device)
+        reset_arms(
+            self.params, self.arm, self.heights, wp.array(mask, dtype=wp.bool, device=self.device),
+            to_array(goal_range, self.device), scale, self.sim.qpos, self.state, self.out.obs, self.error,
+        )  # fmt: skip
+
+
+def place_of(qpos):
+    """The end effector relative to the goals' origin, on the sloping plane, in float64."""
+    w, x, y, z = qpos[3:7]
+    forward = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
+    left = np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
+    tip = np.stack([forward, left, np.cross(forward, left)], axis=1) @ tip_reference(qpos[19:24])
+    flat = rotation("z", math.atan2(forward[1], forward[0])).T @ tip
+    # The mean of a plane over points around the base is its height below the base.
+    ground = 0.1 * qpos[0] - 0.05 * qpos[1] + 0.3
+    return np.add(flat, (0, 0, qpos[2] - ground)) - ORIGIN
+
+
+def test_kinematics_are_the_tables(device):
+    """The end effector is that of the chain of published offsets, and at the zero pose where the table says."""
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, size=(200, 5))
+    angles[0] = 0.0
+    qpos = np.concatenate([np.zeros((200, 19)), angles], axis=1)
+    tip = geometry(qpos, np.zeros((200, 3)), device)[0]
+    # Five turns of vectors below 0.7 m, about ten rounded operations each.
+    np.testing.assert_allclose(tip, [tip_reference(a) for a in angles], rtol=0, atol=50 * 2.0**-24)
+    np.testing.assert_allclose(tip[0] - rx150.MOUNT, (0.358575, 0.0, 0.25457), atol=1e-6)
+
+
+def test_goals_map_to_places_and_back(device):
+    """A goal's place is spherical geometry, corners of the box are those of the shell, and the way back is exact."""
+    corners = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    goals = np.concatenate([corners, np.random.default_rng(1).uniform(-1, 1, size=(500, 3))])
+    _, place, back, clear = geometry(np.zeros((len(goals), 24)), goals, device)
+    expected = np.array([place_reference(goal) for goal in goals])
+    np.testing.assert_allclose(place, expected, rtol=0, atol=10 * 2.0**-24)
+    np.testing.assert_allclose(np.linalg.norm(place[:8], axis=1), np.repeat([0.15, 0.45], 4), rtol=1e-6)
+    # Places of order 0.1 m are off by some 2^-26, an angle by that over the least level distance of 0.075 m.
+    np.testing.assert_allclose(back, goals, rtol=0, atol=2e-6)
+    assert np.array_equal(clear, clear_reference(goals))
+    assert 0.1 < 1 - clear.mean() < 0.5
+
+
+@pytest.mark.parametrize("n", [1, 130])
+def test_judgement_matches_reference(device, n):
+    """Terms, tracking, observation and error equal plain NumPy from the same state, on sloping ground."""
+    arrays = make_world(n, seed=n)
+    out = World(arrays, device).judge()
+    for i in range(n):
+        place = place_of(arrays["qpos"][i])
+        seen, goal = goal_reference(place), arrays["goal"][i, 3:]
+        distance = np.linalg.norm(place - place_reference(goal))
+        values = {
+            "reach": np.exp(-np.abs(seen - goal).sum() / 2),
+            "precision": 1 / (1 + distance / 0.05),
+            "arm_energy": np.abs(arrays["torque"][i, 12:] * arrays["qvel"][i, 18:]).sum(),
+            "arm_action_rate": ((arrays["wanted"][i, 12:] - arrays["action"][i, 12:]) ** 2).sum(),
+        }
+        terms = [DT * getattr(ArmWeights(), name) * values[name] for name in ARM_TERMS]
+        # Positions of some metres are off by 2^-22 m; angles by that over the distance from the axis.
+        slack = 1e-6 / max(0.01, math.hypot(place[0], place[1]))
+        np.testing.assert_allclose(out["term"][i, NUM_COLUMNS:], terms, rtol=1e-4 + 10 * slack, atol=1e-7)
+        np.testing.assert_allclose(out["tracking"][i, 2], values["reach"], rtol=1e-4 + 10 * slack)
+        np.testing.assert_allclose(out["obs"][i, OBS_START:63], np.clip(seen, -2, 2), rtol=0, atol=1e-4 + slack)
+        np.testing.assert_allclose(out["error"][i], distance, rtol=0, atol=2e-6)
+    assert np.all(np.delete(out["obs"], np.r_[OBS_START:63], axis=1) == GARBAGE)
+    assert np.all(out["term"][:, :NUM_COLUMNS] == GARBAGE)
+    assert np.all(out["tracking"][:, :2] == GARBAGE)
+
+
+def test_a_goal_that_is_met_earns_all(device):
+    """Where the end effector is the goal, the error is 0 and both rewards are their weights; the goal shows as seen."""
+    arrays = make_world(100, seed=5)
+    arrays["qpos"][:, 3:7] = (1, 0, 0, 0)
+    places = np.array([place_of(q) for q in arrays["qpos"]])
+    arrays["goal"][:, 3:] = [goal_reference(place) for place in places]
+    out = World(arrays, device).judge()
+    far = np.hypot(places[:, 0], places[:, 1]) > 0.05
+    assert far.sum() > 80
+    np.testing.assert_allclose(out["error"], 0, atol=2e-6)
+    np.testing.assert_allclose(out["term"][far, NUM_COLUMNS], 0.5 * DT, rtol=1e-4)
+    np.testing.assert_allclose(out["term"][:, NUM_COLUMNS + 1], ArmWeights().precision * DT, rtol=1e-4)
+    seen = np.clip(arrays["goal"][far, 3:], -2, 2)
+    np.testing.assert_allclose(out["obs"][far, OBS_START:63], seen, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "column", "value"), [("qpos", 20, np.nan), ("qvel", 8, np.inf), ("qvel", 0, 99.0)])
+def test_worlds_that_are_not_physical_are_left_alone(device, name, column, value):
+    """Nothing is written of a broken world, and no bit of its neighbours' changes."""
+    arrays = make_world(5)
+    sound = World(arrays, device).judge()
+    arrays[name][2, column] = value
+    broken = World(arrays, device).judge()
+    for key, array in broken.items():
+        assert np.all(array[2] == GARBAGE), key
+        np.testing.assert_array_equal(np.delete(array, 2, 0), np.delete(sound[key], 2, 0), err_msg=key)
+
+
+def test_torch_sees_the_error_in_place(device):
+    """The error's torch view is the memory that the kernel writes."""
+    torch = pytest.importorskip("torch")
+    world = World(make_world(4), device)
+    view = wp.to_torch(world.error)
+    assert view.data_ptr() == world.error.ptr
+    assert torch.all(view == GARBAGE)
+    world.judge()
+    np.testing.assert_array_equal(view.cpu().numpy(), world.error.numpy())
+    assert not torch.any(view == GARBAGE)
+
+
+def draw(device, n, count, scale, *, arm=None, seed=3, world_offset=20):
+    """Candidates before and after ``redraw_candidates``, each (n, count, 6)."""
+    row = wp.array(np.arange(n), dtype=wp.int32, device=device)
+    goal_count = wp.array(np.arange(n) % 4, dtype=wp.int32, device=device)
+    scale = to_array(scale, device)
+    candidate = wp.full((n, count, G), np.nan, dtype=wp.float32, device=device)
+    draw_candidates(row, goal_count, scale, candidate, seed=seed, world_offset=world_offset)
+    first = candidate.numpy().copy()
+    redraw_candidates(
+        arm or make_arm(device), row, goal_count, scale, candidate, seed=seed, world_offset=world_offset
+    )  # fmt: skip
+    return first, candidate.numpy()
+
+
+def test_redraws_match_reference(device, uniform_reference):
+    """Valid candidates stay bit for bit; others become the first valid one of further draws of their own address."""
+    scale = np.array([1.0, 0.5, 2.0, 1.0, 0.9, 0.8], np.float32)
+    first, last = draw(device, 12, 9, scale)
+    np.testing.assert_array_equal(first[..., :3], last[..., :3])
+    changed = 0
+    for i in range(12):
+        for k in range(9):
+            goal, block = first[i, k, 3:], 2
+            while not clear_reference([goal])[0]:
+                u = uniform_reference(3, Purpose.CANDIDATE, 20 + i, i % 4, k, block)[:3]
+                goal, block = np.float32(2 * u - 1) * scale[3:], block + 1
+            changed += block > 2
+            np.testing.assert_array_equal(last[i, k, 3:], goal)
+    assert changed > 5
+
+
+def test_no_goal_is_ever_invalid_and_valid_ones_are_uniform(device):
+    """Of 200 000 goals not one is in the box, and cells that are all valid get equal shares (chi-square)."""
+    goals = draw(device, 400, 500, np.ones(6))[1].reshape(-1, G)[:, 3:]
+    assert geometry(np.zeros((len(goals), 24)), goals, device)[3].all()
+    cells = 6
+    edges = np.linspace(-1, 1, cells + 1)
+    corners = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5 * cells + 1)] * 3, indexing="ij"), axis=-1)
+    clear = clear_reference(corners.reshape(-1, 3)).reshape(corners.shape[:3])
+    whole = np.array([
+        clear[tuple(slice(5 * c, 5 * c + 6) for c in cell)].all() for cell in np.ndindex(cells, cells, cells)
+    ])  # fmt: skip
+    counts = np.histogramdd(goals, bins=[edges] * 3)[0].reshape(-1)[whole]
+    assert 100 < whole.sum() < cells**3
+    # A sound generator fails this once in a million.
+    assert stats.chisquare(counts).pvalue > 1e-6
+
+
+def test_where_no_goal_is_valid_it_is_the_middle(device):
+    """After the last draw the arm's part is 0: a place before the shoulder."""
+    everywhere = np.full(3, 1e3)
+    goals = draw(device, 3, 4, np.ones(6), arm=make_arm(device, -everywhere, everywhere))[1]
+    assert np.all(goals[..., 3:] == 0)
+    assert clear_reference([np.zeros(3)])[0]
+
+
+def test_reset_matches_reference(device, uniform_reference):
+    """In masked worlds the first goal is valid, drawn again from its own address, and seen; others keep every bit."""
+    arrays = make_world(120, seed=2)
+    goal_range = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.5], np.float32)
+    mask = np.arange(120) % 3 > 0
+    world = World(arrays, device)
+    before = world.state.goal.numpy().copy()
+    world.reset(mask, goal_range)
+    goals, obs, error = world.state.goal.numpy(), world.out.obs.numpy(), world.error.numpy()
+    changed = 0
+    for i in range(120):
+        if not mask[i]:
+            np.testing.assert_array_equal(goals[i], before[i])
+            assert np.all(obs[i] == GARBAGE)
+            assert error[i] == GARBAGE
+            continue
+        goal, block = before[i, 3:], 2
+        while not clear_reference([goal])[0]:
+            u = uniform_reference(9, Purpose.FIRST_GOAL, 50 + i, arrays["episode_count"][i] - 1, 0, block)[:3]
+            goal, block = np.float32(2 * u - 1) * goal_range[3:], block + 1
+        changed += block > 2
+        np.testing.assert_array_equal(goals[i], np.append(before[i, :3], goal))
+        np.testing.assert_array_equal(obs[i, 9:15], goals[i] * np.float32([2, 2, 0.25, 1, 1, 1]))
+        place = place_of(arrays["qpos"][i])
+        np.testing.assert_allclose(error[i], np.linalg.norm(place - place_reference(goal)), rtol=0, atol=2e-6)
+    assert changed > 3
+
+
+def test_terms_have_names_of_their_own():
+    """No column of the log stands for two terms."""
+    assert not set(COLUMNS) & set(ARM_TERMS)
+
+
+@pytest.mark.parametrize(
+    ("struct", "name", "shape", "message"),
+    [
+        ("sim", "qpos", (5, 19), r"sim.qpos must be float32\(5, 24\).*got float32\(5, 19\)"),
+        ("state", "goal", (5, 3), r"state.goal must be float32\(5, 6\)"),
+        ("out", "term", (5, 12), r"out.term must be float32\(5, 16\)"),
+        ("out", "tracking", (5, 2), r"out.tracking must be float32\(5, 3\)"),
+        ("out", "obs", (5, 62), r"out.obs must be float32\(5, 63\)"),
+        ("arm", "axis", (4,), r"arm.axis must be vec3.*\(5,\)"),
+    ],
+)
+def test_judge_rejects_arrays_of_another_shape(device, struct, name, shape, message):
+    """The message names the array, what it must be and what it was."""
+    world = World(make_world(5), device)
+    dtype = wp.vec3 if struct == "arm" else wp.float32
+    setattr(getattr(world, struct), name, wp.zeros(shape, dtype=dtype, device=device))
+    with pytest.raises(ValueError, match=message):
+        world.judge()
+
+
+def test_others_reject_arrays_of_another_shape(device):
+    """Likewise the redraw and the reset."""
+    with pytest.raises(ValueError, match=r"goal_range must be float32\(6,\).*got float32\(3,\)"):
+        World(make_world(5), device).reset(np.ones(5, bool), np.ones(3))
+    ints = wp.zeros(2, dtype=wp.int32, device=device)
+    with pytest.raises(ValueError, match=r"candidate must be float32\(2, 4, 6\).*got float32\(2, 4, 3\)"):
+        redraw_candidates(
+            make_arm(device), ints, ints, to_array(np.ones(6), device), wp.zeros((2, 4, 3), device=device),
+            seed=0, world_offset=0,
+        )  # fmt: skip
