@@ -17,7 +17,7 @@ from deimos.run_folder import RunError
 class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
-    what: tyro.conf.Positional[Literal["particle", "quad", "terrain"]]
+    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain"]]
     """What to measure."""
     json: Path | None = None
     """Write all numbers to this file too."""
@@ -50,8 +50,13 @@ def run(options: BenchOptions) -> dict[str, Any]:
     results: dict[str, Any] = {
         "versions": provenance(), "threads": torch.get_num_threads(), "device": str(device),
     }  # fmt: skip
+    particle = options.what == "particle"
     with one_stream(device):
-        results |= (_quad if options.what == "quad" else _particle)(options.rounds, device)
+        results |= (
+            _particle(options.rounds, device)
+            if particle
+            else _legged(options.what.replace("-", "_"), options.rounds, device)
+        )
     if options.json is not None:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
     return results
@@ -67,12 +72,9 @@ def _particle(rounds: int, device: torch.device) -> dict[str, Any]:
     particle.print_env(results["env"], torch.get_num_threads(), str(device))
     results["training"] = {}
     for variant in ("directional", "absolute", "relative"):
-        thesis = training.TABLE_4_1[variant]
-        all_of_them = variant == "directional"
-        methods = {name: s for name, s in training.METHODS_TIMED.items() if all_of_them or name in thesis}
         config = replace(TrainConfig(), env=Config(variant=variant))
-        results["training"][variant] = training.measure_training(
-            config, methods, thesis, device, rounds, beside_rsl_rl=all_of_them
+        results["training"][variant] = training.measure_in_groups(
+            config, training.TABLE_4_1[variant], device, rounds, everything=variant == "directional"
         )
         training.print_training(f"{variant}, default sizes", results["training"][variant])
     results["machine"] = training.machine(device)
@@ -81,10 +83,12 @@ def _particle(rounds: int, device: torch.device) -> dict[str, Any]:
     return results
 
 
-def _quad(rounds: int, device: torch.device) -> dict[str, Any]:
-    """The step of Quad beside the bare simulator."""
-    from deimos.bench import quad
+def _legged(name: str, rounds: int, device: torch.device) -> dict[str, Any]:
+    """The step of a legged environment beside the bare simulator, and its column of the thesis's Table 4.1."""
+    from deimos.bench import quad, training
 
-    results: dict[str, Any] = {"env": quad.measure_env(device, rounds)}
-    quad.print_env(results["env"])
+    results: dict[str, Any] = {"env": quad.measure_env(name, device, rounds)}
+    quad.print_env(name, results["env"])
+    results["training"] = quad.measure_training(name, device, 3 * rounds)
+    training.print_training(f"{name}, flat, T = {quad.PERIOD}", results["training"])
     return results

@@ -1,29 +1,43 @@
-"""How fast Quad steps, beside the bare simulator on the same model, flat and rough."""
+"""How fast the legged environments step beside the bare simulator, and how fast they train under every selector."""
 
 import statistics
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
 from rich.table import Table
 
+from deimos.bench import training
 from deimos.bench.timing import in_turn, ratio, short, wide_console
-from deimos.envs import quad
+from deimos.locomotion import Locomotion
+from deimos.locomotion_config import LocomotionConfig
+from deimos.methods import METHODS
 from deimos.physics import Captured
+from deimos.presets import preset
+from deimos.selector import SelectorConfig
+from deimos.selectors import vds
 
 WORLDS = 512
+PERIOD = 100  # T of the training that is timed: a fifth of the presets', so that selectors choose five times as often
+METHODS_TIMED: dict[str, SelectorConfig] = {name: METHODS[name] for name in ("uniform", "p25", "rnd", "vds", "cl")} | {
+    "vds, own shares": vds.Config(data="share", epochs=3)
+}
 STEPS = 8  # control steps of a turn
 SETTLE = 50  # control steps before anything is timed: robots that have landed touch the ground with all feet
 
 
-def measure_env(device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[str, Any]:
+def measure_env(name: str, device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[str, Any]:
     """Control steps per second of ``env.step`` and of the captured substeps alone, on flat and on rough ground.
 
     Both run in the same environment in turn, so that the robots of both are in the same poses.
     """
+    config = preset(name).env
+    assert isinstance(config, LocomotionConfig)
     work: dict[str, Callable[[], Any]] = {}
     for ground in ("flat", "rough"):
-        env = quad.Config(terrain=ground).build(num_envs, device, seed=0)
+        env = replace(config, terrain=ground).build(num_envs, device, seed=0)
+        assert isinstance(env, Locomotion)
         action = torch.zeros(num_envs, env.action_dim, device=device)
         for _ in range(SETTLE):
             env.step(action)
@@ -49,9 +63,21 @@ def measure_env(device: torch.device, rounds: int, num_envs: int = WORLDS) -> di
     }
 
 
-def print_env(result: dict[str, Any]) -> None:
+def measure_training(name: str, device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[str, Any]:
+    """A legged column of Table 4.1: an environment's preset with fewer worlds and a shorter T.
+
+    The clocks of the goals are staggered, so that selectors have the same work in every iteration. A fear network
+    learns and chooses once it has seen robots that fall and robots that do not: before anything is timed with this T.
+    """
+    base = preset(name)
+    env = base.env.with_goal_period(PERIOD)
+    config = replace(base, env=env, num_envs=num_envs, evaluation=False, device="auto", threads=0)
+    return training.measure_training(config, METHODS_TIMED, training.TABLE_4_1[name], device, rounds, length=1)
+
+
+def print_env(title: str, result: dict[str, Any]) -> None:
     """Print the table of ``measure_env``."""
-    table = Table(title=f"Quad, {result['num_envs']} worlds", show_header=False, title_justify="left")
+    table = Table(title=f"{title}, {result['num_envs']} worlds", show_header=False, title_justify="left")
     for name, value in result["control steps/s"].items():
         table.add_row(f"{name}, control steps/s", short(value))
     for name, value in result.items():
