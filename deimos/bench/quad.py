@@ -63,7 +63,7 @@ def measure_env(name: str, device: torch.device, rounds: int, num_envs: int = WO
     }
 
 
-def measure_training(name: str, device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[str, Any]:
+def measure_training(name: str, device: torch.device, rounds: int, num_envs: int = WORLDS // 2) -> dict[str, Any]:
     """A legged column of Table 4.1: an environment's preset with fewer worlds and a shorter T.
 
     The clocks of the goals are staggered, so that selectors have the same work in every iteration. A fear network
@@ -72,7 +72,9 @@ def measure_training(name: str, device: torch.device, rounds: int, num_envs: int
     base = preset(name)
     env = base.env.with_goal_period(PERIOD)
     config = replace(base, env=env, num_envs=num_envs, evaluation=False, device="auto", threads=0)
-    return training.measure_training(config, METHODS_TIMED, training.TABLE_4_1[name], device, rounds, length=1)
+    return training.measure_training(
+        config, METHODS_TIMED, training.TABLE_4_1[name], device, rounds, length=1, warm_up=2
+    )
 
 
 def print_env(title: str, result: dict[str, Any]) -> None:

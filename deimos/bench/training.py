@@ -34,7 +34,7 @@ TABLE_4_1 = {  # thesis, Table 4.1: thousands of frames per second
 
 def measure_training(
     config: TrainConfig, methods: Mapping[str, SelectorConfig], thesis: Mapping[str, int], device: torch.device,
-    rounds: int, *, length: int | None = None, beside_rsl_rl: bool = False,
+    rounds: int, *, length: int | None = None, warm_up: int = 4, beside_rsl_rl: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Training speed of every method on one environment, iteration by iteration in turn.
 
@@ -46,6 +46,7 @@ def measure_training(
         rounds: Rounds that a ratio is the median of.
         length: Iterations of a round; ``None`` for as many as it takes for every world to get at least one goal. 1 is
             enough where goals fall due at a different time in every world.
+        warm_up: How often every world gets a goal before anything is timed, so that fear networks see both classes.
         beside_rsl_rl: Whether to time rsl_rl's own loop on the same environment too, if it is installed.
     """
     config = replace(config, method=None, device="cuda" if device.type == "cuda" else "cpu")
@@ -57,8 +58,8 @@ def measure_training(
     learn = _rsl_rl(config, device) if beside_rsl_rl else None
     if learn is not None:
         work["rsl_rl"] = lambda: learn(1)
-    for trainer in trainers.values():  # let every fear network see both classes before anything is timed
-        for _ in range(4 * period):
+    for trainer in trainers.values():
+        for _ in range(warm_up * period):
             trainer.iterate()
         trainer.synchronise = True
         trainer.seconds.update(dict.fromkeys(trainer.seconds, 0.0))
