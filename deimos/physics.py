@@ -43,7 +43,7 @@ class PhysicsConfig:
     """Bound of its line-search iterations, at least 1."""
     contacts: int = 0
     """Room for contacts per world, shared by all worlds; 0 takes half of what touching with every geom would need, a
-    third on a height field."""
+    quarter on a height field."""
     rows: int = 0
     """Room for constraint rows in each world; 0 takes what touching with every geom, all joints at limits, needs, four
     fifths of it on a height field."""
@@ -120,7 +120,7 @@ class Physics:
         contacts, pairs, rows = _largest_demand(model, plane=terrain is None)
         # Room costs time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's
         # 120 rows a policy's robots needed 64 at most, and robots that were thrown about by their own legs 93.
-        contact_share, row_share = (1 / 2, 1.0) if terrain is None else (1 / 3, 4 / 5)
+        contact_share, row_share = (1 / 2, 1.0) if terrain is None else (1 / 4, 4 / 5)
         # A few worlds alone may need all of the contacts at once.
         shared = num_envs * max(pairs, math.ceil(contact_share * contacts)) + min(num_envs, 16) * contacts
         self.max_contacts = config.contacts * num_envs or shared
