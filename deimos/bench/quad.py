@@ -23,7 +23,7 @@ PERIOD = 100  # T of the training that is timed: a fifth of the presets', so tha
 METHODS_TIMED: dict[str, SelectorConfig] = {name: METHODS[name] for name in ("uniform", "p25", "rnd", "vds", "cl")} | {
     "vds, own shares": vds.Config(data="share", epochs=3)
 }
-STEPS = 8  # control steps of a turn
+STEPS = 4  # control steps of a turn
 SETTLE = 50  # control steps before anything is timed: robots that have landed touch the ground with all feet
 
 
@@ -52,7 +52,7 @@ def measure_env(name: str, device: torch.device, rounds: int, num_envs: int = WO
                 bare()
 
         work |= {f"env.step, {ground}": stepped, f"bare, {ground}": simulated}
-    seconds = in_turn(work, rounds, device)
+    seconds = in_turn(work, training.OFTEN * rounds, device)  # the ratios are close to 1
     speeds = {name: num_envs * STEPS / statistics.median(values) for name, values in seconds.items()}
     return {
         "num_envs": num_envs,
