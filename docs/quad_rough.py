@@ -1,7 +1,8 @@
-"""Train the committed flat policy on rough ground and print the table of docs/quad.md.
+"""Train a committed flat policy on rough ground and print the table of docs/quad.md or docs/quad_arm.md.
 
     python docs/quad_rough.py runs/rough                 # 20 minutes of one core; go on with the same command
     python docs/quad_rough.py runs/rough --figure curve.png
+    python docs/quad_rough.py runs/rough_arm --preset quad-arm
 
 Per-world rewards and levels of every iteration go to worlds.npz in the run's folder, for intervals over worlds.
 """
@@ -19,7 +20,8 @@ from deimos import training
 from deimos.presets import preset
 from deimos.run_folder import RunError
 
-ORIGIN = Path(__file__).parent / "results" / "quad_flat"
+RESULTS = Path(__file__).parent / "results"
+ORIGINS = {"quad": RESULTS / "quad_flat", "quad-arm": RESULTS / "quad_arm_stand"}
 RESAMPLES = 10_000
 RECORDS = ("reward", "level", "invalid", "memory", "seconds")
 
@@ -112,6 +114,7 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--preset", choices=ORIGINS, default="quad")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--start-levels", type=int, default=1)
@@ -120,13 +123,13 @@ def main() -> None:
     if (args.folder / "config.json").exists():
         trainer, folder = training.resume(args.folder)
     else:
-        base = preset("quad")
+        base = preset(args.preset)
         env = replace(base.env, terrain="rough", noise=False, start_levels=args.start_levels)
         config = replace(
             base, env=env, method="uniform", num_envs=512, env_steps=100_000, seed=args.seed, threads=1,
             evaluation=False,
         )  # fmt: skip
-        trainer, folder = training.start(config, args.folder, ORIGIN)
+        trainer, folder = training.start(config, args.folder, ORIGINS[args.preset])
     recorder = Recorder(trainer, folder.path / "worlds.npz")
     training.train(trainer, folder, recorder, lambda: recorder.seconds > 60 * args.minutes)
     print(table(recorder.path))
