@@ -16,6 +16,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     import mujoco
+    import numpy as np
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,10 @@ class Env(abc.ABC):
 
     def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData] | None":
         """One world as MuJoCo's model and data, for rendering; ``None`` where there is nothing to see."""
+        return None
+
+    def goal_point(self, world: int) -> "np.ndarray | None":
+        """Where the goal of one world is in its ``scene`` [m], shape (3,); ``None`` where a goal is no place."""
         return None
 
     @property

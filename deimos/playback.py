@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,6 +20,9 @@ from deimos.policy import load_policy
 from deimos.run_folder import RunError, RunFolder, load_tensors
 from deimos.selectors import uniform
 from deimos.training import SCHEMA, TrainConfig, read_config
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,10 +161,31 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
         assert found is not None
         camera.lookat[:] = found[1].qpos[:3]
         renderer.update_scene(found[1], camera)
+        point = env.goal_point(0)
+        if point is not None:
+            _add_ball(renderer.scene, point)
         return renderer.render()
 
     with renderer:
         yield picture
+
+
+def _add_ball(scene: "mujoco.MjvScene", point: np.ndarray) -> None:
+    """Show a place as a red ball, if the scene has room for it."""
+    import mujoco
+
+    if scene.ngeom == scene.maxgeom:
+        return
+    size, colour = np.array([0.025, 0.0, 0.0]), np.array([0.9, 0.15, 0.1, 0.9], np.float32)
+    mujoco.mjv_initGeom(
+        scene.geoms[scene.ngeom],
+        mujoco.mjtGeom.mjGEOM_SPHERE,
+        size,
+        point.astype(np.float64),
+        np.eye(3).ravel(),
+        colour,
+    )
+    scene.ngeom += 1
 
 
 def _captioned(picture: np.ndarray, text: str) -> np.ndarray:

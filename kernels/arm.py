@@ -338,6 +338,52 @@ def reset_arms(
 
 
 @wp.kernel
+def _locate_goals(
+    # In
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array2d[float],
+    qpos: wp.array2d[float],
+    state: LocomotionState,
+    # Out
+    point: wp.array[wp.vec3],
+):
+    env = wp.tid()
+    direction = heading(base_quaternion(qpos, env))
+    place = place_of_goal(goal_in_force(state, env)) + arm.origin
+    level = rotate_by_heading(direction, place[0], place[1])
+    ground = ground_below(params, heights, direction, qpos[env, 0], qpos[env, 1])
+    point[env] = wp.vec3(qpos[env, 0] + level[0], qpos[env, 1] + level[1], ground + place[2])
+
+
+def locate_goals(
+    params: LocomotionParams, arm: Arm, heights: wp.array, qpos: wp.array, state: LocomotionState, point: wp.array
+) -> None:
+    """Find where in the world the arms' goals are, for pictures.
+
+    Args:
+        params: What all worlds share.
+        arm: The arm.
+        heights: The height grid [m], float32, shape (nx, ny).
+        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
+        state: The worlds; only their goals are read.
+        point: Places [m], vec3, shape (num_envs,). Written.
+
+    Raises:
+        ValueError: If an array has another shape, dtype or device.
+    """
+    require("point", point, dtype=wp.vec3)
+    n = point.shape[0]
+    require_axes("qpos", qpos, 2)
+    require("qpos", qpos, dtype=wp.float32, shape=(n, qpos.shape[1]), like=point)
+    _require_arm(arm, heights, qpos.shape[1] - 7, point)
+    require("state.goal", state.goal, dtype=wp.float32, shape=(n, GOAL_COMPONENT + 3), like=point)
+    wp.launch(
+        _locate_goals, dim=n, inputs=[params, arm, heights, qpos, state], outputs=[point], device=point.device
+    )  # fmt: skip
+
+
+@wp.kernel
 def _redraw_candidates(
     # In
     arm: Arm,

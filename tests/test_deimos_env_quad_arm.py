@@ -94,6 +94,20 @@ def test_errors_are_a_view(torch_device):
     assert env.report()["end_effector_error"] == pytest.approx(float(error.mean()))
 
 
+@pytest.mark.parametrize("ground", ["flat", "rough"])
+def test_goals_are_shown_where_they_are(ground, torch_device):
+    """The place of a goal in the scene is as far from MuJoCo's end effector as the environment says."""
+    env = build(torch_device, num_envs=3, terrain=ground)
+    for step in range(3):
+        env.step(actions(3, torch_device, seed=step))
+    for world in range(3):
+        model, data = env.scene(world)
+        mujoco.mj_kinematics(model, data)
+        distance = np.linalg.norm(data.site("end_effector").xpos - env.goal_point(world))
+        # float32 places the robots of large terrains to some um.
+        assert distance == pytest.approx(env.errors["end effector [m]"][world].item(), abs=1e-5)
+
+
 def test_reward_is_the_sum_of_its_columns(torch_device):
     """The arm's columns come last, count before the clip at 0, and all of them sum to the reward and in the report."""
     env = build(torch_device, num_envs=32)

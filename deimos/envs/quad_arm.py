@@ -14,7 +14,7 @@ from deimos.locomotion_config import LocomotionConfig, check_weights
 from deimos.ppo import PPOConfig
 from deimos.robots import go1, rx150
 from deimos.shared import Shared, warp_device
-from kernels.arm import Arm, judge_arms, redraw_candidates, reset_arms
+from kernels.arm import Arm, judge_arms, locate_goals, redraw_candidates, reset_arms
 from kernels.arm_rewards import ARM_TERMS, ArmWeights, vecA
 from kernels.locomotion_state import COLUMNS
 
@@ -93,6 +93,12 @@ class QuadArm(Locomotion):
             seed=self._seed, world_offset=self._offset, record=True,
         )  # fmt: skip
         return [*super()._record_candidates(candidates), redraw]
+
+    def goal_point(self, world: int) -> np.ndarray:
+        """See ``Env.goal_point``."""
+        points = wp.zeros(self.num_envs, dtype=wp.vec3, device=warp_device(self.device))
+        locate_goals(self._params, self._arm, self._ground.heights, self._sim.qpos, self.state_arrays, points)
+        return points.numpy()[world]
 
     def report(self) -> dict[str, float]:
         """See ``Locomotion.report``; the arm's error is the mean over the worlds at this moment [m]."""
