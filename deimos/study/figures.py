@@ -251,15 +251,13 @@ def dose_response(data: Data, environment: str, period: int) -> "Figure | None":
                     ACHIEVED[name], middle, [[middle - low], [high - middle]], color="black", marker=marker(name),
                     markerfacecolor=colour(name), markersize=8, capsize=3, linewidth=1,
                 )  # fmt: skip
-                side = -1 if name == "antagonist" else 1  # it stands at the rim
-                panel.annotate(
-                    name, (ACHIEVED[name], middle), xytext=(8 * side, 6), textcoords="offset points", fontsize=8,
-                    ha="right" if side < 0 else "left",
-                )  # fmt: skip
         _parabola(panel, {n: x for n, x in samples.items() if n in DIRECTOR_METHODS and len(x)})
         panel.set_title(f"against the {goals.capitalize()}")
         panel.set_xlabel("achieved percentile of fear")
         panel.grid(alpha=0.3)
+        shown = [name for name, values in samples.items() if len(values)]
+        names_above = panel.secondary_xaxis("top")  # beside the markers they would cover each other
+        names_above.set_xticks([ACHIEVED[name] for name in shown], shown, rotation=60, ha="left", fontsize=8)
     _logarithmic(axes[0])
     axes[0].set_ylabel("crashes")
     return figure
