@@ -127,7 +127,7 @@ def main() -> None:
         env = replace(base.env, terrain="rough", noise=False, start_levels=args.start_levels)
         config = replace(
             base, env=env, method="uniform", num_envs=512, env_steps=100_000, seed=args.seed, threads=1,
-            evaluation=False,
+            evaluation=False, device="cpu",
         )  # fmt: skip
         trainer, folder = training.start(config, args.folder, ORIGINS[args.preset])
     recorder = Recorder(trainer, folder.path / "worlds.npz")

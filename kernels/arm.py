@@ -52,6 +52,7 @@ class Arm:
     origin: wp.vec3  # of the goals, in the frame of the base's yaw, above the ground below the robot [m]
     body_low: wp.vec3  # corners of what goals keep out of, relative to the origin [m]
     body_high: wp.vec3
+    clearance: float  # of goals above the ground [m]
     weight: vecA  # of the reward's terms
     obs_start: int  # where the end effector starts in the observation
 
@@ -126,17 +127,56 @@ def is_clear(arm: Arm, goal: wp.vec3) -> wp.bool:
     return False
 
 
+@wp.struct
+class Spot:
+    """Where a robot's goals are."""
+
+    origin: wp.vec3  # of the goals, in the world [m]
+    direction: wp.vec2  # of the base's yaw: cosine and sine
+
+
+@wp.func
+def find_spot(
+    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], qpos: wp.array2d[float], env: int
+) -> Spot:
+    """Where the goals of a robot are at this moment."""
+    spot = Spot()
+    spot.direction = heading(base_quaternion(qpos, env))
+    level = rotate_by_heading(spot.direction, arm.origin[0], arm.origin[1])
+    ground = ground_below(params, heights, spot.direction, qpos[env, 0], qpos[env, 1])
+    spot.origin = wp.vec3(qpos[env, 0] + level[0], qpos[env, 1] + level[1], ground + arm.origin[2])
+    return spot
+
+
+@wp.func
+def point_of_goal(spot: Spot, goal: wp.vec3) -> wp.vec3:
+    """Where the arm's part of a goal is in the world [m]."""
+    place = place_of_goal(goal)
+    level = rotate_by_heading(spot.direction, place[0], place[1])
+    return spot.origin + wp.vec3(level[0], level[1], place[2])
+
+
+@wp.func
+def is_valid(params: LocomotionParams, arm: Arm, heights: wp.array2d[float], spot: Spot, goal: wp.vec3) -> wp.bool:
+    """Whether a goal is outside the robot's body and clear of the ground."""
+    if not is_clear(arm, goal):
+        return False
+    point = point_of_goal(spot, goal)
+    return point[2] >= sample_height(heights, params.cell, params.corner, point[0], point[1]) + arm.clearance
+
+
 @wp.func
 def draw_again(
-    arm: Arm, seed: wp.uint32, purpose: int, world: int, count: int, index: int, scale: wp.array[float], first: wp.vec3
-) -> wp.vec3:
+    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], spot: Spot, purpose: int, world: int, count: int,
+    index: int, scale: wp.array[float], first: wp.vec3,
+) -> wp.vec3:  # fmt: skip
     """``first`` if it is valid, else the first valid one of further draws from the same box, else the middle."""
     goal = first
     draws = int(1)
-    while not is_clear(arm, goal):
+    while not is_valid(params, arm, heights, spot, goal):
         if draws == wp.static(MAX_DRAWS):
             return wp.vec3(0.0)
-        u = uniform4(seed, purpose, world, count, index, wp.static(FIRST_REDRAW - 1) + draws)
+        u = uniform4(params.seed, purpose, world, count, index, wp.static(FIRST_REDRAW - 1) + draws)
         for i in range(3):
             goal[i] = (2.0 * u[i] - 1.0) * scale[wp.static(GOAL_COMPONENT) + i]
         draws += 1
@@ -277,8 +317,8 @@ def _reset_arms(
     if not mask[env]:
         return
     goal = draw_again(
-        arm, params.seed, wp.static(int(Purpose.FIRST_GOAL)), params.world_offset + env,
-        state.episode_count[env] - 1, 0, goal_range, goal_in_force(state, env),
+        params, arm, heights, find_spot(params, arm, heights, qpos, env), wp.static(int(Purpose.FIRST_GOAL)),
+        params.world_offset + env, state.episode_count[env] - 1, 0, goal_range, goal_in_force(state, env),
     )  # fmt: skip
     for i in range(3):
         state.goal[env, wp.static(GOAL_COMPONENT) + i] = goal[i]
@@ -349,11 +389,7 @@ def _locate_goals(
     point: wp.array[wp.vec3],
 ):
     env = wp.tid()
-    direction = heading(base_quaternion(qpos, env))
-    place = place_of_goal(goal_in_force(state, env)) + arm.origin
-    level = rotate_by_heading(direction, place[0], place[1])
-    ground = ground_below(params, heights, direction, qpos[env, 0], qpos[env, 1])
-    point[env] = wp.vec3(qpos[env, 0] + level[0], qpos[env, 1] + level[1], ground + place[2])
+    point[env] = point_of_goal(find_spot(params, arm, heights, qpos, env), goal_in_force(state, env))
 
 
 def locate_goals(
@@ -386,9 +422,10 @@ def locate_goals(
 @wp.kernel
 def _redraw_candidates(
     # In
+    params: LocomotionParams,
     arm: Arm,
-    seed: wp.uint32,
-    world_offset: int,
+    heights: wp.array2d[float],
+    qpos: wp.array2d[float],
     row: wp.array[int],
     goal_count: wp.array[int],
     scale: wp.array[float],
@@ -400,36 +437,40 @@ def _redraw_candidates(
     g = wp.static(GOAL_COMPONENT)
     first = wp.vec3(candidate[i, k, g], candidate[i, k, g + 1], candidate[i, k, g + 2])
     goal = draw_again(
-        arm, seed, wp.static(int(Purpose.CANDIDATE)), world_offset + env, goal_count[env], k, scale, first
+        params, arm, heights, find_spot(params, arm, heights, qpos, env), wp.static(int(Purpose.CANDIDATE)),
+        params.world_offset + env, goal_count[env], k, scale, first,
     )  # fmt: skip
     for c in range(3):
         candidate[i, k, g + c] = goal[c]
 
 
 def redraw_candidates(
+    params: LocomotionParams,
     arm: Arm,
+    heights: wp.array,
+    qpos: wp.array,
     row: wp.array,
     goal_count: wp.array,
     scale: wp.array,
     candidate: wp.array,
     *,
-    seed: int,
-    world_offset: int,
     record: bool = False,
 ) -> wp.Launch | None:
     """Put valid goals in the place of those of ``draw_candidates`` that are not.
 
     The arm's part of such a candidate is drawn again from the same box until it is valid, which makes it uniform over
-    the valid goals. What comes out depends on (seed, world, the number of the goal, k) alone.
+    the valid goals. What comes out depends on (seed, world, the number of the goal, k) alone where the ground is level;
+    elsewhere also on where the robot is.
 
     Args:
+        params: What all worlds share.
         arm: The arm.
+        heights: The height grid [m], float32, shape (nx, ny).
+        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
         row: Worlds that need a goal, int32, shape (n,), each in [0, num_envs).
         goal_count: Goals that each world has received so far, int32, shape (num_envs,).
         scale: Half side of the box along every component, float32, shape (goal_dim,).
         candidate: Candidates, float32, shape (n, count, goal_dim). Updated.
-        seed: Seed of the run, in [0, 2^32).
-        world_offset: Global number of world 0, at least 0.
         record: Return the launch, to be replayed with ``launch()``, instead of making it.
 
     Raises:
@@ -441,10 +482,13 @@ def redraw_candidates(
     require("candidate", candidate, dtype=wp.float32, shape=shape, like=row)
     require("goal_count", goal_count, dtype=wp.int32, shape=goal_count.shape, like=row)
     require("scale", scale, dtype=wp.float32, shape=shape[2:], like=row)
+    require_axes("qpos", qpos, 2)
+    require("qpos", qpos, dtype=wp.float32, shape=(goal_count.shape[0], qpos.shape[1]), like=row)
+    _require_arm(arm, heights, qpos.shape[1] - 7, row)
     return wp.launch(
         _redraw_candidates,
         dim=shape[:2],
-        inputs=[arm, wp.uint32(seed), world_offset, row, goal_count, scale],
+        inputs=[params, arm, heights, qpos, row, goal_count, scale],
         outputs=[candidate],
         device=row.device,
         record_cmd=record,

@@ -27,11 +27,11 @@ def reached():
 
 def test_it_reaches_its_goals(reached):
     """The median error stays near what docs/quad_arm.md says of 256 robots; an arm that rests misses by 28 cm."""
-    assert reached["errors"]["end effector [m]"] < 0.08
+    assert reached["errors"]["end effector [m]"] < 0.04
 
 
 def test_it_stands(reached):
-    """No robot of 48 falls in eight seconds, and their velocities stay near zero, which the goals ask for."""
+    """At most one robot of 48 falls in eight seconds, and their velocities stay near zero, which the goals ask for."""
     assert reached["crashes"] <= 1
     linear, yaw, _ = reached["tracking"]
     assert linear > 0.9

@@ -107,6 +107,11 @@ train = { num_envs = 8, ppo = { epochs = 2 } }
     assert cell.config.env == dataclasses.replace(base.env, terrain="rough")
     assert cell.config.ppo == dataclasses.replace(base.ppo, epochs=2)
     assert (cell.config.num_envs, cell.config.eval) == (8, base.eval)
+    with pytest.raises(RunError, match=r"Environment 'hills': preset must be the name of one, got 3"):
+        plan.expand(described(tmp_path, toml.replace('"quad"', "3")))
+    other = toml.replace("{ terrain", '{ kind = "particle", terrain')
+    with pytest.raises(RunError, match=r"Environment 'hills': preset 'quad' is for quad, not for particle"):
+        plan.expand(described(tmp_path, other))
     with pytest.raises(RunError, match=r"Environment 'hills': There is no preset 'quat'; there are: .*quad"):
         plan.expand(described(tmp_path, toml.replace('"quad"', '"quat"')))
 

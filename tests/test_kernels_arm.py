@@ -68,7 +68,7 @@ def make_arm(device, low=BODY_LOW, high=BODY_HIGH):
     arm.offset = wp.array(OFFSETS, dtype=wp.vec3, device=device)
     arm.axis = wp.array(AXES, dtype=wp.vec3, device=device)
     arm.origin, arm.body_low, arm.body_high = wp.vec3(*ORIGIN), wp.vec3(*low), wp.vec3(*high)
-    arm.weight, arm.obs_start = vecA(*dataclasses.astuple(ArmWeights())), OBS_START
+    arm.weight, arm.obs_start, arm.clearance = vecA(*dataclasses.astuple(ArmWeights())), OBS_START, 0.035
     return arm
 
 
@@ -292,18 +292,44 @@ def test_torch_sees_the_error_in_place(device):
     assert not torch.any(view == GARBAGE)
 
 
-def draw(device, n, count, scale, *, arm=None, seed=3, world_offset=20):
-    """Candidates before and after ``redraw_candidates``, each (n, count, 6)."""
+def draw(device, n, count, scale, *, arm=None, seed=3, world_offset=20, heights=None):
+    """Candidates before and after ``redraw_candidates``, each (n, count, 6); robots face x at the world's origin."""
     row = wp.array(np.arange(n), dtype=wp.int32, device=device)
     goal_count = wp.array(np.arange(n) % 4, dtype=wp.int32, device=device)
     scale = to_array(scale, device)
     candidate = wp.full((n, count, G), np.nan, dtype=wp.float32, device=device)
     draw_candidates(row, goal_count, scale, candidate, seed=seed, world_offset=world_offset)
     first = candidate.numpy().copy()
+    params = LocomotionParams()
+    params.cell, params.corner, params.seed, params.world_offset = CELL, wp.vec2(*CORNER), seed, world_offset
+    ground = to_array(np.zeros((121, 161)) if heights is None else heights, device)
+    qpos = np.zeros((n, 7 + J))
+    qpos[:, 3] = 1.0
     redraw_candidates(
-        arm or make_arm(device), row, goal_count, scale, candidate, seed=seed, world_offset=world_offset
+        params, arm or make_arm(device), ground, to_array(qpos, device), row, goal_count, scale, candidate
     )  # fmt: skip
     return first, candidate.numpy()
+
+
+def test_no_goal_is_in_the_ground(device):
+    """Beyond the edge of a high step goals stay above it by the clearance; those before it are as on level ground."""
+    x = CORNER[0] + CELL * np.arange(121)
+    heights = np.tile(np.where(x > 0.25, 0.5, 0.0)[:, None], (1, 161))  # rises from 0 to 0.5 m between 0.2 and 0.3 m
+    first, last = draw(device, 60, 100, np.ones(G), heights=heights)
+    level = draw(device, 60, 100, np.ones(G))[1].reshape(-1, G)[:, 3:]
+
+    # The highest row of points below the trunk is at 0.19 m, before the step, so the origin is where it is without one.
+    def above(goals):
+        points = np.array([place_reference(goal) for goal in goals]) + ORIGIN
+        return points[:, 2] - 0.5 * np.clip((points[:, 0] - 0.2) / 0.1, 0.0, 1.0)
+
+    goals = last.reshape(-1, G)[:, 3:]
+    assert above(goals).min() >= 0.035 - 1e-5
+    sunk = above(level) < 0.035
+    assert sunk.mean() > 0.05
+    np.testing.assert_array_equal(goals[~sunk], level[~sunk])
+    assert not np.any(goals[sunk] == level[sunk])
+    assert np.isfinite(first).all()
 
 
 def test_redraws_match_reference(device, uniform_reference):
@@ -408,6 +434,7 @@ def test_others_reject_arrays_of_another_shape(device):
     ints = wp.zeros(2, dtype=wp.int32, device=device)
     with pytest.raises(ValueError, match=r"candidate must be float32\(2, 4, 6\).*got float32\(2, 4, 3\)"):
         redraw_candidates(
-            make_arm(device), ints, ints, to_array(np.ones(6), device), wp.zeros((2, 4, 3), device=device),
-            seed=0, world_offset=0,
+            LocomotionParams(), make_arm(device), to_array(np.zeros((9, 9)), device),
+            to_array(np.zeros((2, 7 + J)), device), ints, ints, to_array(np.ones(6), device),
+            wp.zeros((2, 4, 3), device=device),
         )  # fmt: skip

@@ -170,7 +170,7 @@ def _environment(
     if taken := sorted((set(shared) | set(own)) & _GRID):
         raise RunError(f"{', '.join(taken)} cannot stand in 'train': the grid of the study says it.")
     try:
-        ready = to_dict(presets.preset(table["preset"])) if "preset" in table else {"env": {}}
+        ready = _training_preset(table)
         env = from_dict(EnvConfig, _merged(ready["env"], table.get("env", {})))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error
@@ -183,6 +183,19 @@ def _environment(
     _check_unique("method", methods)
     fields = _merged(_merged(_merged(settings, shared), own), last) | {"env": to_dict(env)}
     return name, fields, methods, table.get("goal_periods")
+
+
+def _training_preset(table: dict) -> dict:
+    """Fields of ``TrainConfig`` of the preset that an environment's table names; an empty ``env`` if it names none."""
+    if "preset" not in table:
+        return {"env": {}}
+    name = table["preset"]
+    if not isinstance(name, str):
+        raise ValueError(f"preset must be the name of one, got {name!r}.")
+    kind = table.get("env", {}).get("kind", presets.environment(name))
+    if kind != presets.environment(name):
+        raise ValueError(f"preset '{name}' is for {presets.environment(name)}, not for {kind}.")
+    return to_dict(presets.preset(name))
 
 
 def _cell(environment: tuple[str, dict, list[str], list[int] | None], method_name: str, seed: int) -> Cell:
