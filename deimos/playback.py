@@ -151,7 +151,7 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
     model.vis.global_.offwidth, model.vis.global_.offheight = options.width, options.height
     try:
         renderer = mujoco.Renderer(model, options.height, options.width)
-    except Exception as error:
+    except Exception as error:  # likewise
         raise _unrenderable(error) from error
     camera = mujoco.MjvCamera()
     camera.distance, camera.azimuth, camera.elevation = 1.8, 130.0, -18.0

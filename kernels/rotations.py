@@ -71,3 +71,10 @@ def rotate_by_yaw(quat: wp.vec4, v: wp.vec3) -> wp.vec3:
 def from_yaw(angle: float) -> wp.vec4:
     """The quaternion of a turn by ``angle`` [rad] about the vertical."""
     return wp.vec4(wp.cos(0.5 * angle), 0.0, 0.0, wp.sin(0.5 * angle))
+
+
+@wp.func
+def rotate_about(v: wp.vec3, axis: wp.vec3, angle: float) -> wp.vec3:
+    """``v`` rotated by ``angle`` [rad] about the unit vector ``axis`` (Rodrigues's formula)."""
+    c = wp.cos(angle)
+    return c * v + wp.sin(angle) * wp.cross(axis, v) + (1.0 - c) * wp.dot(axis, v) * axis

@@ -14,7 +14,7 @@ from deimos.envs.quad_arm import Config
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.robots import rx150
 from deimos.selectors import cl, director, uniform
-from kernels.arm import SHELL_HIGH, SHELL_LOW
+from kernels.arm_goals import SHELL_HIGH, SHELL_LOW
 from kernels.arm_rewards import ARM_TERMS, ArmWeights
 from kernels.locomotion_state import COLUMNS
 

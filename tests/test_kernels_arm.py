@@ -9,17 +9,16 @@ import warp as wp
 from scipy import stats
 
 from deimos.robots import rx150
-from kernels.arm import (
+from kernels.arm import judge_arms, reset_arms
+from kernels.arm_goals import (
     SHELL_HIGH,
     SHELL_LOW,
     Arm,
     end_effector,
     goal_of_place,
     is_clear,
-    judge_arms,
     place_of_goal,
     redraw_candidates,
-    reset_arms,
 )
 from kernels.arm_rewards import ARM_TERMS, ArmWeights, vecA
 from kernels.goals import draw_candidates

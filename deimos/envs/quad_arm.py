@@ -14,7 +14,8 @@ from deimos.locomotion_config import LocomotionConfig, check_weights
 from deimos.ppo import PPOConfig
 from deimos.robots import go1, rx150
 from deimos.shared import Shared, warp_device
-from kernels.arm import Arm, judge_arms, locate_goals, redraw_candidates, reset_arms
+from kernels.arm import judge_arms, reset_arms
+from kernels.arm_goals import Arm, locate_goals, redraw_candidates
 from kernels.arm_rewards import ARM_TERMS, ArmWeights, vecA
 from kernels.locomotion_state import COLUMNS
 
@@ -49,7 +50,7 @@ class Config(LocomotionConfig):
 
 
 class QuadArm(Locomotion):
-    """A quadruped with an arm in many worlds; see ``Config``, and ``kernels.arm`` for the arm's part of a goal."""
+    """A quadruped with an arm in many worlds; see ``Config``, and ``kernels.arm_goals`` for the arm's goals."""
 
     config: Config
     goal_groups = (*Locomotion.goal_groups, slice(3, 6))
