@@ -10,7 +10,8 @@ turns with the base's yaw alone. They are its distance, pitch (up positive) and 
 
 and the wanted place is distance (cos pitch cos yaw, cos pitch sin yaw, sin pitch). The numbers of a goal do not
 change while it is in force. Goals inside the robot's own body, or less than ``Arm.clearance`` above the ground
-where the robot is when they are drawn, are not valid and are drawn again. On level ground the lowest are 0.17 m above it.
+where the robot is when they are drawn, are not valid and are drawn again. On level ground the lowest are 0.17 m
+above it.
 
 The end effector comes from the joints' angles by forward kinematics, since the simulator's own lags them by a substep.
 """
