@@ -66,6 +66,7 @@ def _particle(rounds: int, device: torch.device) -> dict[str, Any]:
     """The step of Particle Gym, and Table 4.1 of the thesis for its three variants."""
     from deimos.bench import particle, training
     from deimos.envs.particle import Config
+    from deimos.thesis import TABLE_4_1
     from deimos.training import TrainConfig
 
     results: dict[str, Any] = {"env": [particle.measure_env(n, device, rounds) for n in particle.SIZES]}
@@ -74,7 +75,7 @@ def _particle(rounds: int, device: torch.device) -> dict[str, Any]:
     for variant in ("directional", "absolute", "relative"):
         config = replace(TrainConfig(), env=Config(variant=variant))
         results["training"][variant] = training.measure_in_groups(
-            config, training.TABLE_4_1[variant], device, rounds, everything=variant == "directional"
+            config, TABLE_4_1[variant], device, rounds, everything=variant == "directional"
         )
         training.print_training(f"{variant}, default sizes", results["training"][variant])
     results["machine"] = training.machine(device)

@@ -17,6 +17,7 @@ from deimos.physics import Captured
 from deimos.presets import preset
 from deimos.selector import SelectorConfig
 from deimos.selectors import vds
+from deimos.thesis import TABLE_4_1
 
 WORLDS = 512
 PERIOD = 100  # T of the training that is timed: a fifth of the presets', so that selectors choose five times as often
@@ -72,9 +73,7 @@ def measure_training(name: str, device: torch.device, rounds: int, num_envs: int
     base = preset(name)
     env = base.env.with_goal_period(PERIOD)
     config = replace(base, env=env, num_envs=num_envs, evaluation=False, device="auto", threads=0)
-    return training.measure_training(
-        config, METHODS_TIMED, training.TABLE_4_1[name], device, rounds, length=1, warm_up=2
-    )
+    return training.measure_training(config, METHODS_TIMED, TABLE_4_1[name], device, rounds, length=1, warm_up=2)
 
 
 def print_env(title: str, result: dict[str, Any]) -> None:

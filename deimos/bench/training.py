@@ -23,13 +23,6 @@ METHODS_TIMED: dict[str, SelectorConfig] = {
 } | {"vds, own shares": vds.Config(data="share", epochs=3)}
 """What is timed: a method of each kind, and VDS with the price of each of its options."""
 OFTEN = 4  # times as many rounds for methods that differ from Uniform by less than a round does from the next
-TABLE_4_1 = {  # thesis, Table 4.1: thousands of frames per second
-    "absolute": {"uniform": 331, "p25": 276, "rnd": 284, "vds": 125},
-    "directional": {"uniform": 329, "p25": 274, "rnd": 270, "vds": 119},
-    "relative": {"uniform": 332, "p25": 268, "rnd": 272, "vds": 118},
-    "quad": {"uniform": 101, "p25": 87, "rnd": 94, "vds": 70, "cl": 101},
-    "quad_arm": {"uniform": 78, "p25": 75, "rnd": 70, "vds": 63, "cl": 75},
-}
 
 
 def measure_training(

@@ -16,15 +16,9 @@ from deimos.study.data import Data, Where
 from deimos.study.document import Block, Bullets, Heading, Paragraph, Picture, Table, to_html, to_markdown
 from deimos.study.figures import draw_all
 from deimos.study.stats import Array, Interval
+from deimos.thesis import TABLE_4_1
 
 FIGURES = "figures"
-THESIS_FPS = {  # Table 4.1, thousand frames per second
-    "absolute": {"DEIMOS": 276, "rnd": 284, "uniform": 331, "vds": 125},
-    "directional": {"DEIMOS": 274, "rnd": 270, "uniform": 329, "vds": 119},
-    "relative": {"DEIMOS": 268, "rnd": 272, "uniform": 332, "vds": 118},
-    "quad": {"DEIMOS": 87, "rnd": 94, "uniform": 101, "vds": 70, "cl": 101},
-    "quad_arm": {"DEIMOS": 75, "rnd": 70, "uniform": 78, "vds": 63, "cl": 75},
-}
 COVERAGE = (  # deimos study coverage, its defaults
     "The intervals of IQMs and medians are percentile bootstraps: they cover 93 to 94 % at n = 10, on normal and on "
     "lognormal data. Means have bootstrap-t intervals (94 % and 91 %); the percentile bootstrap would cover 90 % and "
@@ -213,13 +207,13 @@ def _speed(data: Data) -> list[Block]:
             continue
         fps = {name: data.sample(place[0], name, "fps") for name in data.methods(environment)}
         uniform = fps.get("uniform", np.array([]))
-        thesis = THESIS_FPS.get(environment, {})
+        thesis: dict[str, int] = TABLE_4_1.get(environment, {})
         for name, values in fps.items():
             if len(values) < 2:
                 continue
             error = values.std(ddof=1) / math.sqrt(len(values))
             ratio = f"{values.mean() / uniform.mean():.2f}" if len(uniform) else "-"
-            known = thesis.get("DEIMOS" if name[1:].isdigit() else name)
+            known = thesis.get("p25" if name[1:].isdigit() else name)
             theirs = f"{known / thesis['uniform']:.2f}" if known else "-"
             rows.append([environment, name, f"{values.mean():.0f} ± {error:.0f}", ratio, theirs])
     text = (
