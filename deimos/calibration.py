@@ -130,19 +130,23 @@ def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     if len(probability) == 0:
         return dict.fromkeys(names, math.nan)
     p, y = probability.double(), crashed.double()
-    rate = y.mean()
     curve = reliability(p, crashed)
-    share = curve.count.double() / len(p)
-    base = nn.functional.binary_cross_entropy(rate.expand_as(y), y)
-    loss = nn.functional.binary_cross_entropy(p, y)
     top = p.topk(max(1, len(p) // 10)).indices
-    values = torch.stack([
-        (p - y).square().mean(),
-        (share * (curve.predicted - curve.observed).square()).sum(),
-        (share * (curve.observed - rate).square()).sum(),
-        rate * (1 - rate),
-        (share * (curve.predicted - curve.observed).abs()).sum(),
-        torch.where(base > 0, 1 - loss / base, torch.nan),
-        p[top].mean() - y[top].mean(),
+    scalars = torch.stack([
+        y.mean(), (p - y).square().mean(), nn.functional.binary_cross_entropy(p, y), p[top].mean() - y[top].mean()
     ])  # fmt: skip
-    return dict(zip(names, values.tolist(), strict=True))
+    # The rest is a few numbers: one transfer, and no operation of the device for each.
+    parts = [scalars, curve.predicted, curve.observed, curve.count.double() / len(p)]
+    (rate, brier, loss, gap), *bins = (part.tolist() for part in torch.cat(parts).split([len(part) for part in parts]))
+    base = -sum(q * math.log(q) for q in (rate, 1 - rate) if q > 0)
+    gaps = [(share, predicted - observed, observed - rate) for predicted, observed, share in zip(*bins, strict=True)]
+    values = (
+        brier,
+        math.fsum(share * off**2 for share, off, _ in gaps),
+        math.fsum(share * apart**2 for share, _, apart in gaps),
+        rate * (1 - rate),
+        math.fsum(share * abs(off) for share, off, _ in gaps),
+        1 - loss / base if base > 0 else math.nan,
+        gap,
+    )
+    return dict(zip(names, values, strict=True))

@@ -1,24 +1,22 @@
 """Several value functions that differ by initialisation and by data, in one stack of weights."""
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from deimos.networks import Backprop, ManyCandidates, activate_, rows_in_cache
-
-LARGE = 4096  # rows from which on members are spread over threads
+from deimos.networks import Backprop, ManyCandidates, rows_in_cache
+from deimos.products import activate_
 
 
 class Stack:
     """K multilayer perceptrons of one shape; the weights of a layer lie in one tensor, all of them in one vector.
 
-    On a GPU a layer of all members is one batched product. On a CPU batched products are the slower
-    ones; there every member is computed by itself, and the members are spread over as many threads as
-    torch has when the stack is made. Both give the same numbers up to float32 rounding, and the latter
-    the same for any number of threads.
+    On a GPU a layer of all members is one batched product. On a CPU batched products are the slower ones; there
+    the members are computed one after another, each on as many threads as torch has when the stack is made: each on
+    a thread of its own takes half as long again, since Python serves one thread at a time. Both give the same
+    numbers up to float32 rounding.
 
     Args:
         nets: Made by ``networks.mlp``, on one device. Their parameters become views of the stack.
@@ -37,8 +35,6 @@ class Stack:
         self.members = [Backprop(net) for net in nets]
         self.nets = nets
         self._threads = torch.get_num_threads()
-        workers = min(self._threads, len(nets))
-        self._pool = None if self.batched or workers == 1 else ThreadPoolExecutor(workers, initializer=_alone)
 
     def _pack(self, move: bool = False) -> int:
         """Lay every layer's weights, then its biases, of all members end to end; returns their number."""
@@ -64,20 +60,12 @@ class Stack:
                 self._layers.append((weight, bias, weight_grad, bias_grad))
         return start
 
-    def each(self, work: Callable[[int], Any], rows: int) -> list:
-        """``work(k)`` on ``rows`` rows for every member k, in the order of the members.
-
-        Side by side where the work is large. Threads that call small operations wait for each other more than they
-        save, so these run one after another, each on all threads (1200 rows of 64 units, ten members, two cores:
-        5.3 against 6.1 ms).
-        """
-        every: Iterable[int] = range(len(self.nets))
-        if self._pool is not None and rows >= LARGE:
-            return list(self._pool.map(work, every))
+    def each(self, work: Callable[[int], Any]) -> list:
+        """``work(k)`` for every member k, in their order, on all threads also where the caller keeps to one."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._threads)
         try:
-            return [work(k) for k in every]
+            return [work(k) for k in range(len(self.nets))]
         finally:
             torch.set_num_threads(threads)
 
@@ -136,7 +124,7 @@ class Stack:
                 rows = slice(start, start + size)
                 value[k, rows] = self.members[k].forward(x[rows]).squeeze(1)
 
-        self.each(work, len(x))
+        self.each(work)
         return value
 
 
@@ -162,8 +150,3 @@ class CandidateValues:
 def deviation(values: Tensor) -> Tensor:
     """Standard deviation over the first axis; ``Tensor.std`` takes ten times as long along a strided axis."""
     return (values - values.mean(0)).square_().mean(0).sqrt_()
-
-
-def _alone() -> None:
-    """What a thread of the pool does first: it takes one core, since every core has such a thread."""
-    torch.set_num_threads(1)

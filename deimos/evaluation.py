@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from deimos.checks import check_at_least, check_choice, check_range
 from deimos.env import Env, EnvConfig
 from deimos.fear import Fear, FearConfig, auroc
+from deimos.fused import fuse
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.interactions import Interactions, Resolved
 from deimos.oracle import Clones, Oracle
@@ -234,7 +235,7 @@ def train_adversary(
         ``adversary_auroc`` (on every fifth world, which it did not learn from) and ``weak_adversary``:
         whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
     """
-    fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed)
+    fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed, fuse)
     collector = _Collector(env, fear)
     limit = config.adversary_steps * config.adversary_patience
     loop = GoalLoop(env, collector, window=limit)

@@ -11,6 +11,7 @@ from deimos.interactions import Resolved
 from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, weights_of
 from deimos.ranks import mean_over_ranks
 from deimos.seeds import generator, weights_from
+from deimos.selector import Fuse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,15 +50,20 @@ class Fear:
         goal_dim: Components of a goal.
         device: Where it lives.
         seed: Seed of its weights and of the order that it learns in.
+        fuse: Who scores candidates in one kernel; see ``selector.Spaces``.
     """
 
-    def __init__(self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int) -> None:
+    def __init__(
+        self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int,
+        fuse: Fuse | None = None,
+    ) -> None:  # fmt: skip
         self.config = config
         with weights_from(seed, "fear weights"):
             self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation).to(device)
         self._parameters, _ = flatten_parameters(self.network)
         self._pass = Backprop(self.network)
         self._candidates = ManyCandidates(self.network, goal_dim, config.workspace)
+        self._fused = fuse(self.network, goal_dim) if fuse else None
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = generator(seed, "fear minibatches", device)
         self.fitted = False
@@ -87,18 +93,18 @@ class Fear:
         inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
         target = data.crashed.float()
         size = -(-len(data) // self.config.minibatches)
-        losses = torch.zeros((), device=target.device)
+        loss = torch.full((), torch.nan)
         for _ in range(self.config.epochs if epochs is None else epochs):
-            losses.zero_()
             order = torch.randperm(len(data), generator=self.generator, device=target.device)
-            shuffled = zip(*(part[order].split(size) for part in (inputs, target, weight)), strict=True)
-            for minibatch in shuffled:
-                losses += self._learn(len(data) / len(minibatch[0]), *minibatch)
+            x, y, w = inputs[order], target[order], weight[order]
+            minibatches = zip(x.split(size), y.split(size), w.split(size), strict=True)
+            logit = torch.cat([self._learn(len(data) / len(part[0]), *part) for part in minibatches])
+            loss = nn.functional.binary_cross_entropy_with_logits(logit, y, w, reduction="sum")
         self.fitted = True
-        return losses.item()
+        return loss.item()
 
     def _learn(self, scale: float, inputs: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        """One step of Adam on a minibatch; ``scale`` makes its gradient one of a mean. Returns its part of the loss."""
+        """One step of Adam on a minibatch; ``scale`` makes its gradient one of a mean. Returns the logits before it."""
         assert self._parameters.grad is not None
         self._parameters.grad.zero_()
         logit = self._pass.forward(inputs).squeeze(1)
@@ -106,7 +112,7 @@ class Fear:
         self._pass.backward(delta.unsqueeze(1))
         mean_over_ranks(self._parameters.grad)
         self.optimizer.step()
-        return nn.functional.binary_cross_entropy_with_logits(logit, target, weight, reduction="sum")
+        return logit
 
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Logits of crashing for many candidates per decision.
@@ -119,7 +125,10 @@ class Fear:
         Returns:
             Logits, shape (B, N); see ``ManyCandidates``.
         """
-        return self._candidates(torch.cat([state, goal], dim=1), candidates).squeeze(2)
+        context = torch.cat([state, goal], dim=1)
+        if self._fused is not None:
+            return self._fused(context, candidates)
+        return self._candidates(context, candidates).squeeze(2)
 
     def operations(self, decisions: float, count: int) -> float:
         """Multiplications and additions of scoring ``count`` candidates in each of ``decisions``."""

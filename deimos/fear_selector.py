@@ -47,7 +47,7 @@ class FearSelector(GoalSelector):
         self.num_candidates = config.candidates
         self._num_envs = spaces.num_envs
         self._learnt_at = 0  # step of the last call of learn
-        self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
+        self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed, spaces.fuse)
         self.calibration = Calibration()
 
     @abc.abstractmethod

@@ -339,7 +339,7 @@ class Locomotion(Env):
         self._set_rows(rows)
         torch.mul(self._seen_range, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
         for launch in launches:
-            launch.set_dim((len(rows), count))
+            launch.set_dim((len(rows), launch.bounds.shape[1]))  # as many threads per row as were recorded
             launch.launch()
         return candidates.tensor[: len(rows)]
 

@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from deimos.products import activate_, add_product_, fast_linear
+
 Activation = Literal["relu", "elu", "tanh"]
 
 _MODULES: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU, "tanh": nn.Tanh}
@@ -71,61 +73,13 @@ def _aligned(count: int) -> int:
     return -(-count // 16) * 16
 
 
-def fast_linear(x: Tensor, weight: Tensor, bias: Tensor | None, activation: nn.Module | None = None) -> Tensor:
-    """``activation(x @ weight.t() + bias)``, by the faster of PyTorch's two libraries on a CPU.
-
-    PyTorch hands float32 products to MKL, which takes twice as long as oneDNN where the processor
-    is not Intel's (64 x 64 units, 12 000 rows, Zen 5, two cores: 0.57 against 0.30 ms). The
-    operator is the one that ``torch.compile`` emits for a linear layer. Its call alone takes 15 us,
-    MKL's 2 us: below a million multiplications MKL is the faster one. It applies ReLU and tanh while
-    it writes the product, which makes them nearly free; ELU it does not know.
-    """
-    large = len(x) * weight.numel() >= 2**20
-    if large and x.device.type == "cpu" and torch.backends.mkldnn.is_available():
-        fused = "relu" if isinstance(activation, nn.ReLU) else "tanh" if isinstance(activation, nn.Tanh) else "none"
-        y = torch.ops.mkldnn._linear_pointwise(x, weight, bias, fused, [], "")
-        return y if activation is None or fused != "none" else activate_(y, activation)
-    y = nn.functional.linear(x, weight, bias)
-    return y if activation is None else activate_(y, activation)
-
-
-def add_product_(total: Tensor, delta: Tensor, x: Tensor) -> None:
-    """Add ``delta.t() @ x``, the gradient of a layer's weights, by the faster library; see ``fast_linear``.
-
-    The product is small and the sums are long, which oneDNN is good at on one thread and, for the larger
-    layers, on several (6000 rows: 64 x 64 units 0.56 against 0.40 ms on one thread, 0.33 against 0.42 ms on
-    two; 128 x 235 units 2.7 against 1.5 ms on two).
-
-    Args:
-        total: Shape (outputs, inputs). Added to.
-        delta: Shape (n, outputs).
-        x: Shape (n, inputs).
-    """
-    size = total.numel()
-    large = size >= 2**14 or (size >= 2**9 and torch.get_num_threads() == 1)
-    if large and len(x) * size >= 2**22 and x.device.type == "cpu" and torch.backends.mkldnn.is_available():
-        total += torch.ops.mkldnn._linear_pointwise(delta.t(), x.t(), None, "none", [], "")
-    else:
-        total.addmm_(delta.t(), x)
-
-
-def activate_(x: Tensor, activation: nn.Module) -> Tensor:
-    """Apply an activation that ``mlp`` knows, in place."""
-    if isinstance(activation, nn.ReLU):
-        return torch.relu_(x)
-    if isinstance(activation, nn.ELU):
-        return nn.functional.elu_(x)
-    return torch.tanh_(x)
-
-
 def rows_in_cache(widest: int) -> int:
-    """Rows whose activations take 1.5 MiB in a layer of ``widest`` units.
+    """Rows whose activations take 3 MiB in a layer of ``widest`` units.
 
-    A CPU works through larger batches in such pieces. They stay in its caches; and above about
-    2 MiB the C library gives freed memory back to the system, so that every layer would touch
-    fresh pages, at the price of half an update.
+    A CPU works through larger batches in such pieces: they stay in its caches and far below the blocks of memory
+    that the C library gives back to the system (see ``products.keep_freed_memory``).
     """
-    return max(256, 3 * 2**19 // (4 * widest))
+    return max(256, 3 * 2**20 // (4 * widest))
 
 
 class Backprop:

@@ -1,14 +1,25 @@
 """What every goal selector promises. A selector sees tensors only, never an environment or a learner."""
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from deimos.interactions import Interactions
 from deimos.rollout import Rollout
+
+
+class Fuse(Protocol):
+    """Makes ``scores(context, candidates)``, shape (B, N), of a network; ``None`` where it cannot: ``fused.fuse``."""
+
+    def __call__(
+        self, net: nn.Sequential, goal_dim: int, *, mean_square: bool = False
+    ) -> Callable[[Tensor, Tensor], Tensor] | None:
+        """See ``fused.fuse``."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -31,6 +42,8 @@ class Spaces:
     """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
     total_steps: int = 0
     """Steps of the whole training; 0 where nobody knows."""
+    fuse: "Fuse | None" = None
+    """Who scores candidates in one kernel, where the worlds have kernels (``fused.fuse``); ``None`` for torch alone."""
 
     def state_then_goal(self, obs: Tensor) -> Tensor:
         """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""

@@ -26,6 +26,7 @@ from deimos.goal_loop import GoalLoop, spaces
 from deimos.methods import method
 from deimos.policy import load_policy, save_policy
 from deimos.ppo import PPO, PPOConfig
+from deimos.products import keep_freed_memory
 from deimos.rollout import Rollout
 from deimos.run_folder import RunError, RunFolder, load_tensors, save_tensors
 from deimos.selector import SelectorConfig
@@ -143,6 +144,7 @@ class Trainer:
     """Everything that a run holds in memory, and one iteration of it."""
 
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
+        keep_freed_memory()
         self.config = config
         self.env = config.env.build(config.num_envs, device, config.seed)
         total_steps = config.iterations * config.ppo.num_steps

@@ -1,9 +1,12 @@
 """What every environment shares about goals: their clocks and their uniform candidates."""
 
+from typing import Any
+
 import warp as wp
 
 from kernels.check import require, require_axes
-from kernels.random import Purpose, uniform4
+from kernels.lanes import WORDS, lanes, threads
+from kernels.random import Purpose, philox_lanes, unit
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,6 +39,7 @@ def count_events(goal_due: wp.bool, done: wp.bool, count: wp.array[int]):
 @wp.kernel
 def _draw_candidates(
     # In
+    lanes: Any,
     seed: wp.uint32,
     world_offset: int,
     row: wp.array[int],
@@ -44,15 +48,33 @@ def _draw_candidates(
     # Out
     candidate: wp.array3d[float],
 ):
-    i, k = wp.tid()
+    i, part = wp.tid()
     env = row[i]
+    first = part * len(lanes)
     goal_dim = candidate.shape[2]
+    index = type(lanes)()
+    for lane in range(len(lanes)):
+        index[lane] = wp.uint32(first + lane)
     for block in range((goal_dim + 3) // 4):
-        u = uniform4(seed, wp.static(int(Purpose.CANDIDATE)), world_offset + env, goal_count[env], k, block)
-        for lane in range(4):
-            component = 4 * block + lane
-            if component < goal_dim:
-                candidate[i, k, component] = (2.0 * u[lane] - 1.0) * scale[component]
+        x0, x1, x2, x3 = philox_lanes(
+            type(lanes)(wp.uint32(world_offset + env)), type(lanes)(wp.uint32(goal_count[env])), index,
+            type(lanes)(wp.uint32(block)), seed, wp.uint32(wp.static(int(Purpose.CANDIDATE))),
+        )  # fmt: skip
+        d = 4 * block
+        for lane in range(len(lanes)):
+            k = first + lane
+            if k < candidate.shape[1]:
+                candidate[i, k, d] = (2.0 * unit(x0[lane]) - 1.0) * scale[d]
+                if d + 1 < goal_dim:
+                    candidate[i, k, d + 1] = (2.0 * unit(x1[lane]) - 1.0) * scale[d + 1]
+                if d + 2 < goal_dim:
+                    candidate[i, k, d + 2] = (2.0 * unit(x2[lane]) - 1.0) * scale[d + 2]
+                if d + 3 < goal_dim:
+                    candidate[i, k, d + 3] = (2.0 * unit(x3[lane]) - 1.0) * scale[d + 3]
+
+
+for _words in WORDS.values():
+    wp.overload(_draw_candidates, {"lanes": _words})
 
 
 def draw_candidates(
@@ -77,7 +99,8 @@ def draw_candidates(
         candidate: Candidates in [-scale, scale), float32, shape (n, count, goal_dim). Written.
         seed: Seed of the run, in [0, 2^32).
         world_offset: Global number of world 0, at least 0.
-        record: Return the launch, to be replayed with ``launch()``, instead of making it.
+        record: Return the launch, to be replayed with ``launch()``, instead of making it. For other rows, change the
+            first axis of its threads alone: on a CPU one of the second draws many candidates.
 
     Raises:
         ValueError: If an array has another shape, dtype or device.
@@ -89,8 +112,8 @@ def draw_candidates(
     require("candidate", candidate, dtype=wp.float32, shape=(*row.shape, *candidate.shape[1:]), like=row)
     return wp.launch(
         _draw_candidates,
-        dim=candidate.shape[:2],
-        inputs=[wp.uint32(seed), world_offset, row, goal_count, scale],
+        dim=threads(*candidate.shape[:2], row.device),
+        inputs=[WORDS[lanes(candidate.shape[1], row.device)](), wp.uint32(seed), world_offset, row, goal_count, scale],
         outputs=[candidate],
         device=row.device,
         record_cmd=record,

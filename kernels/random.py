@@ -10,10 +10,12 @@ The generator is Philox4x32-10 of Salmon et al., *Parallel Random Numbers: As Ea
 """
 
 from enum import IntEnum
+from typing import Any
 
 import warp as wp
 
 from kernels.check import require
+from kernels.lanes import WORDS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,6 +25,7 @@ _WEYL_0 = wp.constant(wp.uint32(0x9E3779B9))  # the golden ratio
 _WEYL_1 = wp.constant(wp.uint32(0xBB67AE85))  # sqrt(3) - 1
 _SHIFT_32 = wp.constant(wp.uint64(32))
 _SHIFT_8 = wp.constant(wp.uint32(8))
+_one = WORDS[1]
 
 
 class Purpose(IntEnum):
@@ -43,24 +46,49 @@ class vec4u(wp.types.vector(length=4, dtype=wp.uint32)):
 
 
 @wp.func
-def philox(counter: vec4u, key_0: wp.uint32, key_1: wp.uint32) -> vec4u:
-    """Ten rounds of Philox4x32: four random 32-bit words for one (counter, key)."""
-    x0 = counter[0]
-    x1 = counter[1]
-    x2 = counter[2]
-    x3 = counter[3]
+def _round(x0: Any, x1: Any, x2: Any, x3: Any, key_0: wp.uint32, key_1: wp.uint32):
+    """One round, of as many counters side by side as there are lanes."""
+    y0 = type(x0)()
+    y1 = type(x0)()
+    y2 = type(x0)()
+    y3 = type(x0)()
+    for lane in range(len(x0)):
+        product_0 = wp.uint64(_MULTIPLIER_0) * wp.uint64(x0[lane])
+        product_1 = wp.uint64(_MULTIPLIER_1) * wp.uint64(x2[lane])
+        y0[lane] = wp.uint32(product_1 >> _SHIFT_32) ^ x1[lane] ^ key_0
+        y1[lane] = wp.uint32(product_1)
+        y2[lane] = wp.uint32(product_0 >> _SHIFT_32) ^ x3[lane] ^ key_1
+        y3[lane] = wp.uint32(product_0)
+    return y0, y1, y2, y3
+
+
+@wp.func
+def philox_lanes(x0: Any, x1: Any, x2: Any, x3: Any, key_0: wp.uint32, key_1: wp.uint32):
+    """Ten rounds of Philox4x32: four random words per lane, for one counter (x0, x1, x2, x3) per lane.
+
+    The words of a lane are those of ``philox`` for its counter.
+    """
     k0 = key_0
     k1 = key_1
-    for _round in range(10):
-        product_0 = wp.uint64(_MULTIPLIER_0) * wp.uint64(x0)
-        product_1 = wp.uint64(_MULTIPLIER_1) * wp.uint64(x2)
-        x0 = wp.uint32(product_1 >> _SHIFT_32) ^ x1 ^ k0
-        x1 = wp.uint32(product_1)
-        x2 = wp.uint32(product_0 >> _SHIFT_32) ^ x3 ^ k1
-        x3 = wp.uint32(product_0)
+    for _ten in range(10):
+        x0, x1, x2, x3 = _round(x0, x1, x2, x3, k0, k1)
         k0 = k0 + _WEYL_0
         k1 = k1 + _WEYL_1
-    return vec4u(x0, x1, x2, x3)
+    return x0, x1, x2, x3
+
+
+@wp.func
+def philox(counter: vec4u, key_0: wp.uint32, key_1: wp.uint32) -> vec4u:
+    """Ten rounds of Philox4x32: four random 32-bit words for one (counter, key)."""
+    x0, x1, x2, x3 = philox_lanes(_one(counter[0]), _one(counter[1]), _one(counter[2]), _one(counter[3]), key_0, key_1)
+    return vec4u(x0[0], x1[0], x2[0], x3[0])
+
+
+@wp.func
+def unit(word: wp.uint32) -> float:
+    """A random word as a uniform number in [0, 1), a multiple of 2^-24."""
+    # The top 24 bits fill a float32 exactly, so 1.0 is never reached.
+    return float(word >> _SHIFT_8) * float(5.9604644775390625e-8)
 
 
 @wp.func
@@ -69,13 +97,7 @@ def uniform4(seed: wp.uint32, purpose: int, world: int, count: int, index: int, 
     word = philox(
         vec4u(wp.uint32(world), wp.uint32(count), wp.uint32(index), wp.uint32(block)), seed, wp.uint32(purpose)
     )
-    ulp = float(5.9604644775390625e-8)  # 2^-24: the top 24 bits fill a float32 exactly, so 1.0 is never reached
-    return wp.vec4(
-        float(word[0] >> _SHIFT_8) * ulp,
-        float(word[1] >> _SHIFT_8) * ulp,
-        float(word[2] >> _SHIFT_8) * ulp,
-        float(word[3] >> _SHIFT_8) * ulp,
-    )
+    return wp.vec4(unit(word[0]), unit(word[1]), unit(word[2]), unit(word[3]))
 
 
 @wp.func

@@ -180,23 +180,6 @@ def test_a_stack_is_its_networks(batched):
     assert all(not torch.equal(a, b) for a, b in zip(stack.nets[3].parameters(), alone[3].parameters(), strict=True))
 
 
-def test_threads_change_nothing():
-    """Members on two threads learn bit for bit what they learn on one."""
-    env, results = worlds(), []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        try:
-            selector = ensemble(env)
-            torch.set_num_threads(1)
-            assert (selector.stack._pool is None) == (threads == 1)
-            for lesson in range(2):
-                selector.learn(no_interactions(env), random_rollout(env, lesson))
-        finally:
-            torch.set_num_threads(1)
-        results.append(selector.stack.parameters.detach().clone())
-    assert torch.equal(*results)
-
-
 @pytest.mark.parametrize("rule", ["proportional", "argmax", "percentile"])
 def test_goals_are_scored_by_disagreement(rule):
     """A score is the standard deviation over the members, and the rule chooses by it."""

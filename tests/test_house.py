@@ -162,6 +162,7 @@ def test_what_selectors_are_made_of_sees_tensors_only():
         "picks",
         "networks",
         "ensemble",
+        "products",
         "seeds",
     ]
     parts += ["rollout", "adam", "ppo", "goal_director"]

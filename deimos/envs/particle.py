@@ -237,7 +237,7 @@ class Particle(Env):
         self._set_rows(rows)
         torch.mul(self._goal_box, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
         for launch in launches:
-            launch.set_dim((len(rows), count))
+            launch.set_dim((len(rows), launch.bounds.shape[1]))  # as many threads per row as were recorded
             launch.launch()
         return candidates.tensor[: len(rows)]
 

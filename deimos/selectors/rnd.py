@@ -80,6 +80,7 @@ class RND(GoalSelector):
         self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
         self._join()
         self._error = ManyCandidates(self._difference, spaces.goal_dim)
+        self._fused = spaces.fuse(self._difference, spaces.goal_dim, mean_square=True) if spaces.fuse else None
         self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=spaces.device))
         self.generator = generator(seed, "rnd minibatches", spaces.device)
@@ -107,6 +108,8 @@ class RND(GoalSelector):
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
         context = self._whiten(torch.cat([state, goal], dim=1), self._context)
+        if self._fused is not None:
+            return self._fused(context, self._whiten(candidates, self._goal))
         scores = []
         # Features of all candidates together would not fit a cache; fresh memory for them costs more than the products.
         size = self._error.contexts_at_once(candidates.shape[1])
@@ -141,9 +144,9 @@ class RND(GoalSelector):
             return {"rnd/surprise": float("nan"), "rnd/loss": float("nan")}
         context = torch.cat([state, goal], dim=1)
         self._observe(torch.cat([context, uniform], dim=1).double())
-        surprise = self.surprise(state, goal, next_goal.unsqueeze(1)).mean().item()
         everything = slice(0, len(self._mean))
         inputs = self._whiten(torch.cat([context, next_goal], dim=1), everything)
+        surprise = (self._pass.forward(inputs) - self._target_pass.forward(inputs)).square_().mean().item()
         return {"rnd/surprise": surprise, "rnd/loss": self._fit(inputs)}
 
     def _observe(self, inputs: Tensor) -> None:

@@ -174,8 +174,7 @@ class VDS(GoalSelector):
         """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
         inputs = self._spaces.state_then_goal(obs)
         return torch.stack(self.stack.each(
-            lambda k: self.stack.members[k].forward(inputs[:, worlds[k]].flatten(0, 1)).view(len(obs), -1),
-            len(obs) * worlds.shape[1],
+            lambda k: self.stack.members[k].forward(inputs[:, worlds[k]].flatten(0, 1)).view(len(obs), -1)
         ))  # fmt: skip
 
     def _fit(self, rollout: Rollout, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
@@ -191,7 +190,7 @@ class VDS(GoalSelector):
             own = (old[k].flatten()[order[k]], returns[k].flatten()[order[k]], rollout.weight[step, world])
             return inputs[step, world], *own
 
-        data = self.stack.each(data_of, rows)
+        data = self.stack.each(data_of)
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
         for _ in range(self.config.epochs):
@@ -227,7 +226,7 @@ class VDS(GoalSelector):
                 loss += gained
             return loss
 
-        return torch.stack(self.stack.each(work, len(data[0][0])))
+        return torch.stack(self.stack.each(work))
 
     def operations(self, decisions: float, transitions: int) -> float:
         """See ``GoalSelector.operations``."""

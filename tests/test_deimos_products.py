@@ -1,0 +1,128 @@
+"""Matrix products by the faster library, and scores of candidates by one kernel: neither changes a result."""
+
+import copy
+import threading
+
+import pytest
+import torch
+from torch import nn
+
+from deimos import products
+from deimos.fused import fuse
+from deimos.networks import ManyCandidates, mlp
+from deimos.products import add_product_, fast_linear, onednn
+
+MATMUL = torch.backends.mkldnn.matmul
+
+
+@pytest.mark.parametrize("activation", [None, nn.ReLU(), nn.ELU(), nn.Tanh()])
+# An outer product, one that MKL makes, one that oneDNN makes.
+@pytest.mark.parametrize(("rows", "inputs", "outputs"), [(500, 1, 64), (300, 14, 64), (6000, 64, 64)])
+@pytest.mark.parametrize("biased", [False, True])
+def test_fast_linear_is_a_linear_layer(activation, rows, inputs, outputs, biased):
+    """Whoever multiplies, the result is that of float64 up to the rounding of its sums."""
+    torch.manual_seed(0)
+    x, weight, bias = torch.randn(rows, inputs), torch.randn(outputs, inputs), torch.randn(outputs) if biased else None
+    expected = nn.functional.linear(x.double(), weight.double(), None if bias is None else bias.double())
+    expected = expected if activation is None else activation(expected)
+    found = fast_linear(x, weight, bias, copy.deepcopy(activation))
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(("rows", "inputs", "outputs"), [(500, 14, 64), (6144, 64, 64), (12000, 11, 64)])
+def test_gradients_of_weights_are_float32(rows, inputs, outputs):
+    """Sums of thousands of products are off by float32's rounding; that of bfloat16 is a thousand times as large."""
+    torch.manual_seed(0)
+    delta, x = torch.randn(rows, outputs), torch.randn(rows, inputs)
+    total = torch.full((outputs, inputs), 3.0)
+    add_product_(total, delta, x)
+    expected = 3.0 + delta.double().t() @ x.double()
+    assert (total.double() - expected).abs().max() < 2e-5 * rows**0.5
+
+
+def test_onednn_leaves_the_switch_as_it_was():
+    """Afterwards, also after an error and within itself, products are made as before."""
+    before = MATMUL.fp32_precision
+    with onednn():
+        inside = MATMUL.fp32_precision
+        with onednn():
+            assert MATMUL.fp32_precision == inside
+        assert MATMUL.fp32_precision == inside
+    assert MATMUL.fp32_precision == before
+    with pytest.raises(KeyError), onednn():
+        raise KeyError
+    assert MATMUL.fp32_precision == before
+
+
+def test_threads_inside_change_nothing_for_each_other():
+    """Threads that enter and leave within a caller who stays never see the switch off."""
+    with onednn():
+        inside, seen = MATMUL.fp32_precision, set()
+
+        def work():
+            for _ in range(200):
+                with onednn():
+                    seen.add(MATMUL.fp32_precision)
+                seen.add(MATMUL.fp32_precision)
+
+        workers = [threading.Thread(target=work) for _ in range(4)]
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+    assert seen == {inside}
+
+
+def test_inexact_library_is_not_used(monkeypatch):
+    """Where oneDNN would multiply in bfloat16, the switch stays where it is."""
+    monkeypatch.setattr(products, "_exact_through_onednn", lambda: False)
+    before = MATMUL.fp32_precision
+    with onednn():
+        assert MATMUL.fp32_precision == before
+
+
+@pytest.mark.parametrize(("outputs", "mean_square"), [(1, False), (16, True)])
+def test_fused_scores_are_the_networks(torch_device, outputs, mean_square):
+    """One kernel gives what products give, for more and fewer decisions, other candidates and changed weights."""
+    torch.manual_seed(0)
+    net = mlp(9, (64,), outputs, "relu").to(torch_device)
+    fused, by_products = fuse(net, 3, mean_square=mean_square), ManyCandidates(net, 3)
+    kept = []
+    for rows, count in ((20, 100), (3, 100), (50, 100), (20, 1), (20, 100)):
+        context = torch.randn(rows, 6, device=torch_device)
+        candidates = torch.randn(rows, count, 3, device=torch_device)
+        expected = by_products(context, candidates)
+        expected = expected.square().mean(2) if mean_square else expected.squeeze(2)
+        found = fused(context, candidates)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+        kept.append((found, found.clone()))
+        with torch.no_grad():
+            for parameter in net.parameters():
+                parameter += 0.01 * torch.randn_like(parameter)
+    assert all(torch.equal(scores, copied) for scores, copied in kept), "a later call overwrote earlier scores"
+
+
+def test_fused_scores_take_any_view():
+    """Candidates that do not lie end to end are read as what they are."""
+    torch.manual_seed(0)
+    net = mlp(9, (64,), 1, "relu")
+    candidates = torch.randn(100, 20, 3).transpose(0, 1)
+    context = torch.randn(20, 6)
+    expected = ManyCandidates(net, 3)(context, candidates).squeeze(2)
+    torch.testing.assert_close(fuse(net, 3)(context, candidates), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "outputs", "activation", "goal_dim", "mean_square"),
+    [
+        ((64, 64), 1, "relu", 3, False),
+        ((64,), 1, "tanh", 3, False),
+        ((64,), 2, "relu", 3, False),
+        ((64,), 1, "relu", 7, False),
+        ((64,), 6, "relu", 3, True),
+        ((64,), 16, "relu", 4, True),
+    ],
+)
+def test_what_no_kernel_does_is_left_to_products(hidden, outputs, activation, goal_dim, mean_square):
+    """Other networks than the kernel's get none."""
+    assert fuse(mlp(9, hidden, outputs, activation), goal_dim, mean_square=mean_square) is None
