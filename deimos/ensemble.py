@@ -1,40 +1,38 @@
 """Several value functions that differ by initialisation and by data, in one stack of weights."""
 
-from collections.abc import Callable
-from typing import Any
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
 
 from deimos.networks import Backprop, ManyCandidates, rows_in_cache
-from deimos.products import activate_
+from deimos.products import activate_, onednn
 
 
 class Stack:
-    """K multilayer perceptrons of one shape; the weights of a layer lie in one tensor, all of them in one vector.
+    """K multilayer perceptrons of one shape; a layer of all members is one batched product.
 
-    On a GPU a layer of all members is one batched product. On a CPU batched products are the slower ones; there
-    the members are computed one after another, each on as many threads as torch has when the stack is made: each on
-    a thread of its own takes half as long again, since Python serves one thread at a time. Both give the same
-    numbers up to float32 rounding.
+    The weights of a layer lie in one tensor, those of all layers in one vector.
 
     Args:
         nets: Made by ``networks.mlp``, on one device. Their parameters become views of the stack.
-        batched: Whether to use batched products; ``None`` for where they are faster.
     """
 
-    def __init__(self, nets: list[nn.Sequential], batched: bool | None = None) -> None:
+    def __init__(self, nets: list[nn.Sequential]) -> None:
+        self.nets = nets
         self._linears = [[layer for layer in net if isinstance(layer, nn.Linear)] for net in nets]
         first = self._linears[0][0].weight
         self.parameters = nn.Parameter(torch.zeros(self._pack(), device=first.device))
         self.parameters.grad = torch.zeros_like(self.parameters)
         self._pack(move=True)
+        self._member = Backprop(nets[0])
         self._activation = nets[0][1]
         self._inputs: list[Tensor] = []
-        self.batched = first.device.type != "cpu" if batched is None else batched
-        self.members = [Backprop(net) for net in nets]
-        self.nets = nets
         self._threads = torch.get_num_threads()
+        widest = max(layer.in_features for layer in self._linears[0][1:])
+        self._piece = rows_in_cache(widest) // len(nets) if first.device.type == "cpu" else sys.maxsize
 
     def _pack(self, move: bool = False) -> int:
         """Lay every layer's weights, then its biases, of all members end to end; returns their number."""
@@ -60,42 +58,51 @@ class Stack:
                 self._layers.append((weight, bias, weight_grad, bias_grad))
         return start
 
-    def each(self, work: Callable[[int], Any]) -> list:
-        """``work(k)`` for every member k, in their order, on all threads also where the caller keeps to one."""
+    @contextmanager
+    def all_threads(self) -> Iterator[None]:
+        """Run on as many threads as torch had when the stack was made, also where the caller keeps to one."""
         threads = torch.get_num_threads()
         torch.set_num_threads(self._threads)
         try:
-            return [work(k) for k in range(len(self.nets))]
+            yield
         finally:
             torch.set_num_threads(threads)
 
+    def pieces(self, rows: int) -> Iterator[slice]:
+        """Consecutive parts of ``rows`` rows per member; on a CPU such as suit its caches, on a GPU all of them."""
+        size = min(max(1, self._piece), rows)
+        return (slice(start, start + size) for start in range(0, rows, size))
+
     @torch.no_grad()
     def forward(self, x: Tensor) -> Tensor:
-        """Outputs of all members by batched products, shape (K, n, outputs).
+        """Outputs of all members, shape (K, n, outputs).
 
         Args:
             x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own. Kept for ``backward``.
         """
         x = x.expand(len(self.nets), -1, -1)
         self._inputs = []
-        for i, (weight, bias, _, _) in enumerate(self._layers):
-            self._inputs.append(x)
-            x = torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
-            if i < len(self._layers) - 1:
-                x = activate_(x, self._activation)
+        with onednn():
+            for i, (weight, bias, _, _) in enumerate(self._layers):
+                self._inputs.append(x)
+                x = torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
+                if i < len(self._layers) - 1:
+                    x = activate_(x, self._activation)
         return x
 
     @torch.no_grad()
     def backward(self, delta: Tensor) -> None:
         """Add the gradient of every weight to its ``grad``; ``delta`` is shaped like what ``forward`` gave last."""
-        for i in reversed(range(len(self._layers))):
-            weight, _, weight_grad, bias_grad = self._layers[i]
-            x = self._inputs[i]
-            weight_grad.baddbmm_(delta.transpose(1, 2), x)
-            bias_grad += delta.sum(1)
-            if i:
-                delta = torch.bmm(delta, weight)
-                self.members[0].multiply_by_slope(delta, x)
+        with onednn():
+            for i in reversed(range(len(self._layers))):
+                weight, _, weight_grad, bias_grad = self._layers[i]
+                x = self._inputs[i]
+                weight_grad.baddbmm_(delta.transpose(1, 2), x)
+                bias_grad += delta.sum(1)
+                if i:
+                    # An outer product is no work for a library.
+                    delta = delta * weight if delta.shape[2] == 1 else torch.bmm(delta, weight)
+                    self._member.multiply_by_slope(delta, x)
 
     def clip_gradients(self, max_norm: float) -> None:
         """Scale every member's own gradient down to a norm of at most ``max_norm``."""
@@ -109,23 +116,12 @@ class Stack:
 
     @torch.no_grad()
     def values(self, x: Tensor) -> Tensor:
-        """Outputs of members with one output, shape (K, n); a CPU works in pieces that suit its caches.
+        """Outputs of members with one output, shape (K, n).
 
         Args:
-            x: Inputs, shape (n, inputs).
+            x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own.
         """
-        if self.batched:
-            return self.forward(x).squeeze(2)
-        value = torch.empty(len(self.nets), len(x), device=x.device)
-        size = rows_in_cache(max(layer.in_features for layer in self._linears[0][1:]))
-
-        def work(k: int) -> None:
-            for start in range(0, len(x), size):
-                rows = slice(start, start + size)
-                value[k, rows] = self.members[k].forward(x[rows]).squeeze(1)
-
-        self.each(work)
-        return value
+        return torch.cat([self.forward(x[..., rows, :]).squeeze(2) for rows in self.pieces(x.shape[-2])], dim=1)
 
 
 class CandidateValues:
@@ -133,9 +129,7 @@ class CandidateValues:
 
     def __init__(self, stack: Stack, goal_dim: int, workspace: int = 64) -> None:
         self._stack = stack
-        # On a GPU the members' activations lie in memory together, so each gets its part of the workspace.
-        share = max(1, workspace // len(stack.nets)) if stack.batched else workspace
-        self._members = [ManyCandidates(net, goal_dim, share) for net in stack.nets]
+        self._members = [ManyCandidates(net, goal_dim, max(1, workspace // len(stack.nets))) for net in stack.nets]
 
     def operations(self, contexts: float, count: int) -> float:
         """Multiplications and additions of the products; see ``ManyCandidates.operations``."""
@@ -143,8 +137,8 @@ class CandidateValues:
 
     def __call__(self, context: Tensor, candidates: Tensor) -> Tensor:
         """Shape (K, B, N) for members with one output; the arguments are those of ``ManyCandidates``."""
-        # One after another: products this small take less time than handing them to threads (1.7 against 2.1 ms).
-        return torch.stack([member(context, candidates).squeeze(2) for member in self._members])
+        with self._stack.all_threads():
+            return torch.stack([member(context, candidates).squeeze(2) for member in self._members])
 
 
 def deviation(values: Tensor) -> Tensor:

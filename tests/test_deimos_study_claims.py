@@ -27,7 +27,8 @@ def level(environment, method, goals, period):
 def population(seeds=10, environments=ALL, level=level, spread=0.5, methods=None):
     """Rows and curves of every method everywhere, with log crashes that are normal around a level."""
     rng = np.random.default_rng(0)
-    empty = {name: None if kind is str else math.nan for name, kind in RESULT_COLUMNS.items()}
+    blank = {str: None, tuple: (), dict: {}}
+    empty = {name: blank.get(kind, math.nan) for name, kind in RESULT_COLUMNS.items()}
     rows, lines = [], []
     for environment in environments:
         legged = environment.startswith("quad")

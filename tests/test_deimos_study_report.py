@@ -19,7 +19,7 @@ METHODS = ["coop", "p25", "p75", "antagonist", "uniform", "vds"]
 def fill(folder, seeds=4, points=20):
     """Write the tables of a study of six methods in two environments."""
     rng = np.random.default_rng(0)
-    values = {str: "v", int: 100, float: 0.5, bool: False}
+    values = {str: "v", int: 100, float: 0.5, bool: False, tuple: (), dict: {}}
     rows, lines = [], []
     for environment in ("directional", "quad"):
         for method in METHODS:
@@ -30,6 +30,8 @@ def fill(folder, seeds=4, points=20):
                     row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | key
                     crashes = int(np.exp(rng.normal(5, 0.5))) if goals == "adversary" else 0
                     weak = method == "coop" and seed == 0 and goals == "adversary"
+                    if environment == "quad":
+                        row |= {"tracking": tuple(rng.uniform(0.6, 0.7, 2)), "errors": {"reach": rng.uniform(0.3, 0.4)}}
                     rows.append(row | {"goals": goals, "crashes": crashes, "crashes_per_1000": crashes / 4000,
                                        "reward": rng.normal(0.8, 0.01), "fps": rng.normal(1e5, 1e3),
                                        "weak_adversary": weak})  # fmt: skip
@@ -118,6 +120,20 @@ def test_report_says_what_limits_it(folder):
     assert "minimum detectable effect" in text
     assert "| quad | vds |" in text
     assert "0.69 |" in text  # the thesis's VDS over Uniform in Quad, 70 / 101
+
+
+def test_tracking_and_errors_stand_beside_the_crashes(folder):
+    """Where goals have several groups, and an environment errors, the tables of its policies have their means."""
+    text = (folder / "report.md").read_text()
+    particle, quad = text.split("### directional, Naive")[1].split("### quad, Naive")
+    for name in ("tracking of goal group 0: IQM", "tracking of goal group 1: IQM", "reach, median over goals: IQM"):
+        assert name not in particle
+        assert name in quad
+    line = next(line for line in quad.splitlines() if "| uniform |" in line or line.startswith("uniform"))
+    values = [float(cell.split()[0]) for cell in line.strip("| ").split("|")[-3:]]
+    assert 0.6 < values[0] < 0.7
+    assert 0.6 < values[1] < 0.7
+    assert 0.3 < values[2] < 0.4
 
 
 def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):

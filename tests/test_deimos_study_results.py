@@ -10,7 +10,7 @@ import pytest
 from deimos.run_folder import RunError
 from deimos.study.results import RESULT_COLUMNS, GrowingTable, curves, merge, results
 
-COLUMNS = {"name": str, "count": int, "rate": float, "weak": bool, "points": tuple}
+COLUMNS = {"name": str, "count": int, "rate": float, "weak": bool, "points": tuple, "errors": dict}
 
 WRITER = """
 import sys
@@ -30,23 +30,24 @@ def table(tmp_path):
 
 def row(name, **more):
     """A row of that table."""
-    return {"name": name, "count": 3, "rate": 0.1 + 0.2, "weak": False, "points": (1.0, 0.25)} | more
+    return {"name": name, "count": 3, "rate": 0.1 + 0.2, "weak": False, "points": (1.0, 0.25),
+            "errors": {"reach": 0.125, "yaw": math.inf}} | more  # fmt: skip
 
 
 def result(hash, goals="naive", **more):
     """A row of the table of evaluations."""
-    values = {str: "x", int: 1, float: 0.5, bool: False}
+    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
     return {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | {"hash": hash, "goals": goals} | more
 
 
 def test_rows_come_back_as_they_were(table):
     """Numbers are exact, and what is missing is NaN or None."""
     assert table.read() == []
-    assert table.append([row("a, b"), row("c", rate=math.nan, weak=None, points=())]) == 2
+    assert table.append([row("a, b"), row("c", rate=math.nan, weak=None, points=(), errors={})]) == 2
     first, second = table.read()
     assert first == row("a, b")
     assert math.isnan(second["rate"])
-    assert (second["weak"], second["points"]) == (None, ())
+    assert (second["weak"], second["points"], second["errors"]) == (None, (), {})
 
 
 def test_key_is_entered_once(table):
@@ -82,7 +83,7 @@ def test_two_processes_append_at_once(tmp_path):
 def test_other_schema_is_refused(table):
     """A file with other columns is refused with their names, and is not written to."""
     table.path.write_text("name,count,speed\n")
-    message = r"table\.csv is a table of another schema; missing: rate, weak, points; unknown: speed"
+    message = r"table\.csv is a table of another schema; missing: rate, weak, points, errors; unknown: speed"
     for use in (table.read, lambda: table.append([row("a")])):
         with pytest.raises(RunError, match=message):
             use()

@@ -13,7 +13,7 @@ import pytest
 from deimos.run_folder import RunError, RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, lease, plan
-from deimos.study.folder import StudyFolder
+from deimos.study.folder import StudyFolder, result_rows
 from deimos.study.results import TIMED
 from deimos.study.runner import Runner
 
@@ -98,6 +98,10 @@ def test_study_leaves_its_tables(whole):
         }
         assert (row["seed"], row["eval_seed"], row["setting"]) == (0, twin["seed"], cell.setting)
         assert "torch=" in row["versions"]
+        assert (row["tracking"], row["errors"]) == ((), {})  # a particle's goal is all of a piece
+        legged = twin | {"tracking": [0.6, 0.7], "errors": {"reach": 0.02}}
+        (row,) = result_rows(cell, RunFolder(whole.cell_path(cell) / "run"), [legged])
+        assert (row["tracking"], row["errors"]) == ([0.6, 0.7], {"reach": 0.02})
     curves = whole.curves.read()
     assert {line["hash"] for line in curves} == set(by_digest)
     assert all(line["env_steps"][-1] == 1920 and len(line["crashes_per_1000"]) == ITERATIONS for line in curves)

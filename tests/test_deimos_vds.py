@@ -1,7 +1,6 @@
 """The ensemble of critics: against critics trained one by one, against PPO's own, and how it scores goals."""
 
 import copy
-import functools
 import math
 
 import pytest
@@ -89,13 +88,13 @@ def orders(selector, count):
     return [torch.randperm(NUM_ENVS * NUM_STEPS, generator=generator) for _ in range(count)]
 
 
-@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize("piece", [7, 10_000])  # rows worked through at a time: parts of a minibatch, or all of it
 @pytest.mark.parametrize("max_grad_norm", [0.05, 10.0])
-def test_ten_stacked_critics_equal_ten_separate_ones(monkeypatch, batched, max_grad_norm):
+def test_ten_stacked_critics_equal_ten_separate_ones(piece, max_grad_norm):
     """Over five lessons every member stays what it becomes alone, with its own returns, order and gradient clip."""
-    monkeypatch.setattr(vds, "Stack", functools.partial(Stack, batched=batched))
     env = worlds()
     selector = ensemble(env, max_grad_norm=max_grad_norm)
+    selector.stack._piece = piece
     single = [Alone(copy.deepcopy(net), selector.config) for net in selector.stack.nets]
     start = selector.stack.parameters.detach().clone()
     for lesson in range(5):
@@ -149,24 +148,18 @@ def test_critics_with_returns_of_their_own_do_not_agree():
     assert (selector.values(rollout.obs).std(0) > 1e-3).float().mean() > 0.9
 
 
-@pytest.mark.parametrize("batched", [False, True])
-def test_a_stack_is_its_networks(batched):
+def test_a_stack_is_its_networks():
     """Values, gradients and the clip of each member are those of its network alone; weights lie in one vector."""
     torch.manual_seed(0)
     nets = [mlp(5, (16, 9), 1, "tanh") for _ in range(4)]
     alone = copy.deepcopy(nets)
-    stack = Stack(nets, batched=batched)
+    stack = Stack(nets)
     x, delta = torch.randn(4, 50, 5), torch.randn(4, 50, 1)
     torch.testing.assert_close(
         stack.values(x[0]), torch.stack([net(x[0]).squeeze(1) for net in alone]).detach(), rtol=1e-5, atol=1e-6
     )
-    if batched:
-        stack.forward(x)
-        stack.backward(delta)
-    else:
-        for k, member in enumerate(stack.members):
-            member.forward(x[k])
-            member.backward(delta[k])
+    stack.forward(x)
+    stack.backward(delta)
     stack.clip_gradients(3.0)
     norms = []
     for k, (net, own) in enumerate(zip(stack.nets, alone, strict=True)):

@@ -15,7 +15,7 @@ from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.ensemble import CandidateValues, Stack, deviation
 from deimos.interactions import Interactions
-from deimos.networks import Activation, mlp, operations, rows_in_cache
+from deimos.networks import Activation, mlp, operations
 from deimos.ppo import advantages, value_gradient
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
@@ -101,7 +101,6 @@ class VDS(GoalSelector):
         self.optimizer = Adam(self.stack.parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = generator(seed, "vds minibatches", device)
         self._known: tuple[Tensor, Tensor] | None = None  # observations and their values, as asked for last
-        self._piece = rows_in_cache(max(config.hidden))
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
@@ -122,7 +121,8 @@ class VDS(GoalSelector):
     def values(self, obs: Tensor) -> Tensor:
         """Values by every critic, shape (K, ...), of observations of shape (..., obs_dim)."""
         inputs = self._spaces.state_then_goal(obs).flatten(0, -2)
-        return self.stack.values(inputs).view(-1, *obs.shape[:-1])
+        with self.stack.all_threads():
+            return self.stack.values(inputs).view(-1, *obs.shape[:-1])
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
@@ -130,9 +130,10 @@ class VDS(GoalSelector):
         if rollout is None:
             raise ValueError("vds learns values, so it needs the learner's rollout, got None.")
         worlds = self._worlds(rollout.obs.shape[1], rollout.obs.device)
-        old, returns = self._targets(rollout, worlds)
+        with self.stack.all_threads():
+            old, returns = self._targets(rollout, worlds)
+            loss = self._fit(rollout, worlds, old, returns)
         spread = deviation(old).mean().item() if self.config.data == "all" else float("nan")
-        loss = self._fit(rollout, worlds, old, returns)
         self._known = None
         return {"vds/loss": loss, "vds/deviation": spread, "vds/value": old.mean().item()}
 
@@ -172,61 +173,43 @@ class VDS(GoalSelector):
 
     def _own_values(self, obs: Tensor, worlds: Tensor) -> Tensor:
         """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
-        inputs = self._spaces.state_then_goal(obs)
-        return torch.stack(self.stack.each(
-            lambda k: self.stack.members[k].forward(inputs[:, worlds[k]].flatten(0, 1)).view(len(obs), -1)
-        ))  # fmt: skip
+        own = self._spaces.state_then_goal(obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds of each, inputs)
+        return self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
 
     def _fit(self, rollout: Rollout, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
         """Adam on the clipped value loss; returns its mean over critics and minibatches."""
         rows = rollout.num_steps * worlds.shape[1]
         minibatches = min(self.config.minibatches, rows)
         size = rows // minibatches
-        inputs = self._spaces.state_then_goal(rollout.obs[:-1])
-        order = [torch.randperm(rows, generator=self.generator, device=old.device) for _ in worlds]
-
-        def data_of(k: int) -> tuple[Tensor, ...]:
-            step, world = order[k] // worlds.shape[1], worlds[k][order[k] % worlds.shape[1]]
-            own = (old[k].flatten()[order[k]], returns[k].flatten()[order[k]], rollout.weight[step, world])
-            return inputs[step, world], *own
-
-        data = self.stack.each(data_of)
+        order = torch.stack([torch.randperm(rows, generator=self.generator, device=old.device) for _ in worlds])
+        step, world = order // worlds.shape[1], worlds.gather(1, order % worlds.shape[1])
+        data = [
+            self._spaces.state_then_goal(rollout.obs[:-1])[step, world], old.flatten(1).gather(1, order),
+            returns.flatten(1).gather(1, order), rollout.weight[step, world],
+        ]  # fmt: skip
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
         for _ in range(self.config.epochs):
             for start in range(0, minibatches * size, size):
                 self.stack.parameters.grad.zero_()
-                losses += self._gradient([[part[start : start + size] for part in own] for own in data])
+                losses += self._gradient(*[part[:, start : start + size] for part in data])
                 mean_over_ranks(self.stack.parameters.grad)
                 self.stack.clip_gradients(self.config.max_grad_norm)
                 self.optimizer.step()
         return losses.mean().item() / (self.config.epochs * minibatches)
 
-    def _gradient(self, data: list[list[Tensor]]) -> Tensor:
-        """Add every critic's gradient on its own (input, old value, return, weight); returns the losses, shape (K,)."""
-        if self.stack.batched:
-            x, before, target, weight = (torch.stack(tensors) for tensors in zip(*data, strict=True))
-            weight = weight / weight.sum(1, keepdim=True).clamp(min=1.0)
-            value = self.stack.forward(x).squeeze(2)
-            loss, slope = value_gradient(value, before, target, weight, clip=self.config.clip, coef=1.0)
+    def _gradient(self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        """Add every critic's gradient on its own rows, shape (K, n, ...); returns the losses, shape (K,)."""
+        weight = weight / weight.sum(1, keepdim=True).clamp(min=1.0)
+        losses = torch.zeros(len(x), device=x.device)
+        for rows in self.stack.pieces(x.shape[1]):
+            value = self.stack.forward(x[:, rows]).squeeze(2)
+            loss, slope = value_gradient(
+                value, before[:, rows], target[:, rows], weight[:, rows], clip=self.config.clip, coef=1.0
+            )
             self.stack.backward(slope.unsqueeze(2))
-            return loss
-
-        def work(k: int) -> Tensor:
-            x, before, target, weight = data[k]
-            weight = weight / weight.sum().clamp(min=1.0)
-            loss = torch.zeros(())
-            for start in range(0, len(x), self._piece):
-                rows = slice(start, start + self._piece)
-                value = self.stack.members[k].forward(x[rows]).squeeze(1)
-                gained, slope = value_gradient(
-                    value, before[rows], target[rows], weight[rows], clip=self.config.clip, coef=1.0
-                )
-                self.stack.members[k].backward(slope.unsqueeze(1))
-                loss += gained
-            return loss
-
-        return torch.stack(self.stack.each(work))
+            losses += loss
+        return losses
 
     def operations(self, decisions: float, transitions: int) -> float:
         """See ``GoalSelector.operations``."""

@@ -106,18 +106,26 @@ class Data:
     def sample(self, where: Where, method: str, metric: str, seeds: Sequence[int] | None = None) -> Array:
         """The values of a metric over the seeds of a method, in the seeds' order; NaN are left out.
 
-        ``log_crashes`` is log(1 + crashes).
+        ``log_crashes`` is log(1 + crashes), ``tracking:2`` the mean tracking of the goal's group 2, ``errors:NAME`` the
+        median of one of the environment's errors.
 
         Args:
             where: The evaluation.
             method: The method.
-            metric: A column of the results, or ``log_crashes``.
+            metric: A column of the results, or one of these.
             seeds: Which; ``None`` for all.
         """
         rows = self._samples.get((where, method), {})
         chosen = sorted(rows) if seeds is None else [seed for seed in seeds if seed in rows]
         values = np.array([_metric(rows[seed], metric) for seed in chosen], float)
         return values[~np.isnan(values)]
+
+    def parts(self, where: Where) -> list[str]:
+        """The metrics ``tracking:...`` and ``errors:...`` that an evaluation has."""
+        rows = [row for (place, _), seeds in self._samples.items() if place == where for row in seeds.values()]
+        groups = max((len(row["tracking"]) for row in rows), default=0)
+        errors = sorted({name for row in rows for name in row["errors"]})
+        return [f"tracking:{i}" for i in range(groups)] + [f"errors:{name}" for name in errors]
 
     def curves(self, environment: str, method: str) -> list[Curve]:
         """The training curves of a method, seed by seed."""
@@ -126,7 +134,14 @@ class Data:
 
 
 def _metric(row: dict[str, Any], name: str) -> float:
-    return math.log1p(row["crashes"]) if name == "log_crashes" else row[name]
+    if name == "log_crashes":
+        return math.log1p(row["crashes"])
+    column, _, part = name.partition(":")
+    if not part:
+        return row[name]
+    if column == "tracking":
+        return row[column][int(part)] if int(part) < len(row[column]) else math.nan
+    return row[column].get(part, math.nan)
 
 
 def _check_settings(rows: list[dict[str, Any]]) -> None:

@@ -133,7 +133,9 @@ def result_rows(cell: Cell, run: RunFolder, evaluated: Iterable[dict[str, Any]])
         "device": config["device"],
         "versions": " ".join(f"{name}={versions[name]}" for name in names),
     }
-    return [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in evaluated]
+    rows = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in evaluated]
+    # Where a goal is all of a piece, its tracking is the reward.
+    return [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in rows]
 
 
 def curve_row(cell: Cell, run: RunFolder, points: int = 100) -> dict[str, Any]:

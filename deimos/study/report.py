@@ -135,7 +135,7 @@ def _table(data: Data, where: Where, resamples: int, seed: int) -> list[Block]:
     methods = [name for name in data.methods(where.environment) if len(data.sample(where, name, "crashes")) >= 2]
     if not methods:
         return []
-    uniform = data.sample(where, "uniform", "crashes")
+    uniform, parts = data.sample(where, "uniform", "crashes"), data.parts(where)
     rows = []
     for name in methods:
         crashes, reward = (data.sample(where, name, metric) for metric in ("crashes", "reward"))
@@ -152,10 +152,17 @@ def _table(data: Data, where: Where, resamples: int, seed: int) -> list[Block]:
             " to ".join(f"{x:.3g}" for x in np.quantile(crashes, [0.1, 0.9])),
             f"{np.median(rate):.4f}" if len(rate) else "-", _boot(reward, stats.iqm, resamples, seed, ".4f"),
             _boot(score, stats.iqm, resamples, seed, ".3f"), more,
+            *[_boot(data.sample(where, name, part), stats.iqm, resamples, seed, ".3g") for part in parts],
         ])  # fmt: skip
     header = ["method", "seeds", "crashes: median", "IQM", "mean", "worst 20 % (CVaR)", "IQR", "10 % to 90 %",
-              "crashes per interaction", "reward: IQM", "score: IQM", "P(more crashes than uniform)"]  # fmt: skip
+              "crashes per interaction", "reward: IQM", "score: IQM", "P(more crashes than uniform)",
+              *[_part_name(part) for part in parts]]  # fmt: skip
     return [Heading(str(where), 3), Table(header, rows)]
+
+
+def _part_name(part: str) -> str:
+    column, _, name = part.partition(":")
+    return f"tracking of goal group {name}: IQM" if column == "tracking" else f"{name}, median over goals: IQM"
 
 
 def _median(x: Array) -> Array:

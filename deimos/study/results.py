@@ -19,7 +19,7 @@ RESULT_COLUMNS: dict[str, type] = {
     "goals": str, "goal_period": int, "eval_seed": int, "worlds": int, "steps": int,
     # What came out.
     "reward": float, "score": float, "return_per_step": float, "crashes": int, "crashes_per_1000": float,
-    "interactions": int, "interaction_crashes": int, "crash_rate": float,
+    "interactions": int, "interaction_crashes": int, "crash_rate": float, "tracking": tuple, "errors": dict,
     "first_goal_steps": int, "first_goal_crashes": int,
     "adversary_steps": int, "adversary_interactions": int, "adversary_crashes": int, "adversary_auroc": float,
     "weak_adversary": bool,
@@ -169,6 +169,8 @@ def merge(target: Path, sources: Iterable[Path]) -> tuple[int, int, int]:
 def _value(kind: type, text: str) -> Any:
     if kind is tuple:
         return tuple(float(part) for part in text.split())
+    if kind is dict:
+        return {name: float(number) for name, _, number in (part.partition("=") for part in text.split())}
     if text == "":
         return math.nan if kind in (int, float) else None
     if kind is bool:
@@ -183,4 +185,6 @@ def _text(value: Any) -> str:
         return ""
     if isinstance(value, tuple | list):
         return " ".join(f"{part:.5g}" for part in value)
+    if isinstance(value, dict):
+        return " ".join(f"{name}={number:.5g}" for name, number in value.items())
     return repr(value) if isinstance(value, float) else str(value)
