@@ -1,11 +1,14 @@
 """Scores of many candidate goals by one Warp kernel, for selectors that serve an environment on Warp."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import warp as wp
 from torch import Tensor, nn
 
+from deimos.selector import Whitening
 from kernels.candidates import (
     MOST_COMPONENTS,
     MOST_COMPONENTS_SQUARED,
@@ -17,13 +20,14 @@ from kernels.candidates import (
 CANDIDATE = 2  # place of the candidates among the kernels' arguments
 
 
-def fuse(net: nn.Sequential, goal_dim: int, *, mean_square: bool = False) -> "FusedScores | None":
+def fuse(net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None) -> "FusedScores | None":
     """A kernel that does what ``networks.ManyCandidates`` does, if there is one for this network.
 
     Args:
         net: Made by ``networks.mlp``; the last ``goal_dim`` inputs are the candidate. Its weights may change, not move.
         goal_dim: Components of a candidate.
-        mean_square: Whether the score is the mean of the squared outputs instead of the one output.
+        whitening: How candidates are whitened before the network sees them; the score is the mean of its squared
+            outputs then. ``None`` for candidates as they are, and the one output as the score.
 
     Returns:
         ``None`` unless the network has one hidden layer of ReLU, and outputs and components that the kernel takes.
@@ -32,22 +36,25 @@ def fuse(net: nn.Sequential, goal_dim: int, *, mean_square: bool = False) -> "Fu
     if len(linears) != 2 or not isinstance(net[1], nn.ReLU):
         return None
     outputs = linears[1].out_features
-    if mean_square:
+    if whitening:
         fits = goal_dim <= MOST_COMPONENTS_SQUARED and outputs % OUTPUTS_AT_ONCE == 0
     else:
         fits = goal_dim <= MOST_COMPONENTS and outputs == 1
-    return FusedScores(linears[0], linears[1], goal_dim, mean_square=mean_square) if fits else None
+    return FusedScores(linears[0], linears[1], goal_dim, whitening) if fits else None
 
 
 class FusedScores:
     """See ``fuse``. Memory is allocated once for the most decisions that were asked for at a time."""
 
-    def __init__(self, first: nn.Linear, last: nn.Linear, goal_dim: int, *, mean_square: bool) -> None:
+    def __init__(self, first: nn.Linear, last: nn.Linear, goal_dim: int, whitening: Whitening | None) -> None:
         weight = first.weight.data
         self._bias, self._of_context = first.bias.data, weight[:, :-goal_dim].t()
-        out_weight = last.weight.data if mean_square else last.weight.data[0]
-        self._network = [wp.from_torch(part) for part in (weight[:, -goal_dim:], out_weight, last.bias.data)]
-        self._kernel = mean_square_of_candidates if mean_square else score_candidates
+        self._kernel: Callable[..., wp.Launch | None] = score_candidates
+        parts = [weight[:, -goal_dim:], last.weight.data if whitening else last.weight.data[0], last.bias.data]
+        if whitening:
+            parts += [whitening.mean, whitening.factor]
+            self._kernel = partial(mean_square_of_candidates, bound=whitening.bound)
+        self._network = [wp.from_torch(part) for part in parts]
         self._recorded: dict[int, _Recorded] = {}  # by the number of candidates
 
     @torch.no_grad()

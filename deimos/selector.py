@@ -12,11 +12,23 @@ from deimos.interactions import Interactions
 from deimos.rollout import Rollout
 
 
+@dataclass(frozen=True)
+class Whitening:
+    """What a network sees of a candidate: clip((x - mean) * factor, -bound, bound). Tensors may change, not move."""
+
+    mean: Tensor
+    """Shape (goal_dim,)."""
+    factor: Tensor
+    """Shape (goal_dim,)."""
+    bound: float
+    """Above 0."""
+
+
 class Fuse(Protocol):
     """Makes ``scores(context, candidates)``, shape (B, N), of a network; ``None`` where it cannot: ``fused.fuse``."""
 
     def __call__(
-        self, net: nn.Sequential, goal_dim: int, *, mean_square: bool = False
+        self, net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None
     ) -> Callable[[Tensor, Tensor], Tensor] | None:
         """See ``fused.fuse``."""
         ...

@@ -32,6 +32,25 @@ def _component(candidate: wp.array3d[float], i: int, first: int, d: int, lanes: 
     return x
 
 
+@wp.func
+def _whitened(
+    candidate: wp.array3d[float],
+    i: int,
+    first: int,
+    d: int,
+    mean: wp.array[float],
+    factor: wp.array[float],
+    bound: float,
+    lanes: Any,
+):
+    """What ``_component`` gives, less its mean, scaled and clipped; 0 where there is no such component."""
+    x = _component(candidate, i, first, d, lanes)
+    if d < candidate.shape[2]:
+        for lane in range(len(lanes)):
+            x[lane] = wp.clamp((x[lane] - mean[d]) * factor[d], -bound, bound)
+    return x
+
+
 @wp.kernel
 def _score(
     # In
@@ -78,15 +97,18 @@ def _mean_square(
     weight: wp.array2d[float],
     out_weight: wp.array2d[float],
     out_bias: wp.array[float],
+    mean: wp.array[float],
+    factor: wp.array[float],
+    bound: float,
     # Out
     score: wp.array2d[float],
 ):
     i, part = wp.tid()
     first = part * len(lanes)
     last = candidate.shape[2] - 1
-    c0 = _component(candidate, i, first, 0, lanes)
-    c1 = _component(candidate, i, first, 1, lanes)
-    c2 = _component(candidate, i, first, 2, lanes)
+    c0 = _whitened(candidate, i, first, 0, mean, factor, bound, lanes)
+    c1 = _whitened(candidate, i, first, 1, mean, factor, bound, lanes)
+    c2 = _whitened(candidate, i, first, 2, mean, factor, bound, lanes)
     squares = type(lanes)()
     for block in range(out_weight.shape[0] // wp.static(OUTPUTS_AT_ONCE)):
         k = wp.static(OUTPUTS_AT_ONCE) * block
@@ -155,11 +177,16 @@ def mean_square_of_candidates(
     weight: wp.array,
     out_weight: wp.array,
     out_bias: wp.array,
+    mean: wp.array,
+    factor: wp.array,
     score: wp.array,
     *,
+    bound: float,
     record: bool = False,
 ) -> wp.Launch | None:
-    """The mean of the squared outputs of a network for every candidate: ``mean((V relu(h_i + W g_ik) + b)^2)``.
+    """The mean of the squared outputs of a network for every candidate: ``mean((V relu(h_i + W x_ik) + b)^2)``.
+
+    The network sees whitened candidates, ``x_ik = clip((g_ik - mean) * factor, -bound, bound)``.
 
     Args:
         of_context: The hidden layer h before ReLU, without the candidate's share, float32, shape (n, hidden).
@@ -167,6 +194,9 @@ def mean_square_of_candidates(
         weight: W, of the hidden layer by the candidate, float32, shape (hidden, goal_dim).
         out_weight: V, of the outputs, float32, shape (outputs, hidden), a multiple of ``OUTPUTS_AT_ONCE`` outputs.
         out_bias: b, of the outputs, float32, shape (outputs,).
+        mean: What every component is less, float32, shape (goal_dim,).
+        factor: What it is times, float32, shape (goal_dim,).
+        bound: What it is clipped to, above 0.
         score: Mean squares, float32, shape (n, count). Written.
         record: See ``score_candidates``.
 
@@ -180,7 +210,12 @@ def mean_square_of_candidates(
         raise ValueError(f"out_weight must have a multiple of {OUTPUTS_AT_ONCE} rows, got {outputs}.")
     require("out_weight", out_weight, dtype=wp.float32, shape=(outputs, weight.shape[0]), like=of_context)
     require("out_bias", out_bias, dtype=wp.float32, shape=(outputs,), like=of_context)
-    return _launch(_mean_square, [of_context, candidate, weight, out_weight, out_bias], score, record)
+    for name, array in (("mean", mean), ("factor", factor)):
+        require(name, array, dtype=wp.float32, shape=candidate.shape[2:], like=of_context)
+    if not bound > 0:
+        raise ValueError(f"bound must be above 0, got {bound}.")
+    inputs = [of_context, candidate, weight, out_weight, out_bias, mean, factor, float(bound)]
+    return _launch(_mean_square, inputs, score, record)
 
 
 def _launch(kernel: wp.Kernel, inputs: list, score: wp.array, record: bool) -> wp.Launch | None:

@@ -11,6 +11,7 @@ from deimos import products
 from deimos.fused import fuse
 from deimos.networks import ManyCandidates, mlp
 from deimos.products import add_product_, fast_linear, onednn
+from deimos.selector import Whitening
 
 MATMUL = torch.backends.mkldnn.matmul
 
@@ -81,24 +82,28 @@ def test_inexact_library_is_not_used(monkeypatch):
         assert MATMUL.fp32_precision == before
 
 
-@pytest.mark.parametrize(("outputs", "mean_square"), [(1, False), (16, True)])
-def test_fused_scores_are_the_networks(torch_device, outputs, mean_square):
-    """One kernel gives what products give, for more and fewer decisions, other candidates and changed weights."""
+@pytest.mark.parametrize("outputs", [1, 16])
+def test_fused_scores_are_the_networks(torch_device, outputs):
+    """One kernel gives what products give, for more and fewer decisions, other candidates, weights and whitening."""
     torch.manual_seed(0)
     net = mlp(9, (64,), outputs, "relu").to(torch_device)
-    fused, by_products = fuse(net, 3, mean_square=mean_square), ManyCandidates(net, 3)
+    mean, factor = torch.randn(3, device=torch_device), torch.ones(3, device=torch_device)
+    whitening = Whitening(mean, factor, bound=1.0) if outputs > 1 else None
+    fused, by_products = fuse(net, 3, whitening=whitening), ManyCandidates(net, 3)
     kept = []
     for rows, count in ((20, 100), (3, 100), (50, 100), (20, 1), (20, 100)):
         context = torch.randn(rows, 6, device=torch_device)
         candidates = torch.randn(rows, count, 3, device=torch_device)
-        expected = by_products(context, candidates)
-        expected = expected.square().mean(2) if mean_square else expected.squeeze(2)
+        seen = ((candidates - mean) * factor).clamp(-1, 1) if whitening else candidates
+        expected = by_products(context, seen)
+        expected = expected.square().mean(2) if whitening else expected.squeeze(2)
         found = fused(context, candidates)
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
         kept.append((found, found.clone()))
         with torch.no_grad():
             for parameter in net.parameters():
                 parameter += 0.01 * torch.randn_like(parameter)
+        factor *= 0.9
     assert all(torch.equal(scores, copied) for scores, copied in kept), "a later call overwrote earlier scores"
 
 
@@ -113,7 +118,7 @@ def test_fused_scores_take_any_view():
 
 
 @pytest.mark.parametrize(
-    ("hidden", "outputs", "activation", "goal_dim", "mean_square"),
+    ("hidden", "outputs", "activation", "goal_dim", "whitened"),
     [
         ((64, 64), 1, "relu", 3, False),
         ((64,), 1, "tanh", 3, False),
@@ -123,6 +128,7 @@ def test_fused_scores_take_any_view():
         ((64,), 16, "relu", 4, True),
     ],
 )
-def test_what_no_kernel_does_is_left_to_products(hidden, outputs, activation, goal_dim, mean_square):
+def test_what_no_kernel_does_is_left_to_products(hidden, outputs, activation, goal_dim, whitened):
     """Other networks than the kernel's get none."""
-    assert fuse(mlp(9, hidden, outputs, activation), goal_dim, mean_square=mean_square) is None
+    whitening = Whitening(torch.zeros(goal_dim), torch.ones(goal_dim), 5.0) if whitened else None
+    assert fuse(mlp(9, hidden, outputs, activation), goal_dim, whitening=whitening) is None

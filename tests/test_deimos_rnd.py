@@ -1,10 +1,13 @@
 """Random network distillation over goals: what it is surprised by, and by what it is whitened."""
 
+import dataclasses
 import math
+import sys
 
 import pytest
 import torch
 
+from deimos.fused import fuse
 from deimos.interactions import Interactions
 from deimos.selector import Spaces
 from deimos.selectors import rnd
@@ -44,9 +47,12 @@ class World:
         return self.selector.learn(self.interactions, None)
 
 
-def test_scores_are_the_predictors_errors():
+@pytest.mark.parametrize("kernel", [None, fuse])
+def test_scores_are_the_predictors_errors(monkeypatch, kernel):
     """A surprise is the mean squared error between the two networks on whitened (state, goal, candidate)."""
+    monkeypatch.setattr(sys.modules[__name__], "SPACES", dataclasses.replace(SPACES, fuse=kernel))
     world = World()
+    assert (world.selector._fused is None) == (kernel is None)
     world.lesson()
     selector = world.selector
     _, state, goal, candidates, _ = world.decision()

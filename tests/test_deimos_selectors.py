@@ -139,6 +139,23 @@ def test_the_batch_does_not_matter(env_name, name):
 
 
 @pytest.mark.parametrize("name", ALL)
+def test_a_kernel_chooses_what_products_choose(env_name, name):
+    """Where worlds have kernels, a trained selector proposes the goals and scores that it proposes by torch alone."""
+    run = trained(env_name, name)[0]
+    *_, (learnt, arguments) = fresh_and_trained(env_name, name)
+    own = spaces(run.env, 96)
+    proposals = []
+    for served in (own, dataclasses.replace(own, fuse=None)):
+        selector = small(ALL[name]).build(served, 0)
+        selector.load_state_dict(copy.deepcopy(learnt.state_dict()))
+        proposals.append(selector.propose(*arguments))
+    fused, bare = proposals
+    same = (fused.goal == bare.goal).all(1)
+    assert same.float().mean() > 0.97  # two candidates may be as good as each other up to float32's rounding
+    torch.testing.assert_close(fused.score[same], bare.score[same], rtol=1e-3, atol=1e-4, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", ALL)
 def test_it_is_deterministic_in_its_seed_and_resumes_bit_for_bit(env_name, name):
     """A second run of one seed starts alike whatever torch drew before, and from a saved state it ends alike."""
     _, rows, saved, last = trained(env_name, name)

@@ -1,5 +1,7 @@
 """Scores of many candidates by networks of one hidden layer."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,9 @@ from kernels.candidates import (
 )
 from kernels.lanes import WIDE, lanes, threads
 
+BOUND = 0.5  # so low that many components are clipped
+squares_of_candidates = functools.partial(mean_square_of_candidates, bound=BOUND)
+
 
 def network(rows, count, goal_dim, hidden, outputs, seed=0):
     """Arguments of both launchers by name, float32; ``out_weight`` of one output is a vector."""
@@ -26,7 +31,7 @@ def network(rows, count, goal_dim, hidden, outputs, seed=0):
         "out_weight": normal(outputs, hidden) if outputs > 1 else normal(hidden),
         "out_bias": normal(outputs),
         "score": np.full((rows, count), np.nan, np.float32),
-    }
+    } | ({"mean": normal(goal_dim), "factor": normal(goal_dim)} if outputs > 1 else {})
 
 
 def on(device, arguments):
@@ -36,6 +41,8 @@ def on(device, arguments):
 def reference(a):
     """Outputs of the network in float64, shape (rows, count, outputs)."""
     a = {name: value.astype(np.float64) for name, value in a.items()}
+    if "mean" in a:
+        a["candidate"] = np.clip((a["candidate"] - a["mean"]) * a["factor"], -BOUND, BOUND)
     hidden = np.maximum(a["of_context"][:, None] + a["candidate"] @ a["weight"].T, 0.0)
     return hidden @ np.atleast_2d(a["out_weight"]).T + a["out_bias"]
 
@@ -58,7 +65,7 @@ def test_mean_square_matches_reference(device, outputs, count, goal_dim):
     """The score is the mean of the squared outputs."""
     a = network(5, count, goal_dim, 30, outputs, seed=goal_dim)
     arrays = on(device, a)
-    mean_square_of_candidates(**arrays)
+    squares_of_candidates(**arrays)
     np.testing.assert_allclose(arrays["score"].numpy(), np.square(reference(a)).mean(2), rtol=1e-4)
 
 
@@ -71,7 +78,7 @@ def test_relu_cuts_what_is_negative(device):
     np.testing.assert_array_equal(arrays["score"].numpy(), np.broadcast_to(a["out_bias"], (3, 100)))
 
 
-@pytest.mark.parametrize("launcher", [score_candidates, mean_square_of_candidates])
+@pytest.mark.parametrize("launcher", [score_candidates, squares_of_candidates])
 def test_contexts_and_candidates_do_not_mix(device, launcher):
     """A candidate's score is bit for bit the same beside other contexts and, in as many lanes, other candidates."""
     outputs = 1 if launcher is score_candidates else 8
@@ -127,16 +134,18 @@ def test_threads_cover_every_number(device):
     ("launcher", "wrong", "message"),
     [
         (score_candidates, {"candidate": (5, 8, MOST_COMPONENTS + 1)}, "candidate must have 1 to 6 components, got 7"),
-        (mean_square_of_candidates, {"candidate": (5, 8, 4)}, "candidate must have 1 to 3 components, got 4"),
+        (squares_of_candidates, {"candidate": (5, 8, 4)}, "candidate must have 1 to 3 components, got 4"),
         (score_candidates, {"candidate": (4, 8, 3)}, r"candidate must be float32\(5, 8, 3\)"),
         (score_candidates, {"of_context": (5,)}, "of_context must have 2 axes"),
         (score_candidates, {"weight": (12, 2)}, r"weight must be float32\(12, 3\)"),
         (score_candidates, {"out_weight": (11,)}, r"out_weight must be float32\(12,\)"),
         (score_candidates, {"out_bias": (2,)}, r"out_bias must be float32\(1,\)"),
         (score_candidates, {"score": (5, 9)}, r"score must be float32\(5, 8\)"),
-        (mean_square_of_candidates, {"out_weight": (6, 12), "out_bias": (6,)}, "multiple of 4 rows, got 6"),
-        (mean_square_of_candidates, {"out_weight": (12,)}, "out_weight must have 2 axes"),
-        (mean_square_of_candidates, {"out_bias": (4,)}, r"out_bias must be float32\(8,\)"),
+        (squares_of_candidates, {"out_weight": (6, 12), "out_bias": (6,)}, "multiple of 4 rows, got 6"),
+        (squares_of_candidates, {"out_weight": (12,)}, "out_weight must have 2 axes"),
+        (squares_of_candidates, {"out_bias": (4,)}, r"out_bias must be float32\(8,\)"),
+        (squares_of_candidates, {"mean": (2,)}, r"mean must be float32\(3,\)"),
+        (squares_of_candidates, {"factor": (1,)}, r"factor must be float32\(3,\)"),
     ],
 )
 def test_rejects(device, launcher, wrong, message):
@@ -145,6 +154,13 @@ def test_rejects(device, launcher, wrong, message):
     arrays |= {name: wp.zeros(shape, dtype=wp.float32, device=device) for name, shape in wrong.items()}
     with pytest.raises(ValueError, match=message):
         launcher(**arrays)
+
+
+@pytest.mark.parametrize("bound", [0.0, -1.0, float("nan")])
+def test_rejects_a_bound_that_is_none(device, bound):
+    """Nothing can be clipped to an empty range."""
+    with pytest.raises(ValueError, match="bound must be above 0"):
+        mean_square_of_candidates(**on(device, network(5, 8, 3, 12, 8)), bound=bound)
 
 
 def test_rejects_another_dtype(device):

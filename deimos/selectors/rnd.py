@@ -14,7 +14,7 @@ from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parame
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 from deimos.seeds import generator, weights_from
-from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Whitening
 
 CLIP = 5.0  # bound of whitened inputs, as in the paper
 
@@ -80,7 +80,6 @@ class RND(GoalSelector):
         self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
         self._join()
         self._error = ManyCandidates(self._difference, spaces.goal_dim)
-        self._fused = spaces.fuse(self._difference, spaces.goal_dim, mean_square=True) if spaces.fuse else None
         self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=spaces.device))
         self.generator = generator(seed, "rnd minibatches", spaces.device)
@@ -91,6 +90,8 @@ class RND(GoalSelector):
         self._mean, self._scale = torch.zeros(inputs, device=spaces.device), torch.ones(inputs, device=spaces.device)
         self._context = slice(0, inputs - spaces.goal_dim)
         self._goal = slice(inputs - spaces.goal_dim, inputs)
+        whitening = Whitening(self._mean[self._goal], self._scale[self._goal], CLIP)
+        self._fused = spaces.fuse(self._difference, spaces.goal_dim, whitening=whitening) if spaces.fuse else None
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
         """Whether it has seen anything yet; before, nothing can be whitened."""
@@ -109,7 +110,7 @@ class RND(GoalSelector):
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
         context = self._whiten(torch.cat([state, goal], dim=1), self._context)
         if self._fused is not None:
-            return self._fused(context, self._whiten(candidates, self._goal))
+            return self._fused(context, candidates)
         scores = []
         # Features of all candidates together would not fit a cache; fresh memory for them costs more than the products.
         size = self._error.contexts_at_once(candidates.shape[1])
