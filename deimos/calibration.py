@@ -137,7 +137,9 @@ def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     ])  # fmt: skip
     # The rest is a few numbers: one transfer, and no operation of the device for each.
     parts = [scalars, curve.predicted, curve.observed, curve.count.double() / len(p)]
-    (rate, brier, loss, gap), *bins = (part.tolist() for part in torch.cat(parts).split([len(part) for part in parts]))
+    (rate, brier, loss, gap), *bins = (
+        part.tolist() for part in torch.cat(parts).cpu().split([len(part) for part in parts])
+    )
     base = -sum(q * math.log(q) for q in (rate, 1 - rate) if q > 0)
     gaps = [(share, predicted - observed, observed - rate) for predicted, observed, share in zip(*bins, strict=True)]
     values = (

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from deimos.networks import Backprop, ManyCandidates, rows_in_cache
-from deimos.products import activate_, onednn
+from deimos.networks import ManyCandidates, rows_in_cache
+from deimos.products import activate_, multiply_by_slope_, onednn
 
 
 class Stack:
@@ -27,12 +27,11 @@ class Stack:
         self.parameters = nn.Parameter(torch.zeros(self._pack(), device=first.device))
         self.parameters.grad = torch.zeros_like(self.parameters)
         self._pack(move=True)
-        self._member = Backprop(nets[0])
         self._activation = nets[0][1]
         self._inputs: list[Tensor] = []
         self._threads = torch.get_num_threads()
         widest = max(layer.in_features for layer in self._linears[0][1:])
-        self._piece = rows_in_cache(widest) // len(nets) if first.device.type == "cpu" else sys.maxsize
+        self._piece = rows_in_cache(widest * len(nets)) if first.device.type == "cpu" else sys.maxsize
 
     def _pack(self, move: bool = False) -> int:
         """Lay every layer's weights, then its biases, of all members end to end; returns their number."""
@@ -70,8 +69,7 @@ class Stack:
 
     def pieces(self, rows: int) -> Iterator[slice]:
         """Consecutive parts of ``rows`` rows per member; on a CPU such as suit its caches, on a GPU all of them."""
-        size = min(max(1, self._piece), rows)
-        return (slice(start, start + size) for start in range(0, rows, size))
+        return (slice(start, start + self._piece) for start in range(0, max(1, rows), self._piece))
 
     @torch.no_grad()
     def forward(self, x: Tensor) -> Tensor:
@@ -82,7 +80,7 @@ class Stack:
         """
         x = x.expand(len(self.nets), -1, -1)
         self._inputs = []
-        with onednn():
+        with onednn(x.device):
             for i, (weight, bias, _, _) in enumerate(self._layers):
                 self._inputs.append(x)
                 x = torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
@@ -93,7 +91,7 @@ class Stack:
     @torch.no_grad()
     def backward(self, delta: Tensor) -> None:
         """Add the gradient of every weight to its ``grad``; ``delta`` is shaped like what ``forward`` gave last."""
-        with onednn():
+        with onednn(delta.device):
             for i in reversed(range(len(self._layers))):
                 weight, _, weight_grad, bias_grad = self._layers[i]
                 x = self._inputs[i]
@@ -102,7 +100,7 @@ class Stack:
                 if i:
                     # An outer product is no work for a library.
                     delta = delta * weight if delta.shape[2] == 1 else torch.bmm(delta, weight)
-                    self._member.multiply_by_slope(delta, x)
+                    multiply_by_slope_(delta, x, self._activation)
 
     def clip_gradients(self, max_norm: float) -> None:
         """Scale every member's own gradient down to a norm of at most ``max_norm``."""

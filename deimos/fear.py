@@ -31,7 +31,8 @@ class FearConfig:
     min_per_class: int = 32
     """Crashes and survivals that the window must hold before a fit, at least 1."""
     workspace: int = 64
-    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts."""
+    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. One hidden layer
+    of ReLU needs none in training: a kernel scores them."""
 
     def __post_init__(self) -> None:
         check_hidden("hidden", self.hidden)

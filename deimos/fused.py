@@ -17,8 +17,6 @@ from kernels.candidates import (
     score_candidates,
 )
 
-CANDIDATE = 2  # place of the candidates among the kernels' arguments
-
 
 def fuse(net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None) -> "FusedScores | None":
     """A kernel that does what ``networks.ManyCandidates`` does, if there is one for this network.
@@ -31,7 +29,9 @@ def fuse(net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = Non
 
     Returns:
         ``None`` unless the network has one hidden layer of ReLU, and outputs and components that the kernel takes.
+        NaN in a context or a candidate counts as 0 there: what could bring it is looked for elsewhere.
     """
+    wp.init()
     linears = [layer for layer in net if isinstance(layer, nn.Linear)]
     if len(linears) != 2 or not isinstance(net[1], nn.ReLU):
         return None
@@ -48,6 +48,7 @@ class FusedScores:
 
     def __init__(self, first: nn.Linear, last: nn.Linear, goal_dim: int, whitening: Whitening | None) -> None:
         weight = first.weight.data
+        self._goal_dim = goal_dim
         self._bias, self._of_context = first.bias.data, weight[:, :-goal_dim].t()
         self._kernel: Callable[..., wp.Launch | None] = score_candidates
         parts = [weight[:, -goal_dim:], last.weight.data if whitening else last.weight.data[0], last.bias.data]
@@ -64,15 +65,25 @@ class FusedScores:
         Args:
             context: The other inputs, shape (B, inputs - goal_dim).
             candidates: Shape (B, N, goal_dim).
+
+        Raises:
+            ValueError: If the shapes do not fit each other or the network.
         """
-        rows, count = candidates.shape[:2]
+        rows, count, goal_dim = candidates.shape
+        if context.shape != (rows, len(self._of_context)) or goal_dim != self._goal_dim:
+            raise ValueError(
+                f"context and candidates must have the shapes (B, {len(self._of_context)}) and (B, N, "
+                f"{self._goal_dim}), got {tuple(context.shape)} and {tuple(candidates.shape)}."
+            )
+        if rows == 0:
+            return candidates.new_empty(0, count)
         candidates = candidates.contiguous()
         known = self._recorded.get(count)
         if known is None or rows > len(known.hidden):
             known = self._recorded[count] = self._record(candidates)
         elif candidates.data_ptr() != known.candidates_at:
             known.candidates_at = candidates.data_ptr()
-            known.launch.set_param_at_index(CANDIDATE, wp.from_torch(candidates))
+            known.launch.set_param_by_name("candidate", wp.from_torch(candidates))
         torch.addmm(self._bias, context, self._of_context, out=known.hidden[:rows])
         known.launch.set_dim((rows, known.launch.bounds.shape[1]))
         known.launch.launch()

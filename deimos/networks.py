@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from deimos.products import activate_, add_product_, fast_linear
+from deimos.products import activate_, add_product_, fast_linear, multiply_by_slope_
 
 Activation = Literal["relu", "elu", "tanh"]
 
@@ -125,17 +125,7 @@ class Backprop:
             layer.bias.grad += delta.sum(0)
             if layer is not self._linears[0]:
                 delta = fast_linear(delta, layer.weight.t(), None)
-                self.multiply_by_slope(delta, x)
-
-    def multiply_by_slope(self, delta: Tensor, y: Tensor) -> None:
-        """Multiply ``delta`` in place by the activation's slope, which its output ``y`` determines."""
-        aten = torch.ops.aten
-        if isinstance(self._activation, nn.ReLU):
-            aten.threshold_backward(delta, y, 0, grad_input=delta)
-        elif isinstance(self._activation, nn.ELU):
-            aten.elu_backward(delta, 1, 1, 1, True, y, grad_input=delta)
-        else:
-            aten.tanh_backward(delta, y, grad_input=delta)
+                multiply_by_slope_(delta, x, self._activation)
 
 
 class ManyCandidates:
@@ -147,7 +137,7 @@ class ManyCandidates:
     Args:
         net: Made by ``mlp``; the last ``goal_dim`` inputs are the candidate. Its weights may change, not move.
         goal_dim: Components of a candidate.
-        workspace: Memory for activations [MiB]; what takes more is done in parts. A CPU takes parts of 1.5 MiB,
+        workspace: Memory for activations [MiB]; what takes more is done in parts. A CPU takes parts of 3 MiB,
             which fit its caches. The result is the same for any, up to the rounding of float32 products.
     """
 

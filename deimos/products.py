@@ -1,12 +1,12 @@
 """Matrix products of float32 on a CPU by the faster of the two libraries that PyTorch has for them.
 
 PyTorch hands them to MKL, which takes twice as long as oneDNN and longer where the processor is not Intel's.
-A GPU has one library, and everything here falls through to it.
+A GPU has one library; there everything here is the plain operation.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cache
 
 import torch
 from torch import Tensor, nn
@@ -46,7 +46,7 @@ def add_product_(total: Tensor, delta: Tensor, x: Tensor) -> None:
         x: Shape (n, inputs).
     """
     if len(x) * total.numel() >= 2**21:
-        with onednn():
+        with onednn(x.device):
             total.addmm_(delta.t(), x)
     else:
         total.addmm_(delta.t(), x)
@@ -61,23 +61,36 @@ def activate_(x: Tensor, activation: nn.Module) -> Tensor:
     return torch.tanh_(x)
 
 
-@contextmanager
-def onednn() -> Iterator[None]:
-    """Within it, larger products of float32 go to oneDNN where that leaves them float32; elsewhere nothing changes.
+def multiply_by_slope_(delta: Tensor, y: Tensor, activation: nn.Module) -> None:
+    """Multiply ``delta`` by the slope of an activation, which its output ``y`` determines, in place."""
+    aten = torch.ops.aten
+    if isinstance(activation, nn.ReLU):
+        aten.threshold_backward(delta, y, 0, grad_input=delta)
+    elif isinstance(activation, nn.ELU):
+        aten.elu_backward(delta, 1, 1, 1, True, y, grad_input=delta)
+    else:
+        aten.tanh_backward(delta, y, grad_input=delta)
 
-    The switch is one of the process. Threads may enter and leave as they like only while whoever started them
-    stays inside: then none of them changes anything.
+
+@contextmanager
+def onednn(device: torch.device) -> Iterator[None]:
+    """Within it, larger products of float32 on a CPU go to oneDNN where that leaves them float32; else nothing changes.
+
+    The switch (``torch.backends.mkldnn.matmul.fp32_precision``) is the process's: use it around products alone, and
+    not from several threads. Afterwards it is what it was, and no longer follows ``torch.backends.fp32_precision``.
     """
+    if device.type != "cpu" or not _exact_through_onednn():
+        yield
+        return
     before = _MATMUL.fp32_precision
-    if before != "bf16" and _exact_through_onednn():
-        _MATMUL.fp32_precision = "bf16"
+    _MATMUL.fp32_precision = "bf16"
     try:
         yield
     finally:
         _MATMUL.fp32_precision = before
 
 
-@lru_cache(maxsize=1)
+@cache
 def _exact_through_onednn() -> bool:
     """Whether oneDNN multiplies float32 exactly also where it is allowed bfloat16.
 

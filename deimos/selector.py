@@ -54,7 +54,7 @@ class Spaces:
     """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
     total_steps: int = 0
     """Steps of the whole training; 0 where nobody knows."""
-    fuse: "Fuse | None" = None
+    fuse: Fuse | None = None
     """Who scores candidates in one kernel, where the worlds have kernels (``fused.fuse``); ``None`` for torch alone."""
 
     def state_then_goal(self, obs: Tensor) -> Tensor:

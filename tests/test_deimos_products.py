@@ -1,7 +1,6 @@
 """Matrix products by the faster library, and scores of candidates by one kernel: neither changes a result."""
 
 import copy
-import threading
 
 import pytest
 import torch
@@ -13,6 +12,7 @@ from deimos.networks import ManyCandidates, mlp
 from deimos.products import add_product_, fast_linear, onednn
 from deimos.selector import Whitening
 
+CPU = torch.device("cpu")
 MATMUL = torch.backends.mkldnn.matmul
 
 
@@ -44,41 +44,31 @@ def test_gradients_of_weights_are_float32(rows, inputs, outputs):
 def test_onednn_leaves_the_switch_as_it_was():
     """Afterwards, also after an error and within itself, products are made as before."""
     before = MATMUL.fp32_precision
-    with onednn():
-        inside = MATMUL.fp32_precision
-        with onednn():
+    inside = "bf16" if products._exact_through_onednn() else before
+    with onednn(CPU):
+        assert MATMUL.fp32_precision == inside
+        with onednn(CPU):
             assert MATMUL.fp32_precision == inside
         assert MATMUL.fp32_precision == inside
     assert MATMUL.fp32_precision == before
-    with pytest.raises(KeyError), onednn():
+    with pytest.raises(KeyError), onednn(CPU):
         raise KeyError
     assert MATMUL.fp32_precision == before
 
 
-def test_threads_inside_change_nothing_for_each_other():
-    """Threads that enter and leave within a caller who stays never see the switch off."""
-    with onednn():
-        inside, seen = MATMUL.fp32_precision, set()
-
-        def work():
-            for _ in range(200):
-                with onednn():
-                    seen.add(MATMUL.fp32_precision)
-                seen.add(MATMUL.fp32_precision)
-
-        workers = [threading.Thread(target=work) for _ in range(4)]
-        for worker in workers:
-            worker.start()
-        for worker in workers:
-            worker.join()
-    assert seen == {inside}
+def test_onednn_is_nothing_to_a_gpu(monkeypatch):
+    """Products of another device than a CPU neither touch the switch nor try the library."""
+    monkeypatch.setattr(products, "_exact_through_onednn", None)
+    before = MATMUL.fp32_precision
+    with onednn(torch.device("cuda")):
+        assert MATMUL.fp32_precision == before
 
 
 def test_inexact_library_is_not_used(monkeypatch):
     """Where oneDNN would multiply in bfloat16, the switch stays where it is."""
     monkeypatch.setattr(products, "_exact_through_onednn", lambda: False)
     before = MATMUL.fp32_precision
-    with onednn():
+    with onednn(CPU):
         assert MATMUL.fp32_precision == before
 
 
@@ -115,6 +105,15 @@ def test_fused_scores_take_any_view():
     context = torch.randn(20, 6)
     expected = ManyCandidates(net, 3)(context, candidates).squeeze(2)
     torch.testing.assert_close(fuse(net, 3)(context, candidates), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_fused_scores_check_their_shapes():
+    """No decision has no score; contexts and candidates that do not fit raise ``ValueError`` before any launch."""
+    fused = fuse(mlp(9, (64,), 1, "relu"), 3)
+    assert fused(torch.zeros(0, 6), torch.zeros(0, 100, 3)).shape == (0, 100)
+    for context, candidates in (((4, 6), (2, 100, 3)), ((4, 5), (4, 100, 3)), ((4, 6), (4, 100, 2))):
+        with pytest.raises(ValueError, match=r"must have the shapes \(B, 6\) and \(B, N, 3\)"):
+            fused(torch.zeros(*context), torch.zeros(*candidates))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import base64
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from PIL import Image
 from deimos.run_folder import RunError
 from deimos.study import document, figures, report, stats
 from deimos.study.claim_list import CLAIMS
+from deimos.study.data import Data
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, curves, results
 
 METHODS = ["coop", "p25", "p75", "antagonist", "uniform", "vds"]
@@ -31,7 +33,10 @@ def fill(folder, seeds=4, points=20):
                     crashes = int(np.exp(rng.normal(5, 0.5))) if goals == "adversary" else 0
                     weak = method == "coop" and seed == 0 and goals == "adversary"
                     if environment == "quad":
-                        row |= {"tracking": tuple(rng.uniform(0.6, 0.7, 2)), "errors": {"reach": rng.uniform(0.3, 0.4)}}
+                        row |= {
+                            "tracking": tuple(rng.uniform(0.6, 0.7, 2)),
+                            "errors": {"end effector [m]": rng.uniform(0.3, 0.4)},
+                        }
                     rows.append(row | {"goals": goals, "crashes": crashes, "crashes_per_1000": crashes / 4000,
                                        "reward": rng.normal(0.8, 0.01), "fps": rng.normal(1e5, 1e3),
                                        "weak_adversary": weak})  # fmt: skip
@@ -126,7 +131,11 @@ def test_tracking_and_errors_stand_beside_the_crashes(folder):
     """Where goals have several groups, and an environment errors, the tables of its policies have their means."""
     text = (folder / "report.md").read_text()
     particle, quad = text.split("### directional, Naive")[1].split("### quad, Naive")
-    for name in ("tracking of goal group 0: IQM", "tracking of goal group 1: IQM", "reach, median over goals: IQM"):
+    for name in (
+        "tracking of goal group 0: IQM",
+        "tracking of goal group 1: IQM",
+        "end effector [m], median over goals: IQM",
+    ):
         assert name not in particle
         assert name in quad
     line = next(line for line in quad.splitlines() if "| uniform |" in line or line.startswith("uniform"))
@@ -143,6 +152,14 @@ def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):
     report.write(folder, tmp_path, resamples=200)
     text = re.sub(r"!\[.*\n\n", "", (folder / "report.md").read_text())
     assert (tmp_path / "report.md").read_text() == text
+
+
+def test_committed_studies_can_be_read():
+    """The tables under docs/results are of today's schema."""
+    tables = sorted((Path(__file__).parent.parent / "docs" / "results").glob("*/results.csv"))
+    assert len(tables) >= 1
+    for table in tables:
+        assert Data.read(table.parent).environments
 
 
 def test_empty_folder_has_no_report(tmp_path):

@@ -31,7 +31,7 @@ def table(tmp_path):
 def row(name, **more):
     """A row of that table."""
     return {"name": name, "count": 3, "rate": 0.1 + 0.2, "weak": False, "points": (1.0, 0.25),
-            "errors": {"reach": 0.125, "yaw": math.inf}} | more  # fmt: skip
+            "errors": {"end effector [m]": 0.1 + 0.2, "a, b": math.inf}} | more  # fmt: skip
 
 
 def result(hash, goals="naive", **more):
@@ -87,10 +87,10 @@ def test_other_schema_is_refused(table):
     for use in (table.read, lambda: table.append([row("a")])):
         with pytest.raises(RunError, match=message):
             use()
-    table.path.write_text("count,name,rate,weak,points\n")
+    table.path.write_text("count,name,rate,weak,points,errors\n")
     with pytest.raises(RunError, match="its columns stand in another order"):
         table.read()
-    assert table.path.read_text() == "count,name,rate,weak,points\n"
+    assert table.path.read_text() == "count,name,rate,weak,points,errors\n"
 
 
 def test_broken_value_is_refused(table):

@@ -3,6 +3,7 @@
 import csv
 import fcntl
 import io
+import json
 import math
 import os
 from collections.abc import Iterable
@@ -169,10 +170,10 @@ def merge(target: Path, sources: Iterable[Path]) -> tuple[int, int, int]:
 def _value(kind: type, text: str) -> Any:
     if kind is tuple:
         return tuple(float(part) for part in text.split())
-    if kind is dict:
-        return {name: float(number) for name, _, number in (part.partition("=") for part in text.split())}
+    if kind is dict and text:
+        return json.loads(text)
     if text == "":
-        return math.nan if kind in (int, float) else None
+        return {int: math.nan, float: math.nan, dict: {}}.get(kind)
     if kind is bool:
         if text not in ("True", "False"):
             raise ValueError(f"'{text}' is neither True nor False")
@@ -186,5 +187,5 @@ def _text(value: Any) -> str:
     if isinstance(value, tuple | list):
         return " ".join(f"{part:.5g}" for part in value)
     if isinstance(value, dict):
-        return " ".join(f"{name}={number:.5g}" for name, number in value.items())
+        return json.dumps(value) if value else ""
     return repr(value) if isinstance(value, float) else str(value)
