@@ -147,8 +147,9 @@ class RND(GoalSelector):
         self._observe(torch.cat([context, uniform], dim=1).double())
         everything = slice(0, len(self._mean))
         inputs = self._whiten(torch.cat([context, next_goal], dim=1), everything)
-        surprise = (self._pass.forward(inputs) - self._target_pass.forward(inputs)).square_().mean().item()
-        return {"rnd/surprise": surprise, "rnd/loss": self._fit(inputs)}
+        target = self._target_pass.forward(inputs)
+        surprise = (self._pass.forward(inputs) - target).square_().mean().item()
+        return {"rnd/surprise": surprise, "rnd/loss": self._fit(inputs, target)}
 
     def _observe(self, inputs: Tensor) -> None:
         self._moments[0] += len(inputs)
@@ -161,7 +162,7 @@ class RND(GoalSelector):
         self._scale.copy_(torch.where(variance > 1e-12, variance, torch.inf).rsqrt())
         self.fitted = True
 
-    def _fit(self, inputs: Tensor) -> float:
+    def _fit(self, inputs: Tensor, target: Tensor) -> float:
         """Adam on the mean squared error; returns that of the last pass."""
         assert self._parameters.grad is not None
         size = -(-len(inputs) // self.config.minibatches)
@@ -169,9 +170,9 @@ class RND(GoalSelector):
         for _ in range(self.config.epochs):
             total.zero_()
             order = torch.randperm(len(inputs), generator=self.generator, device=inputs.device)
-            for minibatch in inputs[order].split(size):
+            for rows in order.split(size):
                 self._parameters.grad.zero_()
-                error = self._pass.forward(minibatch) - self._target_pass.forward(minibatch)
+                error = self._pass.forward(inputs[rows]) - target[rows]
                 self._pass.backward(error * (2.0 / error.numel()))
                 mean_over_ranks(self._parameters.grad)
                 self.optimizer.step()
