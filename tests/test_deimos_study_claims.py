@@ -94,6 +94,18 @@ def test_complete_data_give_every_planned_test(alike, claim):
         assert not math.isnan(judged.finding.interval.estimate)
 
 
+def test_only_some_methods_are_left():
+    """Data of the thesis's methods are those that a study without the others would have, curves and claims too."""
+    with_more = Data(*population(4, ["relative"], methods=[*PARTICLE_METHODS, "learnability"]))
+    left = with_more.only(PARTICLE_METHODS)
+    assert "learnability" in with_more.methods("relative")
+    assert set(left.methods("relative")) == set(PARTICLE_METHODS)
+    assert left.curves("relative", "learnability") == []
+    assert len(left.sample(Where("relative", "naive", 100), "learnability", "crashes")) == 0
+    claim = next(claim for claim in CLAIMS if claim.id == "C11")
+    assert claims.test(claim, left).made == claim.planned < claims.test(claim, with_more).made
+
+
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
 def test_no_data_is_not_testable(claim):
     """Where no environment of a claim was run, it is not testable, and says where data are missing."""

@@ -1,7 +1,8 @@
 """The results of a study as samples: one value per policy, by environment, goals, T and method."""
 
+import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,15 @@ class Data:
         if not rows:
             raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
         return cls(rows, curves(folder).read())
+
+    def only(self, methods: Collection[str]) -> "Data":
+        """The same results without those of other methods."""
+        found = copy.copy(self)
+        found.rows = [row for row in self.rows if row["method"] in methods]
+        found.weak = [row for row in self.weak if row["method"] in methods]
+        found._samples = {key: seeds for key, seeds in self._samples.items() if key[1] in methods}
+        found._curves = {key: seeds for key, seeds in self._curves.items() if key[1] in methods}
+        return found
 
     @property
     def environments(self) -> list[str]:
