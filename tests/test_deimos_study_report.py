@@ -120,7 +120,9 @@ def test_markdown_says_the_same(folder):
 def test_report_says_what_limits_it(folder):
     """Weak adversaries are counted; the caveat of training curves and the detectable effects are printed."""
     text = (folder / "report.md").read_text()
-    assert "2 of 48 evaluations by the Adversary are marked weak" in text
+    assert (
+        "2 of 48 evaluations by the Adversary are marked weak and left out (directional: coop 1; quad: coop 1)" in text
+    )
     assert figures.CAVEAT in text
     assert "minimum detectable effect" in text
     assert "| quad | vds |" in text

@@ -97,7 +97,17 @@ def _what_was_run(data: Data) -> list[Block]:
               "evaluation: worlds x steps", "setting"]  # fmt: skip
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
     adversaries = [row for row in data.rows if row["goals"] == "adversary"]
-    weak = f"{len(data.weak)} of {len(adversaries)} evaluations by the Adversary are marked weak and left out."
+    weak = f"{len(data.weak)} of {len(adversaries)} evaluations by the Adversary are marked weak and left out"
+    if data.weak:
+        counted = Counter((row["environment"], row["method"]) for row in data.weak)
+        parts = [f"{place}: " + ", ".join(f"{name} {counted[place, name]}" for name in data.methods(place)
+                                          if counted[place, name]) for place in data.environments
+                 if any(where == place for where, _ in counted)]  # fmt: skip
+        weak += (
+            f" ({'; '.join(parts)}). A policy that hardly ever crashes gives its Adversary nothing to learn from, so "
+            "what is left of a method with many of them are its least safe policies"
+        )
+    weak += "."
     return [
         Heading("What was run"),
         Table(header, rows),
