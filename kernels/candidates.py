@@ -51,6 +51,18 @@ def _whitened(
     return x
 
 
+@wp.func
+def _by_three(
+    of_context: wp.array2d[float], weight: wp.array2d[float], i: int, j: int, last: int, c0: Any, c1: Any, c2: Any
+):
+    """Hidden unit ``j`` before ReLU, by the first three components of the candidates; those beyond ``last`` are 0."""
+    h = type(c0)(of_context[i, j])
+    h += weight[j, 0] * c0
+    h += weight[j, wp.min(1, last)] * c1
+    h += weight[j, wp.min(2, last)] * c2
+    return h
+
+
 @wp.kernel
 def _score(
     # In
@@ -74,10 +86,7 @@ def _score(
     c5 = _component(candidate, i, first, 5, lanes)
     total = type(lanes)(out_bias[0])
     for j in range(weight.shape[0]):
-        h = type(lanes)(of_context[i, j])
-        h += weight[j, 0] * c0
-        h += weight[j, wp.min(1, last)] * c1
-        h += weight[j, wp.min(2, last)] * c2
+        h = _by_three(of_context, weight, i, j, last, c0, c1, c2)
         if last > 2:
             h += weight[j, 3] * c3
             h += weight[j, wp.min(4, last)] * c4
@@ -118,11 +127,7 @@ def _mean_square(
         y2 = type(lanes)(out_bias[k + 2])
         y3 = type(lanes)(out_bias[k + 3])
         for j in range(weight.shape[0]):
-            h = type(lanes)(of_context[i, j])
-            h += weight[j, 0] * c0
-            h += weight[j, wp.min(1, last)] * c1
-            h += weight[j, wp.min(2, last)] * c2
-            h = wp.max(h, type(lanes)())
+            h = wp.max(_by_three(of_context, weight, i, j, last, c0, c1, c2), type(lanes)())
             y0 += out_weight[k, j] * h
             y1 += out_weight[k + 1, j] * h
             y2 += out_weight[k + 2, j] * h
