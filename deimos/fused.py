@@ -29,7 +29,6 @@ def fuse(net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = Non
 
     Returns:
         ``None`` unless the network has one hidden layer of ReLU, and outputs and components that the kernel takes.
-        NaN in a context or a candidate counts as 0 there: what could bring it is looked for elsewhere.
     """
     wp.init()
     linears = [layer for layer in net if isinstance(layer, nn.Linear)]

@@ -47,7 +47,8 @@ def _whitened(
     x = _component(candidate, i, first, d, lanes)
     if d < candidate.shape[2]:
         for lane in range(len(lanes)):
-            x[lane] = wp.clamp((x[lane] - mean[d]) * factor[d], -bound, bound)
+            white = (x[lane] - mean[d]) * factor[d]
+            x[lane] = wp.clamp(white, -bound, bound) + (white - white)  # clamp takes NaN for a bound
     return x
 
 
@@ -61,6 +62,12 @@ def _by_three(
     h += weight[j, wp.min(1, last)] * c1
     h += weight[j, wp.min(2, last)] * c2
     return h
+
+
+@wp.func
+def _relu(h: Any):
+    """max(h, 0), and NaN where h is: Warp's ``max`` would take NaN for 0, and a broken state for a safe one."""
+    return h - wp.min(h, type(h)())
 
 
 @wp.kernel
@@ -91,7 +98,7 @@ def _score(
             h += weight[j, 3] * c3
             h += weight[j, wp.min(4, last)] * c4
             h += weight[j, wp.min(5, last)] * c5
-        total += out_weight[j] * wp.max(h, type(lanes)())
+        total += out_weight[j] * _relu(h)
     for lane in range(len(lanes)):
         if first + lane < score.shape[1]:
             score[i, first + lane] = total[lane]
@@ -127,7 +134,7 @@ def _mean_square(
         y2 = type(lanes)(out_bias[k + 2])
         y3 = type(lanes)(out_bias[k + 3])
         for j in range(weight.shape[0]):
-            h = wp.max(_by_three(of_context, weight, i, j, last, c0, c1, c2), type(lanes)())
+            h = _relu(_by_three(of_context, weight, i, j, last, c0, c1, c2))
             y0 += out_weight[k, j] * h
             y1 += out_weight[k + 1, j] * h
             y2 += out_weight[k + 2, j] * h

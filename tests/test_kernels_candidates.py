@@ -79,6 +79,19 @@ def test_relu_cuts_what_is_negative(device):
 
 
 @pytest.mark.parametrize("launcher", [score_candidates, squares_of_candidates])
+@pytest.mark.parametrize(("name", "place"), [("of_context", (2, 5)), ("candidate", (2, 7, 1)), ("weight", (5, 1))])
+def test_nan_is_not_hidden(device, launcher, name, place):
+    """NaN in a context, a candidate or a weight is NaN in every score that it belongs to, and in no other."""
+    a = network(4, 100, 3, 32, 1 if launcher is score_candidates else 8)
+    a[name][place] = np.nan
+    arrays = on(device, a)
+    launcher(**arrays)
+    expected = np.zeros((4, 100), bool)
+    expected[{"of_context": (2,), "candidate": (2, 7), "weight": (...,)}[name]] = True
+    np.testing.assert_array_equal(np.isnan(arrays["score"].numpy()), expected)
+
+
+@pytest.mark.parametrize("launcher", [score_candidates, squares_of_candidates])
 def test_contexts_and_candidates_do_not_mix(device, launcher):
     """A candidate's score is bit for bit the same beside other contexts and, in as many lanes, other candidates."""
     outputs = 1 if launcher is score_candidates else 8
