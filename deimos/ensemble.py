@@ -1,26 +1,43 @@
 """Several value functions that differ by initialisation and by data, in one stack of weights."""
 
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
-from deimos.networks import ManyCandidates, rows_in_cache
+from deimos.networks import rows_in_cache
+from deimos.ppo import value_gradient
 from deimos.products import activate_, multiply_by_slope_, onednn
 
 
-class Stack:
-    """K multilayer perceptrons of one shape; a layer of all members is one batched product.
+class Critics(Protocol):
+    """What computes values and gradients of a stack in the place of batched products."""
 
-    The weights of a layer lie in one tensor, those of all layers in one vector.
+    def values(self, x: Tensor) -> Tensor:
+        """See ``Stack.values``."""
+        ...
+
+    def gradients(
+        self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor, clip: float
+    ) -> Callable[[range], Tensor]:
+        """See ``Stack.gradients``."""
+        ...
+
+
+class Stack:
+    """K multilayer perceptrons of one shape and one output.
+
+    The weights of a layer lie in one tensor, those of all layers in one vector. A layer of all members is one batched
+    product, unless somebody has kernels for the whole.
 
     Args:
         nets: Made by ``networks.mlp``, on one device. Their parameters become views of the stack.
+        fuse: Gives kernels for a stack, or ``None`` where it has none for this one; see ``selector.Spaces``.
     """
 
-    def __init__(self, nets: list[nn.Sequential]) -> None:
+    def __init__(self, nets: list[nn.Sequential], fuse: "Callable[[Stack], Critics | None] | None" = None) -> None:
         self.nets = nets
         self._linears = [[layer for layer in net if isinstance(layer, nn.Linear)] for net in nets]
         first = self._linears[0][0].weight
@@ -29,14 +46,18 @@ class Stack:
         self._pack(move=True)
         self._activation = nets[0][1]
         self._inputs: list[Tensor] = []
-        self._threads = torch.get_num_threads()
-        widest = max(layer.in_features for layer in self._linears[0][1:])
-        self._piece = rows_in_cache(widest * len(nets)) if first.device.type == "cpu" else sys.maxsize
+        self.threads = torch.get_num_threads()
+        """Threads that torch had when the stack was made; it uses them also where its caller keeps to one."""
+        widest = max(layer.in_features for layer in self._linears[0][1:]) * len(nets)
+        self._piece = rows_in_cache(widest) if first.device.type == "cpu" else max(1, 2**26 // widest)
+        self.fused = fuse(self) if fuse else None
+        """Kernels in the place of batched products, if there are any."""
 
     def _pack(self, move: bool = False) -> int:
         """Lay every layer's weights, then its biases, of all members end to end; returns their number."""
         start, count = 0, len(self._linears)
-        self._layers: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        self.layers: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        """Weight, (K, outputs, inputs), and bias, (K, outputs), of every layer, and their gradients: views."""
         for members in zip(*self._linears, strict=True):
             views: list[Tensor] = []
             for name in ("weight", "bias"):
@@ -54,22 +75,72 @@ class Stack:
                 start = -(-stop // 16) * 16  # 64 bytes: products of unaligned weights are slower
             if move:
                 weight, weight_grad, bias, bias_grad = views
-                self._layers.append((weight, bias, weight_grad, bias_grad))
+                self.layers.append((weight, bias, weight_grad, bias_grad))
         return start
 
+    @torch.no_grad()
+    def values(self, x: Tensor) -> Tensor:
+        """Outputs of all members, shape (K, n).
+
+        Args:
+            x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own.
+        """
+        if self.fused is not None:
+            return self.fused.values(x)
+        with self._all_threads():
+            return torch.cat([self.forward(x[..., rows, :]).squeeze(2) for rows in self._pieces(range(x.shape[-2]))], 1)
+
+    @torch.no_grad()
+    def gradients(
+        self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor, clip: float
+    ) -> Callable[[range], Tensor]:
+        """The gradient of the clipped value loss of every member on rows of its own; see ``ppo.value_gradient``.
+
+        Args:
+            x: Inputs, shape (K, n, inputs).
+            before: Values before the update, shape (K, n).
+            target: What they should be, shape (K, n).
+            weight: Weight of every row in the average, 0 or more, shape (K, n).
+            clip: How far a value may move, positive; infinite for the plain squared error.
+
+        Returns:
+            A function that takes a range of rows, writes ``parameters.grad`` and returns the losses, shape (K,),
+            which its next call may overwrite.
+        """
+        if self.fused is not None:
+            return self.fused.gradients(x, before, target, weight, clip)
+
+        def lesson(rows: range) -> Tensor:
+            assert self.parameters.grad is not None
+            self.parameters.grad.zero_()
+            share = weight[:, rows.start : rows.stop]
+            share = share / share.sum(1, keepdim=True).clamp(min=1.0)
+            losses = torch.zeros(len(x), device=x.device)
+            with self._all_threads():
+                for piece in self._pieces(rows):
+                    value = self.forward(x[:, piece]).squeeze(2)
+                    own = share[:, piece.start - rows.start : piece.stop - rows.start]
+                    loss, slope = value_gradient(value, before[:, piece], target[:, piece], own, clip=clip, coef=1.0)
+                    self.backward(slope.unsqueeze(2))
+                    losses += loss
+            return losses
+
+        return lesson
+
     @contextmanager
-    def all_threads(self) -> Iterator[None]:
-        """Run on as many threads as torch had when the stack was made, also where the caller keeps to one."""
+    def _all_threads(self) -> Iterator[None]:
+        """Run on the stack's threads."""
         threads = torch.get_num_threads()
-        torch.set_num_threads(self._threads)
+        torch.set_num_threads(self.threads)
         try:
             yield
         finally:
             torch.set_num_threads(threads)
 
-    def pieces(self, rows: int) -> Iterator[slice]:
-        """Consecutive parts of ``rows`` rows per member; on a CPU such as suit its caches, on a GPU all of them."""
-        return (slice(start, start + self._piece) for start in range(0, max(1, rows), self._piece))
+    def _pieces(self, rows: range) -> Iterator[slice]:
+        """Consecutive parts of some rows; on a CPU such as suit its caches, on a GPU such as fit 256 MiB a layer."""
+        starts = range(rows.start, max(rows.stop, rows.start + 1), self._piece)
+        return (slice(start, min(start + self._piece, rows.stop)) for start in starts)
 
     @torch.no_grad()
     def forward(self, x: Tensor) -> Tensor:
@@ -81,10 +152,10 @@ class Stack:
         x = x.expand(len(self.nets), -1, -1)
         self._inputs = []
         with onednn(x.device):
-            for i, (weight, bias, _, _) in enumerate(self._layers):
+            for i, (weight, bias, _, _) in enumerate(self.layers):
                 self._inputs.append(x)
                 x = torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
-                if i < len(self._layers) - 1:
+                if i < len(self.layers) - 1:
                     x = activate_(x, self._activation)
         return x
 
@@ -92,8 +163,8 @@ class Stack:
     def backward(self, delta: Tensor) -> None:
         """Add the gradient of every weight to its ``grad``; ``delta`` is shaped like what ``forward`` gave last."""
         with onednn(delta.device):
-            for i in reversed(range(len(self._layers))):
-                weight, _, weight_grad, bias_grad = self._layers[i]
+            for i in reversed(range(len(self.layers))):
+                weight, _, weight_grad, bias_grad = self.layers[i]
                 x = self._inputs[i]
                 weight_grad.baddbmm_(delta.transpose(1, 2), x)
                 bias_grad += delta.sum(1)
@@ -105,38 +176,12 @@ class Stack:
     def clip_gradients(self, max_norm: float) -> None:
         """Scale every member's own gradient down to a norm of at most ``max_norm``."""
         squares = torch.zeros(len(self.nets), device=self.parameters.device)
-        for _, _, weight_grad, bias_grad in self._layers:
+        for _, _, weight_grad, bias_grad in self.layers:
             squares += weight_grad.flatten(1).square().sum(1) + bias_grad.square().sum(1)
         factor = (max_norm / (squares.sqrt() + 1e-6)).clamp(max=1.0)
-        for _, _, weight_grad, bias_grad in self._layers:
+        for _, _, weight_grad, bias_grad in self.layers:
             weight_grad *= factor.view(-1, 1, 1)
             bias_grad *= factor.view(-1, 1)
-
-    @torch.no_grad()
-    def values(self, x: Tensor) -> Tensor:
-        """Outputs of members with one output, shape (K, n).
-
-        Args:
-            x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own.
-        """
-        return torch.cat([self.forward(x[..., rows, :]).squeeze(2) for rows in self.pieces(x.shape[-2])], dim=1)
-
-
-class CandidateValues:
-    """Outputs of every member of a stack for many candidates per context; see ``ManyCandidates``."""
-
-    def __init__(self, stack: Stack, goal_dim: int, workspace: int = 64) -> None:
-        self._stack = stack
-        self._members = [ManyCandidates(net, goal_dim, max(1, workspace // len(stack.nets))) for net in stack.nets]
-
-    def operations(self, contexts: float, count: int) -> float:
-        """Multiplications and additions of the products; see ``ManyCandidates.operations``."""
-        return sum(member.operations(contexts, count) for member in self._members)
-
-    def __call__(self, context: Tensor, candidates: Tensor) -> Tensor:
-        """Shape (K, B, N) for members with one output; the arguments are those of ``ManyCandidates``."""
-        with self._stack.all_threads():
-            return torch.stack([member(context, candidates).squeeze(2) for member in self._members])
 
 
 def deviation(values: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from deimos.env import Env, Step
 from deimos.fused import fuse
+from deimos.fused_critics import fuse_critics
 from deimos.interactions import Interactions
 from deimos.selector import GoalSelector, Spaces
 
@@ -15,6 +16,7 @@ def spaces(env: Env, total_steps: int = 0) -> Spaces:
         num_envs=env.num_envs, state_dim=env.state_dim, goal_dim=env.goal_dim, goal_period=env.goal_period,
         device=env.device, groups=env.goal_groups, goal_start=env.goal_slice.start, total_steps=total_steps,
         fuse=fuse,
+        fuse_critics=fuse_critics,
     )  # fmt: skip
 
 

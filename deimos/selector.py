@@ -3,13 +3,16 @@
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from deimos.interactions import Interactions
 from deimos.rollout import Rollout
+
+if TYPE_CHECKING:  # it needs PPO, which needs this module
+    from deimos.ensemble import Critics, Stack
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class Spaces:
     """Steps of the whole training; 0 where nobody knows."""
     fuse: Fuse | None = None
     """Who scores candidates in one kernel, where the worlds have kernels (``fused.fuse``); ``None`` for torch alone."""
+    fuse_critics: "Callable[[Stack], Critics | None] | None" = None
+    """Who has kernels for an ensemble (``fused_critics.fuse_critics``); ``None`` for torch alone."""
 
     def state_then_goal(self, obs: Tensor) -> Tensor:
         """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""

@@ -10,9 +10,9 @@ from typing import Any
 import warp as wp
 
 from kernels.check import require, require_axes
-from kernels.lanes import FLOATS, lanes, threads
+from kernels.lanes import FLOATS, OPTIONS, lanes, threads
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(OPTIONS)
 
 MOST_COMPONENTS = 6
 """Components that a candidate of ``score_candidates`` may have."""

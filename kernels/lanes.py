@@ -6,6 +6,12 @@ to many numbers takes them as vectors there: LLVM makes vector instructions of t
 
 import warp as wp
 
+_FLAGS = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+
+OPTIONS = {"enable_backward": False, "cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast"}
+"""Options for modules of such kernels: on a CPU a product and a sum become one instruction (CUDA does that anyway).
+Warp's operators are functions of their own, across which Clang keeps them apart unless told so."""
+
 WIDE = 64  # what LLVM makes the best code of; with 16 or 32 some kernels take five times as long (Zen 5, AVX-512)
 
 FLOATS = {lanes: wp.types.vector(length=lanes, dtype=float) for lanes in (1, WIDE)}

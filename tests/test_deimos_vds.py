@@ -8,8 +8,9 @@ import torch
 from torch import nn
 
 from deimos.adam import Adam
-from deimos.ensemble import CandidateValues, Stack
+from deimos.ensemble import Stack
 from deimos.envs import particle
+from deimos.fused_critics import fuse_critics
 from deimos.goal_loop import spaces
 from deimos.interactions import Interactions
 from deimos.networks import mlp
@@ -88,12 +89,14 @@ def orders(selector, count):
     return [torch.randperm(NUM_ENVS * NUM_STEPS, generator=generator) for _ in range(count)]
 
 
-@pytest.mark.parametrize("piece", [7, 10_000])  # rows worked through at a time: parts of a minibatch, or all of it
+# By batched products, rows worked through at a time being parts of a minibatch or all of it; and by kernels.
+@pytest.mark.parametrize(("activation", "piece"), [("elu", 7), ("elu", 10_000), ("relu", None)])
 @pytest.mark.parametrize("max_grad_norm", [0.05, 10.0])
-def test_ten_stacked_critics_equal_ten_separate_ones(piece, max_grad_norm):
+def test_ten_stacked_critics_equal_ten_separate_ones(activation, piece, max_grad_norm):
     """Over five lessons every member stays what it becomes alone, with its own returns, order and gradient clip."""
     env = worlds()
-    selector = ensemble(env, max_grad_norm=max_grad_norm)
+    selector = ensemble(env, max_grad_norm=max_grad_norm, activation=activation)
+    assert (selector.stack.fused is None) == (piece is not None)
     selector.stack._piece = piece
     single = [Alone(copy.deepcopy(net), selector.config) for net in selector.stack.nets]
     start = selector.stack.parameters.detach().clone()
@@ -174,6 +177,43 @@ def test_a_stack_is_its_networks(count):
     assert all(not torch.equal(a, b) for a, b in zip(stack.nets[-1].parameters(), alone[-1].parameters(), strict=True))
 
 
+# Layers that fill no vector, one, and several; whole blocks of rows and others; one critic and more.
+@pytest.mark.parametrize("units", [(5, 7), (11, 64, 64), (70, 130, 20, 9)])
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("clip", [0.2, math.inf])
+def test_kernels_and_batched_products_agree(units, count, clip):
+    """Values, losses and gradients are the same to rounding, on all rows and on some, for shared inputs and others."""
+    torch.manual_seed(1)  # no unit is so near to ReLU's kink that rounding decides
+    nets = [mlp(units[0], units[1:], 1, "relu") for _ in range(count)]
+    plain, fused = Stack(copy.deepcopy(nets)), Stack(nets, fuse_critics)
+    assert fused.fused is not None
+    x = torch.randn(count, 200, units[0])
+    before, target, weight = (torch.randn(count, 200) for _ in range(3))
+    weight = (weight > -1.0).float()
+    for inputs in (x, x[0], x[:, :64], x[:, :1], x[:, :0]):
+        torch.testing.assert_close(fused.values(inputs), plain.values(inputs), rtol=1e-5, atol=1e-6)
+    lessons = [stack.gradients(x, before, target, weight, clip) for stack in (plain, fused)]
+    for rows in (range(200), range(30, 94), range(199, 200)):
+        expected, losses = (lesson(rows) for lesson in lessons)
+        torch.testing.assert_close(losses, expected, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(fused.parameters.grad, plain.parameters.grad, rtol=1e-4, atol=1e-6)
+
+
+def test_kernels_see_weights_that_changed():
+    """Values follow the weights, whoever changed them and however."""
+    nets = [mlp(4, (8, 8), 1, "relu") for _ in range(2)]
+    stack, x = Stack(nets, fuse_critics), torch.randn(9, 4)
+    for change in (nets[1][0].bias.data.add_, stack.parameters.data.mul_):
+        change(1.5)
+        torch.testing.assert_close(stack.values(x), torch.stack([net(x).squeeze(1) for net in nets]).detach())
+
+
+@pytest.mark.parametrize(("activation", "outputs"), [("elu", 1), ("tanh", 1), ("relu", 2)])
+def test_kernels_leave_alone_what_they_cannot(activation, outputs):
+    """Other activations and other outputs go to batched products."""
+    assert Stack([mlp(3, (8,), outputs, activation) for _ in range(2)], fuse_critics).fused is None
+
+
 @pytest.mark.parametrize("rule", ["proportional", "argmax", "percentile"])
 def test_goals_are_scored_by_disagreement(rule):
     """A score is the standard deviation over the members, and the rule chooses by it."""
@@ -185,9 +225,6 @@ def test_goals_are_scored_by_disagreement(rule):
     obs = torch.cat([state.expand(20, -1), candidates[0]], dim=1)
     values = torch.stack([net(obs).squeeze(1) for net in selector.stack.nets]).detach()
     score = values.std(dim=0, correction=0)
-    torch.testing.assert_close(
-        CandidateValues(selector.stack, 3)(state, candidates)[:, 0], values, rtol=1e-4, atol=1e-6
-    )
     draws = torch.zeros(4000, 4)
     draws[:, 0] = (torch.arange(4000) + 0.5) / 4000
     proposal = selector.propose(
@@ -228,10 +265,10 @@ def test_a_goal_in_the_middle_of_the_observation_is_found():
     state, goal = torch.cat([obs[:, :4], obs[:, 7:]], dim=1), obs[:, 4:7]
     assert torch.equal(middle.state_then_goal(obs), torch.cat([state, goal], dim=1))
     selector = vds.Config(**SMALL).build(middle, 0)
-    of_candidates = CandidateValues(selector.stack, 3)(state, goal.unsqueeze(1))[:, :, 0]
-    torch.testing.assert_close(selector.values(obs), of_candidates, rtol=1e-4, atol=1e-5)
-    behind = Spaces(NUM_ENVS, 9, 3, 5, CPU, goal_start=9)
-    assert behind.state_then_goal(obs) is obs
+    behind = torch.cat([state, goal], dim=1)
+    expected = torch.stack([net(behind).squeeze(1) for net in selector.stack.nets]).detach()
+    torch.testing.assert_close(selector.values(obs), expected, rtol=1e-4, atol=1e-5)
+    assert Spaces(NUM_ENVS, 9, 3, 5, CPU, goal_start=9).state_then_goal(obs) is obs
 
 
 def test_roles():

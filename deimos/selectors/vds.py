@@ -13,10 +13,10 @@ from torch import Tensor
 from deimos import picks
 from deimos.adam import Adam
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
-from deimos.ensemble import CandidateValues, Stack, deviation
+from deimos.ensemble import Stack, deviation
 from deimos.interactions import Interactions
 from deimos.networks import Activation, mlp, operations
-from deimos.ppo import advantages, value_gradient
+from deimos.ppo import advantages
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 from deimos.seeds import generator, weights_from
@@ -96,15 +96,16 @@ class VDS(GoalSelector):
         for k in range(config.critics):
             with weights_from(seed, f"vds critic {k}"):
                 nets.append(mlp(inputs, config.hidden, 1, config.activation).to(device))
-        self.stack = Stack(nets)
-        self._of_candidates = CandidateValues(self.stack, spaces.goal_dim)
+        self.stack = Stack(nets, spaces.fuse_critics)
         self.optimizer = Adam(self.stack.parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = generator(seed, "vds minibatches", device)
         self._known: tuple[Tensor, Tensor] | None = None  # observations and their values, as asked for last
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
-        score = deviation(self._of_candidates(state, candidates))
+        context = state.unsqueeze(1).expand(-1, candidates.shape[1], -1)
+        values = self.stack.values(torch.cat([context, candidates], dim=2).flatten(0, 1))
+        score = deviation(values).view(candidates.shape[:2])
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
 
@@ -121,8 +122,7 @@ class VDS(GoalSelector):
     def values(self, obs: Tensor) -> Tensor:
         """Values by every critic, shape (K, ...), of observations of shape (..., obs_dim)."""
         inputs = self._spaces.state_then_goal(obs).flatten(0, -2)
-        with self.stack.all_threads():
-            return self.stack.values(inputs).view(-1, *obs.shape[:-1])
+        return self.stack.values(inputs).view(-1, *obs.shape[:-1])
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
@@ -130,9 +130,8 @@ class VDS(GoalSelector):
         if rollout is None:
             raise ValueError("vds learns values, so it needs the learner's rollout, got None.")
         worlds = self._worlds(rollout.obs.shape[1], rollout.obs.device)
-        with self.stack.all_threads():
-            old, returns = self._targets(rollout, worlds)
-            loss = self._fit(rollout, worlds, old, returns)
+        old, returns = self._targets(rollout, worlds)
+        loss = self._fit(rollout, worlds, old, returns)
         spread = deviation(old).mean().item() if self.config.data == "all" else float("nan")
         self._known = None
         return {"vds/loss": loss, "vds/deviation": spread, "vds/value": old.mean().item()}
@@ -183,39 +182,25 @@ class VDS(GoalSelector):
         size = rows // minibatches
         order = torch.stack([torch.randperm(rows, generator=self.generator, device=old.device) for _ in worlds])
         step, world = order // worlds.shape[1], worlds.gather(1, order % worlds.shape[1])
-        data = [
+        lesson = self.stack.gradients(
             self._spaces.state_then_goal(rollout.obs[:-1])[step, world], old.flatten(1).gather(1, order),
-            returns.flatten(1).gather(1, order), rollout.weight[step, world],
-        ]  # fmt: skip
+            returns.flatten(1).gather(1, order), rollout.weight[step, world], self.config.clip,
+        )  # fmt: skip
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
         for _ in range(self.config.epochs):
             for start in range(0, minibatches * size, size):
-                self.stack.parameters.grad.zero_()
-                losses += self._gradient(*[part[:, start : start + size] for part in data])
+                losses += lesson(range(start, start + size))
                 mean_over_ranks(self.stack.parameters.grad)
                 self.stack.clip_gradients(self.config.max_grad_norm)
                 self.optimizer.step()
         return losses.mean().item() / (self.config.epochs * minibatches)
 
-    def _gradient(self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        """Add every critic's gradient on its own rows, shape (K, n, ...); returns the losses, shape (K,)."""
-        weight = weight / weight.sum(1, keepdim=True).clamp(min=1.0)
-        losses = torch.zeros(len(x), device=x.device)
-        for rows in self.stack.pieces(x.shape[1]):
-            value = self.stack.forward(x[:, rows]).squeeze(2)
-            loss, slope = value_gradient(
-                value, before[:, rows], target[:, rows], weight[:, rows], clip=self.config.clip, coef=1.0
-            )
-            self.stack.backward(slope.unsqueeze(2))
-            losses += loss
-        return losses
-
     def operations(self, decisions: float, transitions: int) -> float:
         """See ``GoalSelector.operations``."""
         rows = transitions * (self.config.critics if self.config.data == "all" else 1)
         learning = rows * operations(self.stack.nets[0]) * (1 + 3 * self.config.epochs)  # values, then the passes
-        return learning + self._of_candidates.operations(decisions, self.num_candidates)
+        return learning + decisions * self.num_candidates * self.config.critics * operations(self.stack.nets[0])
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""

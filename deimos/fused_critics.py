@@ -1,0 +1,111 @@
+"""Values and gradients of a stack of critics by Warp kernels, on the threads of a CPU."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import torch
+import warp as wp
+from torch import Tensor, nn
+
+from deimos.ensemble import Stack
+from kernels.critics import Critics, Layout, gradients, values
+
+_Copies = list[tuple[Tensor, Tensor]]  # destination and source
+
+
+def fuse_critics(stack: Stack) -> "FusedCritics | None":
+    """Kernels for a stack; ``None`` unless it lies on a CPU, has ReLU between its layers and one output."""
+    linears = [layer for layer in stack.nets[0] if isinstance(layer, nn.Linear)]
+    fits = isinstance(stack.nets[0][1], nn.ReLU) and linears[-1].out_features == 1
+    return FusedCritics(stack, linears) if fits and stack.parameters.device.type == "cpu" else None
+
+
+class FusedCritics:
+    """See ``fuse_critics``. Threads share the members; what a member computes does not depend on their number."""
+
+    def __init__(self, stack: Stack, linears: list[nn.Linear]) -> None:
+        wp.init()
+        layout = Layout((linears[0].in_features, *(layer.out_features for layer in linears[:-1])))
+        count = len(stack.nets)
+        self._table = torch.zeros(count, layout.rows, layout.width)
+        self._gradient = torch.zeros_like(self._table)
+        self._loads, self._stores = _views(stack, layout, self._table, self._gradient)
+        self._critics = Critics(layout, wp.from_torch(self._table), wp.from_torch(self._gradient))
+        threads = max(1, min(stack.threads, count))
+        self._members = [range(count * i // threads, count * (i + 1) // threads) for i in range(threads)]
+        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._values: list[wp.Launch] = []
+
+    @torch.no_grad()
+    def values(self, x: Tensor) -> Tensor:
+        """See ``Stack.values``."""
+        value = torch.empty(len(self._table), x.shape[-2])
+        arrays = {"x": wp.from_torch(x.expand(len(self._table), -1, -1)), "value": wp.from_torch(value)}
+        if not self._values:
+            self._values = self._record(partial(values, self._critics, **arrays))
+        for launch in self._values:
+            for name, array in arrays.items():
+                launch.set_param_by_name(name, array)
+        _copy(self._loads)
+        self._run(self._values)
+        return value
+
+    @torch.no_grad()
+    def gradients(
+        self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor, clip: float
+    ) -> Callable[[range], Tensor]:
+        """See ``Stack.gradients``."""
+        loss = torch.zeros(len(self._table))
+        arrays = [wp.from_torch(tensor.contiguous()) for tensor in (x, before, target, weight, loss)]
+        launches = self._record(partial(gradients, self._critics, *arrays, clip=clip, rows=range(1)))
+
+        def lesson(rows: range, _alive: list[wp.array] = arrays) -> Tensor:  # launches know no more than addresses
+            for launch in launches:
+                launch.set_param_by_name("start", rows.start)
+                launch.set_param_by_name("stop", rows.stop)
+            _copy(self._loads)
+            self._run(launches)
+            _copy(self._stores)
+            return loss
+
+        return lesson
+
+    def _record(self, launcher: Callable[..., wp.Launch | None]) -> list[wp.Launch]:
+        """A launch for every thread."""
+        launches = [launcher(members=members, record=True) for members in self._members]
+        return [launch for launch in launches if launch is not None]
+
+    def _run(self, launches: list[wp.Launch]) -> None:
+        """Run one launch per thread; Python's lock is free meanwhile."""
+        others = [self._pool.submit(launch.launch) for launch in launches[1:]] if self._pool else []
+        launches[0].launch()
+        for other in others:
+            other.result()
+
+
+def _copy(views: _Copies) -> None:
+    for to, source in views:
+        to.copy_(source)
+
+
+def _views(stack: Stack, layout: Layout, table: Tensor, gradient: Tensor) -> tuple[_Copies, _Copies]:
+    """What fills the tables, and what their gradients go to."""
+    loads: _Copies = []
+    stores: _Copies = []
+    for layer, (weight, bias, weight_grad, bias_grad) in enumerate(stack.layers):
+        outputs, inputs = weight.shape[1:]
+        loads += zip(_places(layout, layer, inputs, outputs, table), (weight, bias), strict=True)
+        stores += zip((weight_grad, bias_grad), _places(layout, layer, inputs, outputs, gradient), strict=True)
+        if 0 < layer < len(layout.turned):
+            turned = layout.turned[layer]
+            loads.append((table[:, turned : turned + outputs, :inputs], weight))
+    return loads, stores
+
+
+def _places(layout: Layout, layer: int, inputs: int, outputs: int, table: Tensor) -> tuple[Tensor, Tensor]:
+    """A layer's weights, shape (K, outputs, inputs), and biases, shape (K, outputs), in the tables."""
+    start = layout.start[layer]
+    if layer == len(layout.turned):  # the output's
+        return table[:, start : start + 1, :inputs], table[:, start + 1, :1]
+    return table[:, start : start + inputs, :outputs].transpose(1, 2), table[:, start + inputs, :outputs]
