@@ -42,22 +42,26 @@ class Calibration:
         """Probability of a crash, in (0, 1); the arguments are those of ``logit``."""
         return torch.sigmoid(self.logit(score))
 
+    def of_log_odds(self, log_odds: Tensor) -> Tensor:
+        """Probability of a crash where the prior, perhaps one of another day, has been added already."""
+        return torch.sigmoid(log_odds / self.temperature)
+
     def set_share(self, share: float) -> None:
         """Take over the share of crashes, in (0, 1), that the class weights were made from."""
         self.prior = math.log(share / (1.0 - share))
 
-    def fit(self, score: Tensor, crashed: Tensor, steps: int = 3) -> None:
+    def fit(self, log_odds: Tensor, crashed: Tensor, steps: int = 3) -> None:
         """Move the temperature towards the least log-loss on interactions that the network has not learnt from.
 
         The loss is convex in 1 / temperature, so Newton's method from the last one tracks it.
 
         Args:
-            score: Logits as they were at issue, shape (n,).
+            log_odds: Logits and prior as they were at issue, shape (n,).
             crashed: What became of them, bool, shape (n,); both classes.
             steps: Newton steps, at least 1.
         """
-        z, y = (score + self.prior).double(), crashed.double()
-        inverse = torch.tensor(1.0 / self.temperature, dtype=torch.float64, device=score.device)
+        z, y = log_odds.double(), crashed.double()
+        inverse = torch.tensor(1.0 / self.temperature, dtype=torch.float64, device=z.device)
         for _ in range(steps):
             p = torch.sigmoid(inverse * z)
             slope = ((p - y) * z).mean()

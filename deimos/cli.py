@@ -247,21 +247,23 @@ def _subcommands(package: Any, *more: Any) -> Any:
 
 def _train(options: Any) -> None:
     from deimos import training
+    from deimos.shared import one_stream
 
     names = {field.name for field in dataclasses.fields(training.TrainConfig)}
     config = training.TrainConfig(**{name: getattr(options, name) for name in names})
     _quiet_warp()
-    with training.one_stream(training.resolve_device(config.device)):
+    with one_stream(training.resolve_device(config.device)):
         trainer, folder = training.start(config, options.out, options.init_from)
         _run(trainer, folder)
 
 
 def _resume(options: ResumeOptions) -> None:
     from deimos import training
+    from deimos.shared import one_stream
 
     _quiet_warp()
     config = training.read_config(training.RunFolder.open(options.resume))
-    with training.one_stream(training.resolve_device(options.device or config.device)):
+    with one_stream(training.resolve_device(options.device or config.device)):
         trainer, folder = training.resume(options.resume, options.env_steps, options.device)
         _run(trainer, folder)
 
@@ -288,6 +290,7 @@ def _evaluate(options: EvaluateOptions) -> None:
     import torch
 
     from deimos import figures, training
+    from deimos.shared import one_stream
 
     folder = training.RunFolder.open(options.run)
     config = training.read_config(folder)
@@ -295,7 +298,7 @@ def _evaluate(options: EvaluateOptions) -> None:
     _quiet_warp()
     device = training.resolve_device(options.device)
     if options.contexts or options.calibration:
-        with training.one_stream(device):
+        with one_stream(device):
             trainer = training.load(folder, dataclasses.replace(config, device=options.device))
             _judge_fear(trainer, folder, options)
         return
@@ -308,7 +311,7 @@ def _evaluate(options: EvaluateOptions) -> None:
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except ValueError as error:
         raise RunError(str(error)) from error
-    with training.one_stream(device):
+    with one_stream(device):
         rows = _evaluate_policy(folder, env_config, eval_config, device)
     figures.draw_summary(folder, _title(config), rows)
     print(folder.path)

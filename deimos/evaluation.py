@@ -170,15 +170,16 @@ def play(
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)
     strata = env.strata()
-    errors: dict[str, list[Tensor]] = {name: [] for name in env.errors}
+    errors = {name: torch.empty(steps, env.num_envs, device=env.device) for name in env.errors}
     for t in range(steps):
         step = env.step(policy(env.obs))
         first = ~loop.interactions.active
         reward += step.reward
         tracking += step.reward.unsqueeze(1) if step.tracking is None else step.tracking
         crashes += step.terminated
+        met = step.goal_due & ~step.terminated
         for name, values in errors.items():
-            values.append(env.errors[name][step.goal_due & ~step.terminated])
+            values[t] = torch.where(met, env.errors[name], torch.nan)
         first_goal_steps += first
         first_goal_crashes += first & step.terminated
         loop.advance(step)
@@ -203,7 +204,7 @@ def play(
         "tracking": (tracking.mean(0) / steps).tolist(),
         "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
         "strata": _by_stratum(strata, crashes, tracking / steps, done),
-        "errors": {name: torch.cat(values).median().item() for name, values in errors.items()},
+        "errors": {name: values.nanmedian().item() for name, values in errors.items()},
     }
 
 
@@ -232,8 +233,8 @@ def train_adversary(
 
     Returns:
         The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``,
-        ``adversary_auroc`` (on every fifth world, which it did not learn from) and ``weak_adversary``:
-        whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
+        ``adversary_auroc`` (under uniform goals, on every fifth world, which it did not learn from) and
+        ``weak_adversary``: whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
     """
     fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed, fuse)
     collector = _Collector(env, fear)
@@ -254,7 +255,8 @@ def train_adversary(
     data = _whole(loop.interactions)
     fear.fit(_training_part(data))
     fear.check()
-    held_out = data.where(data.env % HELD_OUT == 0)
+    # Among goals of both kinds, to tell which are its own would tell much of what crashes.
+    held_out = data.where((data.env % HELD_OUT == 0) & data.probe)
     quality = math.nan
     if fear.fitted and len(held_out):
         logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
@@ -286,7 +288,7 @@ def _training_part(data: Resolved) -> Resolved:
 
 
 class _Collector(GoalSelector):
-    """Half uniform goals, half the argmax of a fear network that is being trained."""
+    """Half uniform goals, which are marked as probes, half the argmax of a fear network that is being trained."""
 
     def __init__(self, env: Env, fear: Fear) -> None:
         self._uniform = uniform.Config().build(spaces(env), 0)
@@ -299,4 +301,4 @@ class _Collector(GoalSelector):
         free = self._uniform.propose(rows, state, goal, candidates, draws)
         own = self._argmax.propose(rows, state, goal, candidates, draws)
         coin = draws[:, 1] < 0.5
-        return replace(own, goal=torch.where(coin.unsqueeze(1), free.goal, own.goal))
+        return replace(own, goal=torch.where(coin.unsqueeze(1), free.goal, own.goal), probe=coin)

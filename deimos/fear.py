@@ -10,7 +10,7 @@ from deimos.checks import SimulationError, check_at_least, check_choice, check_h
 from deimos.interactions import Resolved
 from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, weights_of
 from deimos.ranks import mean_over_ranks
-from deimos.seeds import generator, weights_from
+from deimos.seeds import generator, restore, weights_from
 from deimos.selector import Fuse
 
 
@@ -154,7 +154,7 @@ class Fear:
         """Go on from ``state_dict()``."""
         self.network.load_state_dict(state["network"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
+        restore(self.generator, state["generator"])
         self.fitted, self.share = state["fitted"], state["share"]
 
 

@@ -14,7 +14,7 @@ from deimos.fear import Fear, FearConfig, auroc
 from deimos.interactions import Interactions
 from deimos.networks import operations
 from deimos.rollout import Rollout
-from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,18 +63,17 @@ class FearSelector(GoalSelector):
         """
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
-        """See ``GoalSelector.propose``; scores are logits."""
-        count = candidates.shape[1]
+        """See ``GoalSelector.propose``; scores are log odds before the temperature."""
         if not self.fear.fitted:
-            pick = picks.uniformly(draws[:, 0], count)
-            return Proposal(picks.take(candidates, pick), torch.full_like(draws[:, 0], torch.nan))
+            return uniform_proposal(candidates, draws[:, 0])
         score = self.score(state, goal, candidates)
         ranked = _rolled(score, draws[:, 2]) if self.config.control == "shuffled" else score
         pick, probe = self.choose(ranked, draws[:, 0]), None
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
-            pick = torch.where(probe, picks.uniformly(draws[:, 0], count), pick)
-        return Proposal(picks.take(candidates, pick), picks.take(score, pick), probe=probe)
+            pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
+        # As a forecast it keeps the prior of its day, whatever the share of crashes is when it is judged.
+        return Proposal(picks.take(candidates, pick), picks.take(score, pick) + self.calibration.prior, probe=probe)
 
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Logits of the fear network for all candidates; see ``Fear.score``."""
@@ -88,17 +87,16 @@ class FearSelector(GoalSelector):
         # Columns are taken one by one: a whole row of everything costs ten times what is needed here.
         known = window.score.isfinite()
         score, crashed = window.score[known], window.crashed[known]
+        fair = known & window.probe if self.config.probe else known  # chosen goals are a biased sample
+        judged = fair & recent
         row = {
-            "fear/auroc": auroc(score, crashed),
+            "fear/auroc": auroc(window.score[fair], window.crashed[fair]),
             "fear/crash_share": window.crashed[recent].float().mean().item(),
             "fear/resolved": float(recent.sum()),
             "fear/score": window.score[recent].nanmean().item(),
             "fear/temperature": self.calibration.temperature,
         }
-        judged = recent & known
-        if self.config.probe:
-            judged &= window.probe  # the others are a biased sample
-        quality = judge(self.calibration.probability(window.score[judged]), window.crashed[judged])
+        quality = judge(self.calibration.of_log_odds(window.score[judged]), window.crashed[judged])
         row |= {f"calibration/{name}": value for name, value in quality.items()}
         # The temperature is fitted to scores from before the network learnt from their outcomes.
         crashes = int(crashed.sum())

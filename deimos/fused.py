@@ -88,6 +88,7 @@ class FusedScores:
         known.launch.launch()
         return known.score[:rows].clone()
 
+    @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
     def _record(self, candidates: Tensor) -> "_Recorded":
         rows, count = candidates.shape[:2]
         hidden, score = candidates.new_empty(rows, len(self._bias)), candidates.new_empty(rows, count)

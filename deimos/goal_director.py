@@ -9,7 +9,7 @@ from deimos.checks import check_at_least
 from deimos.env import Step
 from deimos.fear_selector import fear_selector
 from deimos.interactions import Interactions
-from deimos.seeds import generator
+from deimos.seeds import generator, restore
 from deimos.selector import GoalSelector, SelectorConfig, Spaces
 
 
@@ -107,16 +107,20 @@ class GoalDirector:
         reward = torch.zeros_like(self._clock, dtype=torch.float32) if tracking is None else tracking.float()
         result = Step(state, reward, terminated, truncated, due, torch.zeros_like(done), self._clock[:2])
         self._interactions.advance(result)
-        self._interactions.resolve(result, torch.nonzero(due | done).squeeze(1))
-        goals = goal.clone()
-        goals[done] = candidates[done, 0]
-        rows = torch.nonzero(due & ~done).squeeze(1)
+        ended, chooses = due | done, due & ~done
+        counts = torch.stack([ended.sum(), chooses.sum()]).tolist()  # the one synchronisation of the step
+        ended_rows, rows = (
+            torch.nonzero_static(mask, size=count).squeeze(1)
+            for mask, count in zip((ended, chooses), counts, strict=True)
+        )
+        self._interactions.resolve(result, ended_rows)
+        goals = torch.where(done.unsqueeze(1), candidates[:, 0], goal)
         if len(rows):
             self._propose(rows, state[rows], goal[rows], candidates[rows], goals)
-        self._clock[due | done] = 0
+        self._clock.masked_fill_(ended, 0)
         if self._interactions.now % self.learn_every == 0:
             self.metrics = self.selector.learn(self._interactions, None)
-        return Assignment(goals, due | done)
+        return Assignment(goals, ended)
 
     def _begin(self, state: Tensor, goal: Tensor) -> None:
         spaces = Spaces(
@@ -197,4 +201,4 @@ class GoalDirector:
         self.selector.load_state_dict(state["selector"])
         self._interactions.load_state_dict(state["interactions"])
         self._clock.copy_(state["clock"])
-        self._generator.set_state(state["generator"])
+        restore(self._generator, state["generator"])

@@ -18,7 +18,7 @@ from deimos.env import Env
 from deimos.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache, weights_of
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
-from deimos.seeds import generator, weights_from
+from deimos.seeds import generator, restore, weights_from
 from deimos.selector import Critic
 
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # what the adaptive schedule may reach; rsl_rl's
@@ -258,18 +258,21 @@ class PPO:
 
         Returns:
             Averages over all minibatches: ``value_loss``, ``surrogate_loss``, ``kl``; and, after the
-            update, ``entropy``, ``learning_rate``, ``action_std``, ``explained_variance``.
+            update, ``entropy``, ``learning_rate``, ``action_std``, ``explained_variance``. Where fewer transitions
+            count than a minibatch has, nothing is learnt and the first three are NaN.
         """
         batch, explained = self.batch(rollout, critic)
         if order is None:
             order = torch.randperm(len(batch.obs), generator=self.generator, device=batch.obs.device)
-        batch = batch.shuffled(order[: self._size * self.config.minibatches])
         std = self.actor.std.clone()
-        totals = torch.zeros(3, device=batch.obs.device)
-        for _ in range(self.config.epochs):
-            for minibatch in batch.split(self._size):
-                totals += self._learn(minibatch, std, learn_value=critic is None)
-        value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
+        value_loss = surrogate_loss = kl = math.nan
+        if bool(mean_over_ranks(rollout.weight.sum()) >= self._size):
+            batch = batch.shuffled(order[: self._size * self.config.minibatches])
+            totals = torch.zeros(3, device=batch.obs.device)
+            for _ in range(self.config.epochs):
+                for minibatch in batch.split(self._size):
+                    totals += self._learn(minibatch, std, learn_value=critic is None)
+            value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
         return {
             "value_loss": value_loss,
             "surrogate_loss": surrogate_loss,
@@ -291,7 +294,8 @@ class PPO:
         value = value_of(rollout.obs)
         next_value = value[1:].clone()
         if len(rollout.final_obs):
-            next_value = torch.where(rollout.truncated, value_of(rollout.final_obs), next_value)
+            cut_off = rollout.truncated.nonzero(as_tuple=True)
+            next_value[cut_off] = value_of(rollout.final_obs[cut_off])
         advantage = advantages(
             rollout.reward * config.reward_scale, value[:-1], next_value, rollout.terminated, rollout.truncated,
             discount=config.discount, gae_lambda=config.gae_lambda,
@@ -408,7 +412,7 @@ class PPO:
         """
         self.load_weights(state)
         self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
+        restore(self.generator, state["generator"])
 
     def load_weights(self, state: dict) -> None:
         """Take over the networks alone.

@@ -1,5 +1,7 @@
 """Many independent streams of random numbers from one seed."""
 
+import hashlib
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -30,7 +32,33 @@ def generator(seed: int, use: str, device: torch.device) -> torch.Generator:
 
 @contextmanager
 def weights_from(seed: int, use: str) -> Iterator[None]:
-    """Draw the weights of networks built inside from ``derive(seed, use)`` alone, and leave torch's own stream be."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(seed, use))
+    """Draw the weights of networks built inside from ``derive(seed, use)`` alone, and leave torch's own streams be.
+
+    Networks are built on the CPU. ``torch.manual_seed`` would seed the streams of all GPUs too, which may be those of
+    somebody else's training.
+    """
+    own = torch.default_generator
+    state = own.get_state()
+    own.manual_seed(derive(seed, use))
+    try:
         yield
+    finally:
+        own.set_state(state)
+
+
+def restore(generator: torch.Generator, state: torch.Tensor) -> None:
+    """Go on from ``generator.get_state()``, also from one of another kind of device.
+
+    States of CPUs and of GPUs cannot be converted into each other. The stream then goes on from a seed that follows
+    from the saved state: as good a stream, and the same whenever it is done, but not the saved one.
+    """
+    if state.numel() == generator.get_state().numel():
+        generator.set_state(state)
+        return
+    warnings.warn(
+        f"The random numbers of a {generator.device.type} go on from a checkpoint of another kind of device: "
+        "the run is no bit-for-bit continuation.",
+        stacklevel=2,
+    )
+    digest = hashlib.sha256(bytes(state.tolist())).hexdigest()
+    generator.manual_seed(derive(generator.initial_seed(), digest))

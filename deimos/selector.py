@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor, nn
 
+from deimos import picks
 from deimos.interactions import Interactions
 from deimos.rollout import Rollout
 
@@ -96,6 +97,17 @@ class Proposal:
     """A whole number that comes back with the interaction, int64 below 2^24, shape (B,); ``None`` for 0."""
 
 
+def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
+    """Any of the candidates, without an opinion.
+
+    Args:
+        candidates: Shape (B, N, goal_dim).
+        draw: Uniform numbers in [0, 1), shape (B,).
+    """
+    pick = picks.uniformly(draw, candidates.shape[1])
+    return Proposal(picks.take(candidates, pick), torch.full_like(draw, torch.nan))
+
+
 class Critic(Protocol):
     """A value function that somebody else trains."""
 
@@ -181,3 +193,55 @@ class GoalSelector(abc.ABC):
 
     def load_state_dict(self, state: dict) -> None:  # noqa: B027 (nor anything to load)
         """Go on from ``state_dict()``."""
+
+
+class Delegate(GoalSelector):
+    """Leaves everything to another selector, ``current``, but for what it overrides."""
+
+    @property
+    @abc.abstractmethod
+    def current(self) -> GoalSelector:
+        """Who chooses."""
+
+    @property
+    def num_candidates(self) -> int:  # type: ignore[override]
+        """See ``GoalSelector.num_candidates``."""
+        return self.current.num_candidates
+
+    @property
+    def needs_rollout(self) -> bool:  # type: ignore[override]
+        """See ``GoalSelector.needs_rollout``."""
+        return any(part.needs_rollout for part in self.parts)
+
+    @property
+    def first_goals_scaled(self) -> bool:  # type: ignore[override]
+        """See ``GoalSelector.first_goals_scaled``."""
+        return self.current.first_goals_scaled
+
+    def goal_range(self) -> Tensor | None:
+        """See ``GoalSelector.goal_range``."""
+        return self.current.goal_range()
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``."""
+        return self.current.propose(rows, state, goal, candidates, draws)
+
+    def critic(self) -> "Critic | None":
+        """See ``GoalSelector.critic``."""
+        return self.current.critic()
+
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """See ``GoalSelector.learn``."""
+        return self.current.learn(interactions, rollout)
+
+    def check(self) -> None:
+        """See ``GoalSelector.check``."""
+        self.current.check()
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        return self.current.state_dict()
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        self.current.load_state_dict(state)

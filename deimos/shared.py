@@ -1,5 +1,7 @@
 """One block of memory, seen by Warp and by torch."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -34,3 +36,18 @@ class Shared:
 def warp_device(device: torch.device) -> str:
     """Warp's name of a torch device."""
     return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
+
+
+@contextmanager
+def one_stream(device: torch.device) -> Iterator[None]:
+    """Run torch and Warp on one explicit CUDA stream, so that neither has to wait for the other.
+
+    Enter it before anything is built on the device. On the CPU it does nothing. The stream is Warp's: torch's own do
+    not wait for the default stream, on which Warp frees memory that may still be in use.
+    """
+    if device.type == "cpu":
+        yield
+        return
+    stream = wp.Stream(warp_device(device))
+    with wp.ScopedStream(stream), torch.cuda.stream(wp.stream_to_torch(stream)):
+        yield

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from deimos import __version__
@@ -108,20 +107,6 @@ def resolve_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise RunError("There is no CUDA device here; use --device cpu.")
     return torch.device("cuda", 0) if name != "cpu" and torch.cuda.is_available() else torch.device("cpu")
-
-
-@contextmanager
-def one_stream(device: torch.device) -> Iterator[None]:
-    """Run torch and Warp on one explicit CUDA stream, so that neither has to wait for the other.
-
-    Enter it before anything is built on the device. On the CPU it does nothing.
-    """
-    if device.type == "cpu":
-        yield
-        return
-    stream = torch.cuda.Stream(device)
-    with torch.cuda.stream(stream), wp.ScopedStream(wp.stream_from_torch(stream)):
-        yield
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from deimos.fear import Fear
 from deimos.goal_loop import spaces
 from deimos.oracle import Clones, Oracle
 from deimos.run_folder import RunFolder
-from deimos.selector import GoalSelector, Proposal
+from deimos.selector import GoalSelector, Proposal, uniform_proposal
 from deimos.selectors import director
 from deimos.training import load, read_config
 
@@ -48,8 +48,7 @@ class Watcher(GoalSelector):
             for name, (rule, percentile) in RULES.items():
                 pick = picks.by_rule(score, draws[:, 0], rule, percentile)
                 self.crashed.setdefault((known, name), []).append(picks.take(danger, pick) > 0)
-        pick = picks.uniformly(draws[:, 0], candidates.shape[1])
-        return Proposal(picks.take(candidates, pick), torch.full_like(draws[:, 0], torch.nan))
+        return uniform_proposal(candidates, draws[:, 0])
 
     def rate(self, known: str, name: str) -> float:
         """Share of what a rule would have chosen that would have crashed the policy."""

@@ -5,6 +5,8 @@ import pytest
 import torch
 import warp as wp
 
+from deimos.shared import one_stream
+
 wp.config.log_level = wp.LOG_WARNING
 torch.set_num_threads(1)
 
@@ -16,11 +18,7 @@ if wp.get_cuda_device_count() > 0 and torch.cuda.is_available():  # a torch with
 @pytest.fixture(params=DEVICES)
 def device(request):
     """Name of a device; on CUDA, torch and Warp run on one stream for as long as the test lasts."""
-    if request.param == "cpu":
-        yield "cpu"
-        return
-    stream = torch.cuda.Stream(request.param)
-    with torch.cuda.stream(stream), wp.ScopedStream(wp.stream_from_torch(stream)):
+    with one_stream(torch.device(request.param)):
         yield request.param
 
 

@@ -52,7 +52,7 @@ def test_known_probabilities_are_recovered():
     raw = judge(calibration.probability(score), held_out.crashed)
     calibration.set_share(fear.share)
     corrected = judge(calibration.probability(score), held_out.crashed)
-    calibration.fit(score[:10_000], held_out.crashed[:10_000], steps=20)
+    calibration.fit(score[:10_000] + calibration.prior, held_out.crashed[:10_000], steps=20)
     probability = calibration.probability(score[10_000:])
     last = judge(probability, held_out.crashed[10_000:])
     assert raw["ece"] > 0.1
@@ -70,7 +70,7 @@ def test_the_temperature_is_found(temperature):
     calibration = Calibration()
     calibration.set_share(0.3)
     score = temperature * truth - calibration.prior
-    calibration.fit(score, crashed, steps=20)
+    calibration.fit(score + calibration.prior, crashed, steps=20)
     # The inverse's standard error is (n E[p (1 - p) z^2])^(-1/2), which is below 0.018 / temperature here.
     assert calibration.temperature == pytest.approx(temperature, rel=0.07)
     expected = torch.sigmoid(temperature / calibration.temperature * truth)

@@ -1,5 +1,6 @@
 """The learner against textbook sums, autograd, torch's own Adam, and rsl_rl on the same data."""
 
+import copy
 import math
 
 import pytest
@@ -229,6 +230,22 @@ def test_transitions_of_weight_zero_teach_nothing():
         results.append([value.clone() for value in ppo.actor.state_dict().values()])
     for first, second in zip(*results, strict=True):
         torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("counting", [0, 1, NUM_ENVS * NUM_STEPS // 4 - 1])  # a minibatch has one more
+def test_too_few_transitions_teach_nothing(counting):
+    """Where fewer transitions count than a minibatch has, weights and step size stay, whatever Adam remembers."""
+    env, ppo = small_learner()
+    ppo.update(filled(env, ppo))
+    rollout = filled(env, ppo, seed=2)
+    rollout.weight.zero_()
+    rollout.weight.view(-1)[:counting] = 1.0
+    before = copy.deepcopy(ppo.state_dict() | {"generator": None})
+    row = ppo.update(rollout)
+    after = ppo.state_dict() | {"generator": None}
+    torch.testing.assert_close(after, before, rtol=0, atol=0)
+    assert all(math.isnan(row[name]) for name in ("value_loss", "surrogate_loss", "kl"))
+    ppo.check()
 
 
 def test_rows_that_do_not_divide_are_left_out():

@@ -107,6 +107,14 @@ def test_fused_scores_take_any_view():
     torch.testing.assert_close(fuse(net, 3)(context, candidates), expected, rtol=1e-4, atol=1e-5)
 
 
+def test_fused_scores_outlive_an_inference():
+    """What was first asked for in inference mode, as rsl_rl's rollouts are, is asked for outside it later."""
+    fused, arguments = fuse(mlp(9, (64,), 1, "relu"), 3), (torch.randn(20, 6), torch.randn(20, 30, 3))
+    with torch.inference_mode():
+        first = fused(*arguments)
+    assert torch.equal(fused(*arguments), first)
+
+
 def test_fused_scores_check_their_shapes():
     """No decision has no score; contexts and candidates that do not fit raise ``ValueError`` before any launch."""
     fused = fuse(mlp(9, (64,), 1, "relu"), 3)

@@ -74,7 +74,7 @@ def test_it_switches_once_at_its_share(recorders, at, switch):
         row = run.iterate()
         assert row["schedule/switched"] == (24 * rollout > switch)
         assert selector.switched == (24 * rollout >= switch)
-        assert selector.now is recorders["two" if selector.switched else "one"]
+        assert selector.current is recorders["two" if selector.switched else "one"]
         assert selector.num_candidates == (3 if selector.switched else 1)
     last = run.loop.interactions.resolved()
     assert (last.score == (2.0 if switch < 80 else 1.0)).all()
@@ -152,6 +152,17 @@ def test_a_mix_has_its_share_of_uniform_goals(recorders, share):
     assert torch.equal(proposal.goal, torch.where(free.unsqueeze(1), uniform_goals, candidates[:, 1]))
     assert torch.equal(proposal.score.isnan(), free)
     assert torch.equal(proposal.note, torch.where(free, 0, 7))
+
+
+def test_the_uniform_goals_of_a_mix_are_not_replayed_ones(recorders):
+    """A learner that may learn from its method's goals alone learns from no uniform one."""
+    METHODS["noted"].proposal["learn"] = torch.ones(4000, dtype=torch.bool)
+    selector = mix.Config(base="noted", share=0.5).build(SPACES, 0)
+    generator = torch.Generator().manual_seed(0)
+    arguments = [torch.randn(4000, *shape, generator=generator) for shape in ((9,), (3,), (5, 3))]
+    proposal = selector.propose(torch.arange(4000), *arguments, torch.rand(4000, 4, generator=generator))
+    assert torch.equal(proposal.learn, ~proposal.probe)
+    assert 0 < proposal.learn.sum() < 4000
 
 
 def test_a_mix_is_its_method_in_all_else():

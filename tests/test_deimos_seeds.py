@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from deimos.networks import ManyCandidates, mlp
-from deimos.seeds import derive, generator, weights_from
+from deimos.seeds import derive, generator, restore, weights_from
 
 USES = ("policy weights", "policy noise", "fear weights", "fear minibatches", "vds critic 0", "vds critic 1", "")
 
@@ -46,6 +46,29 @@ def test_weights_leave_the_global_stream_alone():
     assert torch.equal(weights(1, "a"), first)
     assert not torch.equal(weights(1, "b"), first)
     assert not torch.equal(weights(2, "a"), first)
+
+
+def test_a_stream_goes_on_from_its_state():
+    """A saved stream is gone on with bit for bit."""
+    first, second = (generator(seed, "a", torch.device("cpu")) for seed in (0, 1))
+    torch.rand(5, generator=first)
+    restore(second, first.get_state())
+    assert torch.equal(torch.rand(5, generator=first), torch.rand(5, generator=second))
+
+
+def test_a_stream_of_another_kind_of_device_goes_on_as_one_of_its_own():
+    """After the 16 bytes of a GPU a CPU goes on as they and the seed determine, and says that it is no continuation."""
+    states = [torch.tensor([0] * 8 + [offset] + [0] * 7, dtype=torch.uint8) for offset in (4, 4, 8)]
+    numbers = []
+    for state in states:
+        stream = generator(3, "a", torch.device("cpu"))
+        untouched = torch.rand(5, generator=stream)
+        with pytest.warns(UserWarning, match="no bit-for-bit continuation"):
+            restore(stream, state)
+        numbers.append(torch.rand(5, generator=stream))
+        assert not torch.equal(numbers[-1], untouched)
+    assert torch.equal(numbers[0], numbers[1])
+    assert not torch.equal(numbers[0], numbers[2])
 
 
 @pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])

@@ -49,19 +49,19 @@ def small(config):
     return dataclasses.replace(config, **{name: value for name, value in SMALL_FIELDS.items() if name in known})
 
 
-def trainer(env_name, name, seed=0):
+def trainer(env_name, name, seed=0, device=CPU):
     """A training run of four rollouts in 128 worlds whose policy throws itself about."""
     config = TrainConfig(
         env=plugins.load(envs, env_name).Config(**SMALL_ENVS.get(env_name, {})), selector=small(ALL[name]), seed=seed,
         ppo=PPOConfig(hidden=(16,), epochs=1, init_std=100.0), num_envs=128, env_steps=96, evaluation=False,
     )  # fmt: skip
-    return Trainer(config, CPU)
+    return Trainer(config, device)
 
 
 @functools.cache
-def trained(env_name, name):
+def trained(env_name, name, device=CPU):
     """A run that came to its end, its rows, what was saved after two of its four rollouts, and its last state."""
-    run, saved = trainer(env_name, name), io.BytesIO()
+    run, saved = trainer(env_name, name, device=device), io.BytesIO()
     rows = [run.iterate() for _ in range(2)]
     torch.save(run.state_dict(), saved)
     rows += [run.iterate() for _ in range(2)]
@@ -156,15 +156,24 @@ def test_a_kernel_chooses_what_products_choose(env_name, name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_it_is_deterministic_in_its_seed_and_resumes_bit_for_bit(env_name, name):
+def test_it_is_deterministic_in_its_seed_and_resumes_bit_for_bit(env_name, name, torch_device):
     """A second run of one seed starts alike whatever torch drew before, and from a saved state it ends alike."""
-    _, rows, saved, last = trained(env_name, name)
+    _, rows, saved, last = trained(env_name, name, torch_device)
     torch.rand(17)
-    other = trainer(env_name, name)
+    other = trainer(env_name, name, device=torch_device)
     assert_same(other.iterate(), rows[0])
-    other.load_state_dict(torch.load(io.BytesIO(saved), weights_only=True))
+    other.load_state_dict(torch.load(io.BytesIO(saved), map_location="cpu", weights_only=True))
     assert_same([other.iterate(), other.iterate()], rows[2:])
     assert_same(other.state_dict(), last)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_building_it_leaves_torchs_streams_alone(name, monkeypatch):
+    """Neither the CPU's random numbers nor, by a new seed, those of any GPU are another's afterwards."""
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", lambda seed: pytest.fail("all GPUs were seeded"))
+    before = torch.get_rng_state()
+    small(ALL[name]).build(dataclasses.replace(SPACES, total_steps=96), 0)
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -172,7 +181,7 @@ def test_it_has_begun_to_choose(env_name, name):
     """The short runs of these tests exercise what a selector learns: nobody is still in his uniform beginning."""
     run, rows, *_ = trained(env_name, name)
     selector = run.loop.selector
-    last = selector.now if isinstance(selector, schedule.Schedule) else selector
+    last = selector.current if isinstance(selector, schedule.Schedule) else selector
     afraid = fear_selector(last)
     assert afraid is None or afraid.fear.fitted
     assert getattr(last, "fitted", True)
@@ -232,7 +241,8 @@ def test_coop_and_antagonist_take_the_ends():
         score = selector.fear.score(*arguments[1:4])
         chosen = selector.propose(*arguments)
         assert torch.equal(chosen.goal, arguments[3][torch.arange(40), pick(score, 1)])
-        torch.testing.assert_close(chosen.score, score.amin(1) if name == "coop" else score.amax(1))
+        best = score.amin(1) if name == "coop" else score.amax(1)
+        torch.testing.assert_close(chosen.score, best + selector.calibration.prior)
 
 
 def test_a_higher_percentile_is_more_frightening():
@@ -277,7 +287,7 @@ def test_shuffled_fear_keeps_the_record_straight():
     arguments = decision()
     proposal = selector.propose(*arguments)
     own = selector.score(arguments[1], arguments[2], proposal.goal.unsqueeze(1)).squeeze(1)
-    torch.testing.assert_close(proposal.score, own, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(proposal.score, own + selector.calibration.prior, rtol=1e-5, atol=1e-5)
 
 
 def test_state_blind_fear_sees_no_state():
@@ -367,7 +377,8 @@ def test_predictions_are_judged_once_and_before_they_are_learnt_from(monkeypatch
     window = interactions.resolved()
     assert (window.resolved == 144).any()
     recent = window.where((window.resolved > 144) & window.score.isfinite())
-    before = selector.calibration.probability(recent.score)
+    # A forecast keeps the prior that it was issued with, while the share of crashes goes on changing.
+    before = torch.sigmoid(recent.score / selector.calibration.temperature)
     row = selector.learn(interactions, None)
     assert_same(resumed.loop.selector.learn(resumed.loop.interactions, None), row)
     assert len(recent) > 50

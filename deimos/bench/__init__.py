@@ -35,7 +35,8 @@ class BenchOptions:
 
 def run(options: BenchOptions) -> dict[str, Any]:
     """Measure, print one table per subject, and write the JSON file if asked for."""
-    from deimos.training import cores, one_stream, provenance, resolve_device
+    from deimos.shared import one_stream
+    from deimos.training import cores, provenance, resolve_device
 
     if options.json is not None and not options.json.parent.is_dir():
         raise RunError(f"The folder of {options.json} does not exist.")

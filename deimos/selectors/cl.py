@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deimos import picks
 from deimos.checks import check_at_least
 from deimos.interactions import Interactions
 from deimos.rollout import Rollout
-from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +59,7 @@ class Curriculum(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
-        pick = picks.uniformly(draws[:, 0], candidates.shape[1])
-        return Proposal(picks.take(candidates, pick), torch.full_like(draws[:, 0], torch.nan))
+        return uniform_proposal(candidates, draws[:, 0])
 
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
         """Widen the range of every group that was tracked well under the range that it has."""

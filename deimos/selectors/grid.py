@@ -9,7 +9,7 @@ from deimos import picks
 from deimos.checks import check_at_least, check_positive
 from deimos.interactions import Interactions
 from deimos.rollout import Rollout
-from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +81,7 @@ class Grid(GoalSelector):
         """See ``GoalSelector.propose``; scores are weights."""
         torch.maximum(self._seen, candidates.abs().amax(dim=(0, 1)), out=self._seen)
         if not self.fitted:
-            pick = picks.uniformly(draws[:, 0], candidates.shape[1])
-            return Proposal(picks.take(candidates, pick), torch.full_like(draws[:, 0], torch.nan))
+            return uniform_proposal(candidates, draws[:, 0])
         cell = self._cells(candidates)
         weight = torch.ones(candidates.shape[:2], device=candidates.device)
         for i, group in enumerate(self._groups):

@@ -5,11 +5,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from deimos import picks
 from deimos.checks import check_range
-from deimos.interactions import Interactions
-from deimos.rollout import Rollout
-from deimos.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.selector import Delegate, GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,64 +29,30 @@ class Config(SelectorConfig):
         return Mix(self, spaces, seed)
 
 
-class Mix(GoalSelector):
+class Mix(Delegate):
     """See ``Config``. The uniform goals have no score and are marked as probes."""
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         from deimos.methods import method
 
         self.config = config
-        self.base = method(config.base).build(spaces, seed)
-        self.parts = (self.base,)
+        self.parts = (method(config.base).build(spaces, seed),)
 
     @property
-    def num_candidates(self) -> int:  # type: ignore[override]
-        """See ``GoalSelector.num_candidates``."""
-        return self.base.num_candidates
-
-    @property
-    def needs_rollout(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.needs_rollout``."""
-        return self.base.needs_rollout
-
-    @property
-    def first_goals_scaled(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.first_goals_scaled``."""
-        return self.base.first_goals_scaled
-
-    def goal_range(self) -> Tensor | None:
-        """See ``GoalSelector.goal_range``."""
-        return self.base.goal_range()
+    def current(self) -> GoalSelector:
+        """See ``Delegate.current``."""
+        return self.parts[0]
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
-        own = self.base.propose(rows, state, goal, candidates, draws)
+        own = self.current.propose(rows, state, goal, candidates, draws)
         free = draws[:, 3] < self.config.share
-        anything = picks.take(candidates, picks.uniformly(draws[:, 0], candidates.shape[1]))
+        anything = uniform_proposal(candidates, draws[:, 0]).goal
         return replace(
             own,
             goal=torch.where(free.unsqueeze(1), anything, own.goal),
+            learn=None if own.learn is None else own.learn & ~free,
             score=own.score.masked_fill(free, torch.nan),
             probe=free if own.probe is None else free | own.probe,
             note=None if own.note is None else own.note * ~free,
         )
-
-    def critic(self) -> Critic | None:
-        """See ``GoalSelector.critic``."""
-        return self.base.critic()
-
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
-        """See ``GoalSelector.learn``."""
-        return self.base.learn(interactions, rollout)
-
-    def check(self) -> None:
-        """See ``GoalSelector.check``."""
-        self.base.check()
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return self.base.state_dict()
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.base.load_state_dict(state)

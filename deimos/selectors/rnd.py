@@ -13,8 +13,8 @@ from deimos.interactions import Interactions
 from deimos.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, operations, weights_of
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
-from deimos.seeds import generator, weights_from
-from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Whitening
+from deimos.seeds import generator, restore, weights_from
+from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Whitening, uniform_proposal
 
 CLIP = 5.0  # bound of whitened inputs, as in the paper
 
@@ -72,12 +72,12 @@ class RND(GoalSelector):
             for layer in (*self.target, *self.predictor):
                 if isinstance(layer, nn.Linear):
                     nn.init.orthogonal_(layer.weight, 2**0.5)
+            # The difference of two networks of one hidden layer is one such network, at half of the calls.
+            units = (config.target + config.predictor,)
+            self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
         self.target.to(spaces.device)
         self.predictor.to(spaces.device)
         self._parameters, _ = flatten_parameters(self.predictor)
-        # The difference of two networks of one hidden layer is one such network, at half of the calls.
-        units = (config.target + config.predictor,)
-        self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
         self._join()
         self._error = ManyCandidates(self._difference, spaces.goal_dim)
         self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
@@ -100,8 +100,7 @@ class RND(GoalSelector):
         """See ``GoalSelector.propose``; scores are surprises."""
         self._uniform[rows] = candidates[:, 0]
         if not self.fitted:
-            pick = picks.uniformly(draws[:, 0], candidates.shape[1])
-            return Proposal(picks.take(candidates, pick), torch.full_like(draws[:, 0], torch.nan))
+            return uniform_proposal(candidates, draws[:, 0])
         score = self.surprise(state, goal, candidates)
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, 0.0)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
@@ -210,7 +209,7 @@ class RND(GoalSelector):
         self.predictor.load_state_dict(state["predictor"])
         self.target.load_state_dict(state["target"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
+        restore(self.generator, state["generator"])
         for name in ("uniform", "moments", "mean", "scale"):
             getattr(self, f"_{name}").copy_(state[name])
         self._learnt_at, self.fitted = state["learnt_at"], state["fitted"]

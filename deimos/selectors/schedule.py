@@ -3,20 +3,19 @@
 import math
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from deimos.checks import SimulationError
 from deimos.interactions import Interactions
 from deimos.rollout import Rollout
-from deimos.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.selector import Critic, Delegate, GoalSelector, SelectorConfig, Spaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
     """The first method chooses the goals up to a share of the training, the second one from there on.
 
-    The second learns from the start, so that it knows something when its time comes. The first goes on learning
-    as long as it chooses, and beyond where the learner has its baseline from it.
+    The second learns from the start what the first one's goals teach: outcomes and transitions. (Of candidates, which
+    RND, grid and PLR learn from as well, it sees none before it chooses.) The first goes on learning as long as it
+    chooses, and beyond where the learner has its baseline from it.
     """
 
     first: str = "vds"
@@ -39,7 +38,7 @@ class Config(SelectorConfig):
         return Schedule(self, spaces, seed)
 
 
-class Schedule(GoalSelector):
+class Schedule(Delegate):
     """See ``Config``."""
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
@@ -53,37 +52,14 @@ class Schedule(GoalSelector):
         self._keys: list[str] = []  # what the first method logs: every row of a run has the same columns
 
     @property
-    def now(self) -> GoalSelector:
-        """Who chooses."""
+    def current(self) -> GoalSelector:
+        """See ``Delegate.current``."""
         return self.parts[self.switched]
-
-    @property
-    def num_candidates(self) -> int:  # type: ignore[override]
-        """See ``GoalSelector.num_candidates``."""
-        return self.now.num_candidates
-
-    @property
-    def needs_rollout(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.needs_rollout``."""
-        return any(part.needs_rollout for part in self.parts)
-
-    @property
-    def first_goals_scaled(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.first_goals_scaled``."""
-        return self.now.first_goals_scaled
-
-    def goal_range(self) -> Tensor | None:
-        """See ``GoalSelector.goal_range``."""
-        return self.now.goal_range()
-
-    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
-        """See ``GoalSelector.propose``."""
-        return self.now.propose(rows, state, goal, candidates, draws)
 
     def critic(self) -> Critic | None:
         """See ``GoalSelector.critic``."""
         # The baseline stays with whoever has it: the learner's own has learnt nothing meanwhile.
-        return self.now.critic() or self.parts[0].critic()
+        return self.current.critic() or self.parts[0].critic()
 
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
         """See ``GoalSelector.learn``."""

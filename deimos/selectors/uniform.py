@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least
-from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +32,4 @@ class Uniform(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
-        count = candidates.shape[1]
-        pick = (draws[:, 0] * count).long().clamp(max=count - 1)
-        chosen = candidates.gather(1, pick.view(-1, 1, 1).expand(-1, 1, candidates.shape[2])).squeeze(1)
-        no_opinion = torch.full_like(draws[:, 0], torch.nan)
-        return Proposal(chosen, no_opinion)
+        return uniform_proposal(candidates, draws[:, 0])

@@ -19,7 +19,7 @@ from deimos.networks import Activation, mlp, operations
 from deimos.ppo import advantages
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
-from deimos.seeds import generator, weights_from
+from deimos.seeds import generator, restore, weights_from
 from deimos.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
 
 
@@ -99,7 +99,7 @@ class VDS(GoalSelector):
         self.stack = Stack(nets, spaces.fuse_critics)
         self.optimizer = Adam(self.stack.parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = generator(seed, "vds minibatches", device)
-        self._known: tuple[Tensor, Tensor] | None = None  # observations and their values, as asked for last
+        self._known: tuple[Tensor, Tensor] | None = None  # a whole rollout's observations and their values
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
@@ -116,13 +116,14 @@ class VDS(GoalSelector):
     def value(self, obs: Tensor) -> Tensor:
         """Mean value over the ensemble, shape (...,), of observations of shape (..., obs_dim)."""
         values = self.values(obs)
-        self._known = obs, values
+        if obs.dim() == 3:
+            self._known = obs, values
         return values.mean(0)
 
     def values(self, obs: Tensor) -> Tensor:
         """Values by every critic, shape (K, ...), of observations of shape (..., obs_dim)."""
         inputs = self._spaces.state_then_goal(obs).flatten(0, -2)
-        return self.stack.values(inputs).view(-1, *obs.shape[:-1])
+        return self.stack.values(inputs).view(len(self.stack.nets), *obs.shape[:-1])
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
@@ -155,8 +156,11 @@ class VDS(GoalSelector):
             value = self._own_values(rollout.obs, worlds)
         next_value = value[:, 1:]
         if len(rollout.final_obs):
-            final = self.values(rollout.final_obs) if shared else self._own_values(rollout.final_obs, worlds)
-            next_value = torch.where(_of_worlds(rollout.truncated, worlds), final, next_value)
+            step, world = rollout.truncated.nonzero(as_tuple=True)
+            final = torch.zeros(len(worlds), *rollout.truncated.shape, device=value.device)
+            final[:, step, world] = self.values(rollout.final_obs[step, world])
+            own = final.gather(2, worlds.unsqueeze(1).expand(-1, rollout.num_steps, -1))
+            next_value = torch.where(_of_worlds(rollout.truncated, worlds), own, next_value)
         old = value[:, :-1]
 
         def along_time(tensor: Tensor) -> Tensor:  # (K, num_steps, m) -> (num_steps, K * m)
@@ -219,7 +223,7 @@ class VDS(GoalSelector):
         """See ``GoalSelector.load_state_dict``."""
         self.stack.parameters.data.copy_(state["parameters"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
+        restore(self.generator, state["generator"])
 
 
 def _of_worlds(tensor: Tensor, worlds: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from deimos.checks import SimulationError
 from deimos.evaluation import evaluate, weights_hash
 from deimos.policy import load_policy
 from deimos.run_folder import RunError, RunFolder
+from deimos.shared import one_stream
 from deimos.study.folder import StudyFolder, curve_row, result_rows
 from deimos.study.plan import Cell
 
@@ -48,7 +49,7 @@ def work(study: StudyFolder, cell: Cell, stopped: Callable[[], bool]) -> bool:
     """
     path = study.cell_path(cell) / "run"
     device = training.resolve_device(cell.config.device)
-    with training.one_stream(device):
+    with one_stream(device):
         if (path / "checkpoint.pt").exists():
             trainer, run = training.resume(path)
         else:
