@@ -110,7 +110,9 @@ class Env(abc.ABC):
     episode_step: Tensor
     """Steps since the last reset, int32, shape (num_envs,); a view."""
     tensors: dict[str, Tensor]
-    """Everything that a bit-exact resume needs, by name; views, worlds along the first axis."""
+    """Everything that a bit-exact resume needs, by name; views, worlds along the first axis. ``episode_count`` and
+    ``goal_count`` are how many episodes each world has begun and how many goals it was given since: its draws'
+    addresses."""
 
     @abc.abstractmethod
     def step(self, action: Tensor) -> Step:
@@ -163,7 +165,10 @@ class Env(abc.ABC):
 
     @abc.abstractmethod
     def check(self) -> None:
-        """Raise ``SimulationError`` if a world has become invalid; reads the device once."""
+        """Raise ``SimulationError`` if an action was not finite or more worlds became invalid than may.
+
+        It reads the device. Call it after every step, or once in a while.
+        """
 
     def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData] | None":
         """One world as MuJoCo's model and data, for rendering; ``None`` where there is nothing to see."""
@@ -226,6 +231,16 @@ class Env(abc.ABC):
         if goal.stop == self.obs_dim:  # a goal at the end costs no copy
             return obs[..., : goal.start]
         return torch.cat([obs[..., : goal.start], obs[..., goal.stop :]], dim=-1)
+
+    def restart(self, goal_scale: Tensor | None = None) -> None:
+        """Begin every world's first episode again, as it was when the environment was built, its first goal apart.
+
+        Args:
+            goal_scale: Share of the goal range that first goals come from; see ``reset``.
+        """
+        for name in ("episode_count", "goal_count"):
+            self.tensors[name].zero_()
+        self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device), goal_scale)
 
     def copy_worlds(self, source: Tensor, target: Tensor, origin: "Env | None" = None) -> None:
         """Make worlds ``target`` exact clones of worlds ``source``, clocks and counts included.

@@ -39,7 +39,7 @@ class GoalLoop:
         self.learn = torch.ones(env.num_envs, device=env.device)
         """1 where the learner may use the transitions under the goal in force, else 0, shape (num_envs,)."""
         if selector.first_goals_scaled:  # the goals that the environment was built with are not
-            self.start()
+            env.restart(selector.goal_range())
 
     def start(self) -> None:
         """Begin a new episode in every world and drop what is pending; a fresh environment has begun already."""

@@ -15,12 +15,12 @@ from torch import Tensor
 
 import terrain
 from deimos.checks import SimulationError
-from deimos.env import Env, ObsField, Step
+from deimos.env import ObsField
 from deimos.locomotion_config import LocomotionConfig
 from deimos.physics import Captured, Physics
 from deimos.robots import Robot
 from deimos.shared import Shared, warp_device
-from kernels.goals import draw_candidates
+from deimos.warp_env import WarpEnv
 from kernels.height_scan import scan_points
 from kernels.locomotion import apply_actions, judge_step
 from kernels.locomotion_episodes import reset_worlds, set_goals, update_levels
@@ -29,6 +29,7 @@ from kernels.locomotion_rewards import LEG_JOINTS, vec12, vecT
 from kernels.locomotion_state import (
     BROKEN,
     COLUMNS,
+    COUNTERS,
     HEIGHT_SCALE,
     JOINT_SPEED_SCALE,
     NUM_FEET,
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
 MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
 MAX_INVALID_SHARE = 1e-3  # of all world-steps; more of them stop the run
+WINDOW = 10_000  # world-steps that the share is of at least, however often it is looked at
 ACTION_BOUND = 100.0  # Legged Gym's: far beyond what a policy does, so that only nonsense is clipped
 SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
 EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
@@ -61,12 +63,14 @@ NOISE = {
 }  # half widths, in the unit of each field; Legged Gym's  # fmt: skip
 
 
-class Locomotion(Env):
+class Locomotion(WarpEnv):
     """A legged robot in many worlds; see ``LocomotionConfig``.
+
+    Actions are differences from the default pose, in units of ``action_scale``.
 
     What the robot carries has its joints after those of the legs and may add components to the goal, fields to the
     observation and terms to the reward: set the class's attributes and override ``_judge_carried``,
-    ``_reset_carried`` and ``_record_candidates``.
+    ``_reset_carried`` and ``_finish_candidates``.
 
     Args:
         config: The task.
@@ -90,6 +94,8 @@ class Locomotion(Env):
     """Half width of the noise of every noisy field of the observation, in its unit."""
     columns: tuple[str, ...] = COLUMNS
     """What the reward is the sum of: those of ``kernels.locomotion``, then the terms of what is carried."""
+    _steps_in_window: int
+    _faults_known: int
 
     def __init__(
         self,
@@ -116,11 +122,7 @@ class Locomotion(Env):
         ground = config.load_terrain()
         self.terrain = ground or terrain.flat()
         self._goal_scale = wp.array(goal_scale, dtype=wp.float32, device=warp_device(device))
-        self._goal_range = Shared.zeros(len(goal_range), wp.float32, device)
-        self._whole_range = torch.tensor(goal_range, device=device)
-        self._seen_range = self._whole_range * torch.tensor(goal_scale, device=device)
-        self._allocate(len(goal_range))
-        self._seed, self._offset = seed, env_offset
+        self._allocate(goal_range, goal_scale, seed, env_offset)
         self.physics = self._build_physics(ground)
         self._params = self._make_params(ground)
         self._wire()
@@ -156,7 +158,8 @@ class Locomotion(Env):
             "dt": self.dt, "goal_period": config.goal_period, "time_limit": config.episode_steps,
             "stagger": config.stagger, "seed": self._seed, "world_offset": self._offset,
             "action_bound": ACTION_BOUND, "noise": config.noise,
-            "push_interval": round(config.push_interval / self.dt), "push_speed": config.push_speed,
+            "push_interval": max(1, round(config.push_interval / self.dt)) if config.push_interval else 0,
+            "push_speed": config.push_speed,
             "weight": vecT(*asdict(config.rewards).values()), "air_time_target": config.air_time_target,
             "soft_low": vec12(*(middle - half)), "soft_high": vec12(*(middle + half)),
             "max_speed": MAX_SPEED, "max_rate": MAX_RATE, "lost_contacts": self.physics.lost_contacts,
@@ -187,43 +190,34 @@ class Locomotion(Env):
             ObsField("heights", len(self.points), "m", HEIGHT_SCALE),
         )
 
-    def _allocate(self, goal_dim: int) -> None:
-        """Allocate every array once; nothing is allocated or rebound later."""
-        n, joints, device = self.num_envs, self.action_dim, self.device
+    def _allocate(
+        self, goal_range: tuple[float, ...], goal_scale: tuple[float, ...], seed: int, env_offset: int
+    ) -> None:  # fmt: skip
+        n, joints, goal_dim, device = self.num_envs, self.action_dim, len(goal_range), self.device
 
         def zeros(sizes: dict[str, tuple[int, ...]], dtype: type) -> dict[str, Shared]:
             return {name: Shared.zeros(shape, dtype, device) for name, shape in sizes.items()}
 
-        counters = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count")
         rows = {"goal": goal_dim, "action": joints, "joint_speed": joints, "air_time": NUM_FEET}
         state = zeros({name: (n, width) for name, width in rows.items()}, wp.float32)
-        state |= zeros(dict.fromkeys(counters, (n,)), wp.int32) | zeros({"tracked": (n,)}, wp.vec2)
+        state |= zeros(dict.fromkeys(COUNTERS, (n,)), wp.int32) | zeros({"tracked": (n,)}, wp.vec2)
         out = zeros(
             {"obs": (n, self.obs_dim), "term": (n, len(self.columns)), "reward": (n,), "value": (n,)}, wp.float32
         )
         out |= zeros({"tracking": (n, len(self.goal_groups))}, wp.float32)
         out |= zeros(dict.fromkeys(("terminated", "truncated", "goal_due", "invalid"), (n,)), wp.bool)
         out |= zeros({"count": (2,), "fault": (3,), "cause": (n,)}, wp.int32)
-        self.state_arrays, self.step_arrays = LocomotionState(), LocomotionStep()
-        for struct, arrays in ((self.state_arrays, state), (self.step_arrays, out)):
-            for name, shared in arrays.items():
-                setattr(struct, name, shared.array)
-        self.obs = out["obs"].tensor
-        self.term = out["term"].tensor
+        whole_range = torch.tensor(goal_range, device=device)
+        self._share(
+            LocomotionState(), state, LocomotionStep(), out, action=Shared.zeros((n, joints), wp.float32, device),
+            new_goal=Shared.zeros((n, goal_dim), wp.float32, device), first_range=whole_range,
+            seen_range=whole_range * torch.tensor(goal_scale, device=device), seed=seed, env_offset=env_offset,
+        )  # fmt: skip
+        self.term = self._out["term"]
         """What the last reward is the sum of, shape (num_envs, len(columns))."""
-        self._out = {name: shared.tensor for name, shared in out.items()}
-        self.tensors = {name: shared.tensor for name, shared in state.items()} | {"obs": self.obs}
-        self.episode_step = self.tensors["episode_step"]
-        self._step = Step(**{name: self._out[name] for name in Step.__dataclass_fields__})
         self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=device)
-        self._steps_reported = self._steps_checked = self.invalid_steps = 0
-        self.action = Shared.zeros((n, joints), wp.float32, device)
-        self._mask = Shared.zeros(n, wp.bool, device)
-        self._row = Shared.zeros(n, wp.int32, device)
-        self._new_goal = Shared.zeros((n, goal_dim), wp.float32, device)
-        self._draw = Shared.zeros(n, wp.vec4, device)
-        self._candidate_scale = Shared.zeros(goal_dim, wp.float32, device)
-        self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
+        self._steps_reported = self.invalid_steps = 0
+        self._clear_faults()
 
     def _wire(self) -> None:
         """Join the simulator's arrays and the robot's numbers to the kernels."""
@@ -253,10 +247,6 @@ class Locomotion(Env):
             self._row.array, self._new_goal.array, self._goal_scale, self.state_arrays, self.step_arrays.obs,
             record=True,
         )  # fmt: skip
-        self._launch_draw = draw_uniforms(
-            self._row.array, self.state_arrays.goal_count, self._draw.array, seed=self._seed, purpose=Purpose.GOAL,
-            world_offset=self._offset, record=True,
-        )  # fmt: skip
 
     def _run_step(self) -> None:
         params, state, out, sim = self._params, self.state_arrays, self.step_arrays, self._sim
@@ -281,7 +271,7 @@ class Locomotion(Env):
         )  # fmt: skip
         self.physics.reset(mask)
         reset_worlds(
-            params, self._joints, self._ground, mask, self._goal_range.array, self._goal_scale, state, sim.qpos,
+            params, self._joints, self._ground, mask, self._first_range.array, self._goal_scale, state, sim.qpos,
             sim.qvel, out.obs,
         )  # fmt: skip
         self._reset_carried()
@@ -293,13 +283,8 @@ class Locomotion(Env):
     def _reset_carried(self) -> None:
         """Launch what else the worlds of ``_mask`` need to begin an episode."""
 
-    def _record_candidates(self, candidates: wp.array) -> list[wp.Launch]:
-        """The launches that draw valid goals, uniform within ``_candidate_scale``, for the worlds of ``_row``."""
-        launch = draw_candidates(
-            self._row.array, self.state_arrays.goal_count, self._candidate_scale.array, candidates,
-            seed=self._seed, world_offset=self._offset, record=True,
-        )  # fmt: skip
-        return [launch]
+    def _finish_candidates(self, candidates: wp.array) -> list[wp.Launch]:
+        return []
 
     def _reset_all(self) -> None:
         """Begin every world's first episode; what recording has done before is undone."""
@@ -310,82 +295,44 @@ class Locomotion(Env):
             tensor.zero_()
         self._clear_faults()
         self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        self.physics.buffer_use()  # what the recording needed says nothing about these worlds
 
-    def step(self, action: Tensor) -> Step:
-        """See ``Env.step``. Actions are differences from the default pose, in units of ``action_scale``."""
-        if action.shape != self.action.tensor.shape:
-            expected = tuple(self.action.tensor.shape)
-            raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
-        self.action.tensor.copy_(action)
-        self._step.count.zero_()
+    def launch_step(self) -> None:
+        """See ``WarpEnv.launch_step``."""
         self._launch_step()
         self._sums += self.term.sum(0)
         self._steps_reported += 1
-        self._steps_checked += 1
-        return self._step
-
-    def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
-        """See ``Env.reset``."""
-        self._mask.tensor.copy_(mask)
-        torch.mul(self._whole_range, 1.0 if goal_scale is None else goal_scale, out=self._goal_range.tensor)
-        self._launch_reset()
-
-    def sample_goals(self, rows: Tensor, count: int, scale: Tensor | None = None) -> Tensor:
-        """See ``Env.sample_goals``."""
-        if count not in self._candidates:
-            candidates = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device)
-            self._candidates[count] = candidates, self._record_candidates(candidates.array)
-        candidates, launches = self._candidates[count]
-        self._set_rows(rows)
-        torch.mul(self._seen_range, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
-        for launch in launches:
-            launch.set_dim((len(rows), launch.bounds.shape[1]))  # as many threads per row as were recorded
-            launch.launch()
-        return candidates.tensor[: len(rows)]
-
-    def draw(self, rows: Tensor) -> Tensor:
-        """See ``Env.draw``."""
-        self._set_rows(rows)
-        self._launch_draw.set_dim(len(rows))
-        self._launch_draw.launch()
-        return self._draw.tensor[: len(rows)]
-
-    def set_goals(self, rows: Tensor, goal: Tensor) -> None:
-        """See ``Env.set_goals``."""
-        self._set_rows(rows)
-        self._new_goal.tensor[: len(rows)] = goal
-        self._launch_goals.set_dim(len(rows))
-        self._launch_goals.launch()
+        self._steps_in_window += 1
 
     def check(self) -> None:
-        """See ``Env.check``. Single invalid worlds are reset and left out of learning; too many of them stop the run.
+        """See ``Env.check``. An action that is not finite stops the run at once.
 
-        An action that is not finite stops it at once.
+        Single invalid worlds are reset and left out of learning. Too many of them stop the run: more than a share of
+        the world-steps since the window began, which is at least ``WINDOW`` of them and ends with the next check.
         """
         faults, world, broken_action = self._out["fault"].tolist()
-        steps, self._steps_checked = self._steps_checked, 0
-        self.invalid_steps = faults
-        self._clear_faults()
+        self.invalid_steps += faults - self._faults_known
+        self._faults_known = faults
+        window = self._steps_in_window * self.num_envs
         if broken_action < self.num_envs:
+            self._clear_faults()
             raise SimulationError(f"World {broken_action}: its action is not finite.")
-        if faults > MAX_INVALID_SHARE * steps * self.num_envs:
+        if faults > MAX_INVALID_SHARE * max(window, WINDOW):
+            self._clear_faults()
             raise SimulationError(
-                f"World {world}: {self._describe_fault(world)}; {faults} of {steps * self.num_envs} world-steps since "
-                f"the last check were invalid, more than {100 * MAX_INVALID_SHARE:g} %."
+                f"World {world}: {self._describe_fault(world)}; {faults} of the last {window} world-steps were "
+                f"invalid, more than {100 * MAX_INVALID_SHARE:g} % of {max(window, WINDOW)}."
             )
+        if window >= WINDOW:
+            self._clear_faults()
 
     def _describe_fault(self, world: int) -> str:
         """What was wrong with an invalid world when it last was."""
         cause, value = BROKEN[int(self._out["cause"][world]).bit_length() - 1], float(self._out["value"][world])
-        if cause != "contacts":
-            unit = " m/s or rad/s" if cause == "speed" else ""
-            return f"its {cause} was {value:g}{unit}"
-        use = self.physics.buffer_use()
-        return (
-            f"it lost contacts (overflow {int(value)}): up to {use['rows']} constraint rows in a world and "
-            f"{use['contacts']} contacts in all worlds were needed, with room for {use['max_rows']} and "
-            f"{use['max_contacts']}; raise physics.rows or physics.contacts"
-        )
+        if cause == "contacts":
+            return f"it lost contacts ({self.physics.explain_loss(int(value))})"
+        unit = " m/s or rad/s" if cause == "speed" else ""
+        return f"its {cause} was {value:g}{unit}"
 
     def report(self) -> dict[str, float]:
         """What a log wants to know since the last call: means of the reward's terms per step, levels, buffers.
@@ -395,11 +342,12 @@ class Locomotion(Env):
         steps, self._steps_reported = max(self._steps_reported, 1), 0
         means = (self._sums / (steps * self.num_envs)).tolist()
         self._sums.zero_()
+        invalid, self.invalid_steps = self.invalid_steps, 0
         use = self.physics.buffer_use()
         return {
             **{f"reward/{name}": value for name, value in zip(self.columns, means, strict=True)},
             "level": self.tensors["level"].float().mean().item(),
-            "invalid_steps": self.invalid_steps,
+            "invalid_steps": invalid,
             "contact_use": use["contacts"] / use["max_contacts"],
             "row_use": use["rows"] / use["max_rows"],
         }
@@ -423,7 +371,6 @@ class Locomotion(Env):
         return None
 
     def _clear_faults(self) -> None:
+        """Begin a new window."""
         self._out["fault"].copy_(torch.tensor([0, self.num_envs, self.num_envs], dtype=torch.int32))
-
-    def _set_rows(self, rows: Tensor) -> None:
-        self._row.tensor[: len(rows)] = rows
+        self._steps_in_window = self._faults_known = 0

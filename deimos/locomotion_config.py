@@ -36,7 +36,8 @@ class LocomotionConfig(EnvConfig):
     friction: tuple[float, float] = (0.5, 1.25)
     """Range of the feet's friction, drawn once per world; at least 0.05, below which contacts are ill-conditioned."""
     payload: float = 1.0
-    """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0."""
+    """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0. Off in Legged
+    Gym, but for its ANYmal."""
     push_interval: float = 15.0
     """Time from push to push, each robot in a phase of its own [s], at least 0; 0 for none."""
     push_speed: float = 1.0
@@ -46,9 +47,9 @@ class LocomotionConfig(EnvConfig):
     stagger: bool = True
     """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
     stiffness: float = 30.0
-    """Position gain of the legs' joints [N m/rad], positive."""
+    """Position gain of the legs' joints [N m/rad], positive. Legged Gym's A1, a lighter robot, has 20."""
     damping: float = 0.8
-    """Velocity gain of the legs' joints [N m s/rad], positive."""
+    """Velocity gain of the legs' joints [N m s/rad], positive. Legged Gym's A1 has 0.5."""
     action_scale: float = 0.25
     """What an action of one adds to a target angle [rad], positive."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)

@@ -26,6 +26,7 @@ from terrain import Terrain
 if TYPE_CHECKING:
     import mujoco
 
+FINEST_CELL = 0.05  # [m] of a height field on which no geom of a robot covers more than the 50 prisms that are tested
 PATIENCE = 3.0  # [s] of silence before the first step says what it waits for
 
 
@@ -43,7 +44,8 @@ class PhysicsConfig:
     """Bound of its line-search iterations, at least 1."""
     contacts: int = 0
     """Room for contacts per world, shared by all worlds; 0 takes half of what touching with every geom would need, a
-    quarter on a height field."""
+    quarter on a height field, but one for every pair of geoms that can touch at least, and all of it for 16 worlds
+    more. That is 63 % and 28 % for 512 Go1s."""
     rows: int = 0
     """Room for constraint rows in each world; 0 takes what touching with every geom, all joints at limits, needs, four
     fifths of it on a height field."""
@@ -67,6 +69,9 @@ class Physics:
         config: The simulator's settings.
         friction: Sliding friction of every world's feet, shape (num_envs,); ``None`` for that of the robot.
         payload: What is added to every world's base [kg], shape (num_envs,); ``None`` for nothing.
+
+    Raises:
+        ValueError: If the terrain's cells are finer than ``FINEST_CELL``.
     """
 
     model: "mujoco.MjModel"
@@ -83,8 +88,6 @@ class Physics:
     """Normal forces between each part of the robot and the terrain, float32, shape (substeps, num_envs, parts)."""
     overflow: wp.array
     """Bits of what ran out since they were last cleared, int32, shape (num_envs,)."""
-    rows: wp.array
-    """Constraint rows needed in the last substep, int32, shape (num_envs,)."""
     joint_range: np.ndarray
     """Lowest and highest angle of every joint [rad], shape (nu, 2)."""
     lost_contacts: int
@@ -106,6 +109,11 @@ class Physics:
         import mujoco
         import mujoco_warp as mjw
 
+        if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
+            raise ValueError(
+                f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
+                f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}."
+            )
         self.config = config
         self.num_envs = num_envs
         self.device = device
@@ -119,7 +127,8 @@ class Physics:
 
         contacts, pairs, rows = _largest_demand(model, plane=terrain is None)
         # Room costs time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's
-        # 120 rows a policy's robots needed 64 at most, and robots that were thrown about by their own legs 93.
+        # 120 rows a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown
+        # about by their own legs 93.
         contact_share, row_share = (1 / 2, 1.0) if terrain is None else (1 / 4, 4 / 5)
         # A few worlds alone may need all of the contacts at once.
         shared = num_envs * max(pairs, math.ceil(contact_share * contacts)) + min(num_envs, 16) * contacts
@@ -141,7 +150,7 @@ class Physics:
                 self._set_payload(model, payload)
         data = self._data
         self.qpos, self.qvel, self.ctrl, self.torque = data.qpos, data.qvel, data.ctrl, data.actuator_force
-        self.overflow, self.rows = data.overflow, data.nefc
+        self.overflow = data.overflow
         self.joint_range = model.jnt_range[1:].copy()
         bits = mjw.OverflowType
         self.lost_contacts = int(
@@ -226,9 +235,18 @@ class Physics:
             "contacts": contacts, "max_contacts": self.max_contacts, "rows": rows, "max_rows": self.max_rows,
         }  # fmt: skip
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Copies of all tensors that a bit-exact resume needs."""
-        return {name: tensor.clone() for name, tensor in self.tensors.items()}
+    def explain_loss(self, bits: int) -> str:
+        """Why contacts were lost, by the bits of ``overflow``, and what helps; reads the device."""
+        bit, use = self._mjw.OverflowType, self.buffer_use()
+        rows = f"up to {use['rows']} constraint rows in a world were needed, with room for {use['max_rows']}"
+        contacts = f"up to {use['contacts']} contacts in all worlds were needed, with room for {use['max_contacts']}"
+        reasons = {
+            bit.NEFC | bit.NJMAX_NNZ: f"{rows}; raise physics.rows",
+            bit.BROADPHASE | bit.NARROWPHASE | bit.CCD: f"{contacts}; raise physics.contacts",
+            bit.HFIELD: "a geom covered more of the height field than is tested; take a terrain of larger cells",
+            bit.EPA_HORIZON: "a contact was deeper than the collision test can resolve",
+        }
+        return "; ".join(f"{bit(bits & cause).name}: {text}" for cause, text in reasons.items() if bits & cause)
 
     def to_mujoco(self, world: int) -> "mujoco.MjData":
         """One world as MuJoCo's own data on ``model``, for rendering, viewers and tests; reads the device."""

@@ -21,7 +21,15 @@ from kernels.check import require, require_axes
 from kernels.locomotion import find_fault
 from kernels.locomotion_obs import write_goal
 from kernels.locomotion_rewards import LEG_JOINTS
-from kernels.locomotion_state import NUM_COLUMNS, LocomotionParams, LocomotionState, LocomotionStep, Simulation
+from kernels.locomotion_state import (
+    NUM_COLUMNS,
+    LocomotionParams,
+    LocomotionState,
+    LocomotionStep,
+    Simulation,
+    require_obs,
+    require_state,
+)
 from kernels.random import Purpose
 
 wp.set_module_options({"enable_backward": False})
@@ -67,7 +75,7 @@ def _judge_arms(
     error: wp.array[float],
 ):
     for env in range(wp.tid(), action.shape[0], num_threads):
-        if find_fault(params, sim, env)[0] == 0.0:
+        if find_fault(params, sim, state.goal, env)[0] == 0.0:
             place = place_of_end_effector(params, arm, heights, sim.qpos, env)
             seen = goal_of_place(place)
             goal = goal_in_force(state, env)
@@ -121,8 +129,9 @@ def judge_arms(
     require_arm(arm, heights, num_joints, action)
     for name, width in (("qpos", 7 + num_joints), ("qvel", 6 + num_joints), ("torque", num_joints)):
         require(f"sim.{name}", getattr(sim, name), dtype=wp.float32, shape=(n, width), like=action)
+    require("sim.overflow", sim.overflow, dtype=wp.int32, shape=(n,), like=action)
     require("state.goal", state.goal, dtype=wp.float32, shape=(n, GOAL_COMPONENT + 3), like=action)
-    require("state.action", state.action, like=action)
+    require_state(state, n, num_joints, action)
     require("out.obs", out.obs, dtype=wp.float32, shape=(n, max(out.obs.shape[1], arm.obs_start + 3)), like=action)
     require("out.term", out.term, dtype=wp.float32, shape=(n, NUM_COLUMNS + len(ARM_TERMS)), like=action)
     require("out.tracking", out.tracking, dtype=wp.float32, shape=(n, GROUP + 1), like=action)
@@ -205,7 +214,8 @@ def reset_arms(
     require("goal_range", goal_range, dtype=wp.float32, shape=(GOAL_COMPONENT + 3,), like=mask)
     require("goal_scale", goal_scale, like=goal_range)
     require("state.goal", state.goal, dtype=wp.float32, shape=(n, GOAL_COMPONENT + 3), like=mask)
-    require_axes("obs", obs, 2)
+    require_state(state, n, qpos.shape[1] - 7, mask)
+    require_obs("obs", obs, state, mask)
     require("obs", obs, dtype=wp.float32, shape=(n, max(obs.shape[1], arm.obs_start + 3)), like=mask)
     require("error", error, dtype=wp.float32, shape=(n,), like=mask)
     wp.launch(

@@ -22,7 +22,7 @@ import warp as wp
 
 from kernels.arm_rewards import vecA
 from kernels.check import require, require_axes
-from kernels.height_scan import sample_height
+from kernels.height_scan import require_heights, sample_height
 from kernels.locomotion_obs import base_quaternion
 from kernels.locomotion_rewards import LEG_JOINTS
 from kernels.locomotion_state import LocomotionParams, LocomotionState
@@ -304,5 +304,4 @@ def require_arm(arm: Arm, heights: wp.array, num_joints: int, like: wp.array) ->
     joints = num_joints - LEG_JOINTS
     require("arm.axis", arm.axis, dtype=wp.vec3, shape=(joints,), like=like)
     require("arm.offset", arm.offset, dtype=wp.vec3, shape=(joints + 1,), like=like)
-    require_axes("heights", heights, 2)
-    require("heights", heights, dtype=wp.float32, shape=heights.shape, like=like)
+    require_heights("heights", heights, like)

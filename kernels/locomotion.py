@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from kernels.check import require
+from kernels.check import require, require_axes
 from kernels.contacts import peak_force
 from kernels.goals import count_events, goal_is_due, time_is_up
 from kernels.locomotion_obs import base_quaternion, base_rate, base_velocity, write_proprioception
@@ -30,6 +30,9 @@ from kernels.locomotion_state import (
     LocomotionState,
     LocomotionStep,
     Simulation,
+    require_joints,
+    require_obs,
+    require_state,
 )
 from kernels.random import Purpose, uniform4
 from kernels.rotations import down_in_body
@@ -102,8 +105,8 @@ def apply_actions(
     """
     _require_simulation(sim, action)
     require("fault", fault, dtype=wp.int32, shape=(3,), like=action)
-    _require_joints(joints, action)
-    _require_state(state, action)
+    require_joints(joints, action.shape[1], action)
+    require_state(state, *action.shape, action)
     num_threads = 1 if action.device.is_cpu else action.shape[0]
     wp.launch(
         _apply_actions,
@@ -115,8 +118,8 @@ def apply_actions(
 
 
 @wp.func
-def find_fault(params: LocomotionParams, sim: Simulation, env: int) -> wp.vec2:
-    """(bit of BROKEN, value): why a world is not physical any more, or (0, 0) where it is."""
+def find_fault(params: LocomotionParams, sim: Simulation, goal: wp.array2d[float], env: int) -> wp.vec2:
+    """(bit of BROKEN, value): why a world is not physical any more or has no goal, or (0, 0) where all is well."""
     position = float(0.0)
     for i in range(sim.qpos.shape[1]):
         position += sim.qpos[env, i] - sim.qpos[env, i]  # 0, or NaN for NaN and infinity
@@ -126,10 +129,15 @@ def find_fault(params: LocomotionParams, sim: Simulation, env: int) -> wp.vec2:
         velocity += sim.qvel[env, i] - sim.qvel[env, i]
         if i >= 3:
             fastest = wp.max(fastest, wp.abs(sim.qvel[env, i]))
+    aim = float(0.0)
+    for i in range(goal.shape[1]):
+        aim += goal[env, i] - goal[env, i]
     if position != 0.0:
         return wp.vec2(2.0, position)
     if velocity != 0.0:
         return wp.vec2(4.0, velocity)
+    if aim != 0.0:
+        return wp.vec2(32.0, aim)
     speed = wp.length(wp.vec3(sim.qvel[env, 0], sim.qvel[env, 1], sim.qvel[env, 2]))
     if speed > params.max_speed:
         return wp.vec2(8.0, speed)
@@ -228,7 +236,7 @@ def write_reward(m: LegMotion, params: LocomotionParams, env: int, out: Locomoti
         total += terms[k]
     for k in range(wp.static(NUM_COLUMNS), out.term.shape[1]):  # those of what is carried, written before
         total += out.term[env, k]
-    reward = wp.max(total, 0.0)
+    reward = total - wp.min(total, 0.0)  # a maximum of NaN and 0 would be 0
     out.term[env, wp.static(len(TERMS))] = reward - total
     out.reward[env] = reward
 
@@ -261,7 +269,7 @@ def _judge_step(
     out: LocomotionStep,
 ):
     for env in range(wp.tid(), action.shape[0], num_threads):
-        found = find_fault(params, sim, env)
+        found = find_fault(params, sim, state.goal, env)
         broken = found[0] > 0.0
         crashed = peak_force(sim.part_force, env, wp.static(BASE_PART)) > wp.static(CRASH_FORCE)
 
@@ -308,8 +316,9 @@ def judge_step(
     """Judge what the simulator has done: health, crash, reward, clocks, observation without heights and noise.
 
     Nothing is reset and no goal changes. A world whose state is not physical any more (not finite, too
-    fast, or with contacts lost) is marked ``invalid`` and cut off: it gets a reward of 0, keeps the
-    observation of the step before, and no goal falls due in it. A crash on the same step counts all the same.
+    fast, or with contacts lost), or whose goal is not finite, is marked ``invalid`` and cut off: it gets a reward
+    of 0, keeps the observation of the step before, and no goal falls due in it. A crash on the same step counts
+    all the same.
 
     Args:
         params: What all worlds share.
@@ -326,9 +335,10 @@ def judge_step(
         ValueError: If an array has another shape, dtype or device.
     """
     _require_simulation(sim, action)
-    _require_joints(joints, action)
-    _require_state(state, action)
+    require_joints(joints, action.shape[1], action)
+    require_state(state, *action.shape, action)
     require("goal_scale", goal_scale, dtype=wp.float32, shape=state.goal.shape[1:], like=action)
+    require_obs("out.obs", out.obs, state, action)
     _require_step(out, action)
     num_threads = 1 if action.device.is_cpu else action.shape[0]
     wp.launch(
@@ -340,13 +350,9 @@ def judge_step(
     )
 
 
-def _require_joints(joints: Joints, action: wp.array) -> None:
-    for name in ("pose", "action_scale", "low", "high"):
-        require(f"joints.{name}", getattr(joints, name), dtype=wp.float32, shape=action.shape[1:], like=action)
-
-
 def _require_simulation(sim: Simulation, action: wp.array) -> None:
     require("action", action, dtype=wp.float32)
+    require_axes("action", action, 2)
     n, num_joints = action.shape
     for name, width in (
         ("qpos", 7 + num_joints),
@@ -360,22 +366,10 @@ def _require_simulation(sim: Simulation, action: wp.array) -> None:
     require("sim.overflow", sim.overflow, dtype=wp.int32, shape=(n,), like=action)
 
 
-def _require_state(state: LocomotionState, action: wp.array) -> None:
-    n = action.shape[0]
-    require("state.goal", state.goal, dtype=wp.float32, shape=(n, state.goal.shape[1]), like=action)
-    require("state.action", state.action, like=action)
-    require("state.joint_speed", state.joint_speed, like=action)
-    require("state.air_time", state.air_time, dtype=wp.float32, shape=(n, NUM_FEET), like=action)
-    require("state.tracked", state.tracked, dtype=wp.vec2, shape=(n,), like=action)
-    for name in ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count"):
-        require(f"state.{name}", getattr(state, name), dtype=wp.int32, shape=(n,), like=action)
-
-
 def _require_step(out: LocomotionStep, action: wp.array) -> None:
     n = action.shape[0]
     for name, shape, dtype in (
-        ("obs", (n, out.obs.shape[1]), wp.float32), ("reward", (n,), wp.float32),
-        ("tracking", (n, out.tracking.shape[1]), wp.float32),
+        ("reward", (n,), wp.float32), ("tracking", (n, max(2, out.tracking.shape[1])), wp.float32),
         ("term", (n, max(NUM_COLUMNS, out.term.shape[1])), wp.float32),
         ("count", (2,), wp.int32), ("fault", (3,), wp.int32), ("cause", (n,), wp.int32), ("value", (n,), wp.float32),
         *((flag, (n,), wp.bool) for flag in ("terminated", "truncated", "goal_due", "invalid")),

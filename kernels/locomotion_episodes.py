@@ -3,7 +3,7 @@
 import warp as wp
 
 from kernels.check import require, require_axes
-from kernels.height_scan import sample_height
+from kernels.height_scan import require_heights, sample_height
 from kernels.locomotion_obs import write_goal, write_proprioception
 from kernels.locomotion_rewards import LEG_JOINTS
 from kernels.locomotion_state import (
@@ -13,6 +13,9 @@ from kernels.locomotion_state import (
     LevelRule,
     LocomotionParams,
     LocomotionState,
+    require_joints,
+    require_obs,
+    require_state,
 )
 from kernels.random import Purpose, uniform4
 from kernels.rotations import from_yaw
@@ -211,7 +214,7 @@ def update_levels(
         terminated: Worlds whose last step ended in a crash, bool, shape (num_envs,).
         truncated: Worlds whose last step cut the episode off, bool, shape (num_envs,).
         invalid: Worlds whose last step was not physical; they keep their level, bool, shape (num_envs,).
-        qpos: Positions, float32, shape (num_envs, nq).
+        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
         state: The worlds. Their levels are updated where ``mask`` is true.
 
     Raises:
@@ -224,6 +227,7 @@ def update_levels(
     require("origin", origin, dtype=wp.vec3, shape=origin.shape, like=mask)
     require_axes("qpos", qpos, 2)
     require("qpos", qpos, dtype=wp.float32, shape=(mask.shape[0], qpos.shape[1]), like=mask)
+    require_state(state, mask.shape[0], qpos.shape[1] - 7, mask)
     wp.launch(
         _update_levels,
         dim=mask.shape[0],
@@ -300,15 +304,16 @@ def reset_worlds(
     """
     require("mask", mask, dtype=wp.bool)
     n, num_joints = mask.shape[0], joints.pose.shape[0]
+    require_joints(joints, num_joints, mask)
+    require_state(state, n, num_joints, mask)
+    require_obs("obs", obs, state, mask)
     require("goal_range", goal_range, dtype=wp.float32, shape=state.goal.shape[1:], like=mask)
     require("goal_scale", goal_scale, like=goal_range)
     require("qpos", qpos, dtype=wp.float32, shape=(n, 7 + num_joints), like=mask)
     require("qvel", qvel, dtype=wp.float32, shape=(n, 6 + num_joints), like=mask)
-    require_axes("obs", obs, 2)
-    require("obs", obs, dtype=wp.float32, shape=(n, obs.shape[1]), like=mask)
     require_axes("ground.origin", ground.origin, 2)
     require("ground.origin", ground.origin, dtype=wp.vec3, shape=ground.origin.shape, like=mask)
-    require("ground.heights", ground.heights, dtype=wp.float32, shape=ground.heights.shape, like=mask)
+    require_heights("ground.heights", ground.heights, mask)
     wp.launch(
         _reset_worlds,
         dim=n,
@@ -360,10 +365,10 @@ def set_goals(
         ValueError: If an array has another shape, dtype or device.
     """
     require("row", row, dtype=wp.int32)
+    require_state(state, state.goal.shape[0], state.action.shape[1], row)
     require("goal", goal, dtype=wp.float32, shape=(row.shape[0], state.goal.shape[1]), like=row)
     require("goal_scale", goal_scale, dtype=wp.float32, shape=goal.shape[1:], like=row)
-    require_axes("obs", obs, 2)
-    require("obs", obs, dtype=wp.float32, shape=(state.goal.shape[0], obs.shape[1]), like=row)
+    require_obs("obs", obs, state, row)
     return wp.launch(
         _set_goals,
         dim=row.shape[0],

@@ -3,7 +3,7 @@
 import warp as wp
 
 from kernels.check import require, require_axes
-from kernels.height_scan import sample_minimum
+from kernels.height_scan import require_heights, sample_minimum
 from kernels.locomotion_state import (
     GOAL_START,
     HEIGHT_BOUND,
@@ -14,6 +14,8 @@ from kernels.locomotion_state import (
     Joints,
     LocomotionParams,
     LocomotionState,
+    require_obs,
+    require_state,
 )
 from kernels.random import Purpose, uniform4
 from kernels.rotations import down_in_body, heading, rotate_by_heading, rotate_inverse
@@ -144,7 +146,7 @@ def finish_obs(
         heights: The height grid [m], float32, shape (nx, ny).
         point: Points in the frame of the robot's yaw [m], vec2, shape (obs_dim - params.scan_start,).
         noise: Half width of the uniform noise of every component, as the policy sees it, float32, shape (obs_dim,).
-        qpos: Positions, float32, shape (num_envs, nq).
+        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
         state: The worlds; its clocks address the draws.
         obs: Observations, float32, shape (num_envs, obs_dim). Updated.
         wanted: Value of ``mask`` where to write.
@@ -153,16 +155,14 @@ def finish_obs(
         ValueError: If an array has another shape, dtype or device.
     """
     require("mask", mask, dtype=wp.bool)
-    for name, array, axes in (("heights", heights, 2), ("qpos", qpos, 2), ("obs", obs, 2)):
-        require_axes(name, array, axes)
-        require(name, array, dtype=wp.float32, shape=array.shape, like=mask)
-    n, obs_dim = mask.shape[0], obs.shape[1]
-    require("qpos", qpos, shape=(n, qpos.shape[1]), like=qpos)
-    require("obs", obs, shape=(n, obs_dim), like=obs)
+    require_heights("heights", heights, mask)
+    require_axes("qpos", qpos, 2)
+    require("qpos", qpos, dtype=wp.float32, shape=(mask.shape[0], qpos.shape[1]), like=mask)
+    require_state(state, mask.shape[0], qpos.shape[1] - 7, mask)
+    require_obs("obs", obs, state, mask)
+    n, obs_dim = obs.shape
     require("point", point, dtype=wp.vec2, shape=(obs_dim - params.scan_start,), like=mask)
     require("noise", noise, dtype=wp.float32, shape=(obs_dim,), like=mask)
-    for name in ("episode_count", "episode_step"):
-        require(f"state.{name}", getattr(state, name), dtype=wp.int32, like=mask)
     threads = (1, 1) if mask.device.is_cpu else (n, (obs_dim + 3) // 4)
     wp.launch(
         _finish_obs,

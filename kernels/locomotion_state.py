@@ -15,6 +15,7 @@ from enum import IntEnum
 
 import warp as wp
 
+from kernels.check import require, require_axes
 from kernels.locomotion_rewards import TERMS, vec12, vecT
 
 wp.set_module_options({"enable_backward": False})
@@ -32,7 +33,8 @@ CRASH_FORCE = 1.0  # [N] between base and terrain
 FOOT_FORCE = 1.0  # [N] that makes a contact of a foot
 LIMB_FORCE = 0.1  # [N] that makes a collision of a thigh or calf
 
-BROKEN = ("action", "position", "velocity", "speed", "contacts")  # causes of an invalid world, by their bit
+BROKEN = ("action", "position", "velocity", "speed", "contacts", "goal")  # causes of an invalid world, by their bit
+COUNTERS = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count")  # of a state
 
 
 class LevelRule(IntEnum):
@@ -146,8 +148,37 @@ class Simulation:
     torque: wp.array2d[float]  # [N m]
     part_force: wp.array3d[float]  # (substeps, num_envs, parts): normal forces on the terrain [N]
     overflow: wp.array[int]  # bits of what the simulator ran out of
-    rows: wp.array[int]  # constraint rows that were needed
 
 
 COLUMNS = (*TERMS, "clipping")  # of ``LocomotionStep.term``; what clipping at 0 added comes last
 NUM_COLUMNS = len(COLUMNS)
+
+
+def require_state(state: LocomotionState, num_envs: int, num_joints: int, like: wp.array) -> None:
+    """Raise ``ValueError`` unless every array of ``state`` is as long as its struct says.
+
+    Args:
+        state: The worlds.
+        num_envs: Their number.
+        num_joints: Number of joints.
+        like: An array on whose device they must be.
+    """
+    widths = {"goal": max(3, state.goal.shape[1]), "action": num_joints, "joint_speed": num_joints}
+    for name, width in (widths | {"air_time": NUM_FEET}).items():
+        require(f"state.{name}", getattr(state, name), dtype=wp.float32, shape=(num_envs, width), like=like)
+    require("state.tracked", state.tracked, dtype=wp.vec2, shape=(num_envs,), like=like)
+    for name in COUNTERS:
+        require(f"state.{name}", getattr(state, name), dtype=wp.int32, shape=(num_envs,), like=like)
+
+
+def require_joints(joints: Joints, num_joints: int, like: wp.array) -> None:
+    """Raise ``ValueError`` unless ``joints`` are that many, on the device of ``like``."""
+    for name in Joints.vars:
+        require(f"joints.{name}", getattr(joints, name), dtype=wp.float32, shape=(num_joints,), like=like)
+
+
+def require_obs(name: str, obs: wp.array, state: LocomotionState, like: wp.array) -> None:
+    """Raise ``ValueError`` unless ``obs`` has a row for every world, with room for goal and joints of ``state``."""
+    require_axes(name, obs, 2)
+    least = GOAL_START + state.goal.shape[1] + 3 * state.action.shape[1]
+    require(name, obs, dtype=wp.float32, shape=(state.goal.shape[0], max(least, obs.shape[1])), like=like)

@@ -48,23 +48,9 @@ def heading(quat: wp.vec4) -> wp.vec2:
 
 
 @wp.func
-def yaw(quat: wp.vec4) -> float:
-    """The yaw [rad], in [-pi, pi]."""
-    direction = heading(quat)
-    return wp.atan2(direction[1], direction[0])
-
-
-@wp.func
 def rotate_by_heading(direction: wp.vec2, x: float, y: float) -> wp.vec2:
     """The horizontal vector (x, y) turned by the angle whose (cos, sin) is ``direction``."""
     return wp.vec2(direction[0] * x - direction[1] * y, direction[1] * x + direction[0] * y)
-
-
-@wp.func
-def rotate_by_yaw(quat: wp.vec4, v: wp.vec3) -> wp.vec3:
-    """``v`` turned about the vertical by the body's yaw alone; pitch and roll are ignored."""
-    flat = rotate_by_heading(heading(quat), v[0], v[1])
-    return wp.vec3(flat[0], flat[1], v[2])
 
 
 @wp.func

@@ -27,7 +27,7 @@ commands:
   list           the shapes and their parameters, and the presets
   shape NAME     build one tile of a shape
   grid           build a grid of many tiles, from a preset, a TOML file or a list of shapes
-  bench          measure the speed of the making and of the height scan
+  bench          measure the speed of the making
 
 Every command explains its options with --help.
 
@@ -73,7 +73,7 @@ class GridOptions(Outputs):
     border: float | None = None
     """Width of the level border [m], at least 0."""
     cell: float | None = None
-    """Distance of two samples of the height grid [m]; must divide tile and border."""
+    """Distance of two samples of the height grid [m]; must divide tile and border. Robots take none below 0.05 m."""
     max_step: float | None = None
     """Highest step that any shape may have [m]."""
 

@@ -17,7 +17,7 @@ from rsl_rl.runners import OnPolicyRunner
 from deimos.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from deimos.adapters.rsl_rl import RslRlVecEnv
 from deimos.checks import SimulationError
-from deimos.envs import particle
+from deimos.envs import particle, quad
 from deimos.fear import FearConfig
 from deimos.goal_loop import GoalLoop, spaces
 from deimos.selectors import director, uniform
@@ -170,6 +170,17 @@ class TestRslRl:
         action[2, 1] = torch.nan
         with pytest.raises(SimulationError, match="World 2: its action is not finite"):
             env.step(action)
+
+    def test_goes_on_after_an_invalid_world(self, torch_device):
+        """One broken world of four begins anew, though it is a quarter of the steps that were checked so far."""
+        env = RslRlVecEnv(quad.Config().build(4, torch_device, 0))
+        idle = torch.zeros(4, 12, device=torch_device)
+        env.env.tensors["qvel"][2, 0] = 99.0
+        dones = [env.step(idle)[2].tolist() for _ in range(3)]
+        assert dones == [[False, False, True, False], *[[False] * 4] * 2]
+        idle[1, 7] = torch.inf
+        with pytest.raises(SimulationError, match="World 1: its action is not finite"):
+            env.step(idle)
 
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
     def test_refuses_a_bad_reward_scale(self, scale):
@@ -374,6 +385,18 @@ class TestGymnasium:
             GymnasiumVectorEnv(CONFIG, 0)
         idle[3, 0] = np.nan
         with pytest.raises(SimulationError, match="World 3: its action is not finite"):
+            envs.step(idle)
+
+    def test_goes_on_after_an_invalid_world(self):
+        """One broken world is cut off and begins anew, alone or among few, and a run of them is an error."""
+        envs, idle = GymnasiumVectorEnv(quad.Config(), 2), np.zeros((2, 12))
+        envs.reset()
+        speed = envs.loop.env.tensors["qvel"]
+        for _ in range(10):
+            speed[1, 0] = 99.0
+            assert envs.step(idle)[3].tolist() == [False, True]
+        speed[1, 0] = 99.0
+        with pytest.raises(SimulationError, match=r"World 1: its speed was .* 11 of the last 22 world-steps"):
             envs.step(idle)
 
     def test_single_world_must_be_reset(self):

@@ -254,6 +254,29 @@ def test_resume_is_exact(task, torch_device, hills):
 
 
 @both
+def test_reports_are_the_same_after_a_resume(task, torch_device, hills):
+    """What a log gets of the steps after a resume is what it would have got of an uninterrupted run, buffers too."""
+    env = build(torch_device, task=task, terrain=hills)
+    assert env.report()["row_use"] == env.report()["contact_use"] == 0, "nothing has been simulated yet"
+    action = actions(6, torch_device, task=task)
+    reports = []
+    for _ in range(12):
+        env.step(action)
+    env.check()
+    env.report()
+    saved = env.state_dict()
+    resumed = build(torch_device, task=task, terrain=hills)
+    resumed.load_state_dict(saved)
+    for world in (env, resumed):
+        for _ in range(3):
+            world.step(action)
+        world.check()
+        reports.append(world.report())
+    assert reports[0] == reports[1]
+    assert 0 < reports[0]["row_use"] < 1
+
+
+@both
 def test_two_shards_equal_the_whole(task, torch_device, hills):
     """Two environments of 4 worlds, the second with an offset of 4, do what one of 8 does, bit for bit."""
     config = {"terrain": hills, "push_interval": 0.2}
@@ -473,23 +496,75 @@ def test_a_broken_world_is_reset_and_touches_nobody(task, torch_device, hills, n
     assert int(env.tensors["episode_count"][2]) >= 2
 
 
-def test_too_many_invalid_worlds_stop_the_run(torch_device):
-    """One invalid world-step in six is far above 0.1 %: the check names the world, the quantity and the share."""
+@pytest.mark.parametrize("often", [True, False])
+def test_too_many_invalid_worlds_stop_the_run(torch_device, often):
+    """More than 0.1 % of 10 000 world-steps are too many, however often the check looks; it names what was wrong."""
     env = build(torch_device)
-    env.tensors["qvel"][4, 1] = 123.0
-    env.step(actions(6, torch_device))
-    with pytest.raises(SimulationError, match=r"World 4: its speed was 12\d.* 1 of 6 world-steps .* more than 0.1 %"):
+    for count in range(11):
+        assert env.invalid_steps == (count if often else 0)
+        env.tensors["qvel"][4, 1] = 123.0
+        step = env.step(torch.zeros(6, 12, device=torch_device))
+        assert step.invalid.tolist() == [False] * 4 + [True, False]
+        env.reset(step.invalid)
+        if often and count < 10:
+            env.check()
+    wanted = r"World 4: its speed was 1[12]\d.* 11 of the last 66 world-steps were invalid, more than 0.1 % of 10000"
+    with pytest.raises(SimulationError, match=wanted):
         env.check()
     env.check()
+    assert env.report()["invalid_steps"] == 11
+    assert env.report()["invalid_steps"] == 0
+
+
+def test_invalid_worlds_are_forgotten_after_a_window(torch_device):
+    """Ten invalid world-steps in every window of 10 000 or more are no reason to stop, for however long."""
+    env = build(torch_device, num_envs=512)
+    for _ in range(3):
+        env.tensors["qvel"][:10, 1] = 123.0
+        for _ in range(20):
+            step = env.step(torch.zeros(512, 12, device=torch_device))
+            env.reset(step.terminated | step.truncated)
+            env.check()
+    assert env.report()["invalid_steps"] == 30
+
+
+def test_a_goal_that_is_not_finite_breaks_its_world(torch_device):
+    """A NaN goal is named like a broken state, and the world that has it begins anew under a sound one."""
+    env = build(torch_device, episode_steps=200, goal_period=100)
+    loop = build_loop(env)
+    goal = env.goal[:1].clone()
+    goal[0, 1] = torch.nan
+    env.set_goals(rows_of(env, 3), goal)
+    step = env.step(actions(6, torch_device))
+    assert step.invalid.tolist() == [False, False, False, True, False, False]
+    assert env._describe_fault(3) == "its goal was nan"
+    loop.advance(step)
+    assert bool(env.obs.isfinite().all())
+    assert not env.step(actions(6, torch_device)).invalid.any()
 
 
 def test_buffers_too_small_say_how_large_they_had_to_be(torch_device):
-    """The message names the buffer, its size, what was needed and the flag."""
+    """The message names the bit, the buffer, its size, what was needed and the flag, and no buffer that had room."""
     env = build(torch_device, physics=PhysicsConfig(rows=8))
     for _ in range(20):
         env.step(actions(6, torch_device))
-    with pytest.raises(SimulationError, match=r"lost contacts.*up to \d+ constraint rows.*room for 8 .*physics.rows"):
+    message = r"lost contacts \(NEFC: up to \d+ constraint rows .* were needed, with room for 8; raise physics.rows\)"
+    with pytest.raises(SimulationError, match=message):
         env.check()
+
+
+@pytest.mark.parametrize(("seconds", "steps"), [(0.0, 0), (0.009, 1), (0.02, 1), (0.3, 15)])
+def test_pushes_come_as_often_as_they_are_asked_for(torch_device, seconds, steps):
+    """An interval shorter than a step is a push on every step, and only 0 is none."""
+    assert build(torch_device, num_envs=1, push_interval=seconds)._params.push_interval == steps
+
+
+def test_terrain_of_fine_cells_is_refused(torch_device, tmp_path):
+    """On cells finer than those that its geoms were tried on no robot is built, and the message says what to do."""
+    ground = terrain.build(Grid(shapes=(Share(shape=Stairs(tile=4.0)),), levels=1, columns=1, tile=4.0, cell=0.025))
+    ground.save(tmp_path / "fine.npz")
+    with pytest.raises(ValueError, match=r"terrain must have cells of at least 0.05 m .*got 0.025 m.*--cell 0.05"):
+        build(torch_device, terrain=str(tmp_path / "fine.npz"))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

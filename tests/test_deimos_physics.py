@@ -1,6 +1,7 @@
 """The simulator behind its face: agreement with MuJoCo C, resets, friction, payload, contact forces."""
 
 import math
+import re
 import time
 
 import mujoco
@@ -267,7 +268,29 @@ def test_buffers_tell_their_use(device):
     place(small, 0.25)
     small.step()
     assert np.all(small.overflow.numpy() & small.lost_contacts)
-    assert small.rows.numpy().max() > 8
+
+
+@pytest.mark.parametrize(
+    ("bits", "message"),
+    [
+        (1, r"^NEFC: up to \d+ constraint rows in a world were needed, with room for 49; raise physics.rows$"),
+        (16, r"^CCD: up to \d+ contacts in all worlds were needed, with room for 80; raise physics.contacts$"),
+        (32, "^HFIELD: a geom covered more of the height field than is tested; take a terrain of larger cells$"),
+        (256, "^EPA_HORIZON: a contact was deeper than the collision test can resolve$"),
+        (33 + 512, "^NEFC: .*; HFIELD: "),
+    ],
+)
+def test_losses_are_explained(device, bits, message):
+    """Every bit that means a lost contact has its name, its reason and what helps, and the solver's bits have none."""
+    assert re.search(message, make(2, device).explain_loss(bits))
+
+
+def test_every_loss_has_an_explanation(device):
+    """No single bit of those that mean a lost contact is left without words."""
+    physics = make(1, device)
+    bits = [1 << i for i in range(16) if physics.lost_contacts & 1 << i]
+    assert len(bits) == 7
+    assert all(physics.explain_loss(bit) for bit in bits)
 
 
 def test_buffers_hold_an_arm_that_touches_everything(device, stairs):

@@ -45,17 +45,83 @@ def test_mass_and_tree(model):
     assert model.actuator_trnid[:, 0].tolist() == list(range(1, 13))
 
 
-def test_inertias_are_those_of_the_source(model):
-    """Principal inertias of trunk, front right hip and thigh and of the calf are those that Menagerie stores."""
-    # kg m^2, as go1.xml has them (diaginertia), sorted; the table that the code holds was computed from them.
-    for name, numbers in {"trunk": go1.TRUNK, "FR_hip": go1.HIP, "FR_thigh": go1.THIGH, "FR_calf": go1.CALF}.items():
-        mass, centre, (xx, yy, zz, xy, xz, yz) = numbers
-        body = model.body(name)
-        expected = np.sort(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        np.testing.assert_allclose(np.sort(body.inertia), expected, rtol=1e-9)
-        np.testing.assert_allclose(body.ipos, centre, atol=1e-12)
-        assert body.mass[0] == mass
-        assert expected[0] + expected[1] > expected[2], "a rigid body obeys the triangle inequality"
+# go1.xml of MuJoCo Menagerie, letter by letter: mass [kg], pos [m], quat, diaginertia [kg m^2].
+SOURCE = {
+    "trunk": (
+        5.204, (0.0223, 0.002, -0.0005), (-0.00342088, 0.705204, 0.000106698, 0.708996),
+        (0.0716565, 0.0630105, 0.0168101),
+    ),
+    "FR_hip": (
+        0.68, (-0.0049166, 0.00762615, -8.865e-05), (0.507341, 0.514169, 0.495027, 0.482891),
+        (0.000734064, 0.000468438, 0.000398719),
+    ),
+    "FL_hip": (
+        0.68, (-0.0049166, -0.00762615, -8.865e-05), (0.482891, 0.495027, 0.514169, 0.507341),
+        (0.000734064, 0.000468438, 0.000398719),
+    ),
+    "RR_hip": (
+        0.68, (0.0049166, 0.00762615, -8.865e-05), (0.495027, 0.482891, 0.507341, 0.514169),
+        (0.000734064, 0.000468438, 0.000398719),
+    ),
+    "RL_hip": (
+        0.68, (0.0049166, -0.00762615, -8.865e-05), (0.514169, 0.507341, 0.482891, 0.495027),
+        (0.000734064, 0.000468438, 0.000398719),
+    ),
+    **dict.fromkeys(("FR_thigh", "RR_thigh"), (
+        1.009, (-0.00304722, 0.019315, -0.0305004), (0.65243, -0.0272313, 0.0775126, 0.753383),
+        (0.00478717, 0.00460903, 0.000709268),
+    )),
+    **dict.fromkeys(("FL_thigh", "RL_thigh"), (
+        1.009, (-0.00304722, -0.019315, -0.0305004), (0.753383, 0.0775126, -0.0272313, 0.65243),
+        (0.00478717, 0.00460903, 0.000709268),
+    )),
+    **dict.fromkeys([f"{leg}_calf" for leg in ("FL", "FR", "RL", "RR")], (
+        0.195862, (0.00429862, 0.000976676, -0.146197), (0.691246, 0.00357467, 0.00511118, 0.722592),
+        (0.00149767, 0.00148468, 3.58427e-05),
+    )),
+}  # fmt: skip
+
+
+def tensor(quat, principal):
+    """An inertia in the axes of its body."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, np.array(quat) / np.linalg.norm(quat))
+    axes = axes.reshape(3, 3)
+    return axes @ np.diag(principal) @ axes.T
+
+
+@pytest.mark.parametrize("name", SOURCE)
+def test_bodies_are_those_of_the_source(model, name):
+    """Mass, centre and the whole tensor of inertia of every body are Menagerie's own numbers."""
+    mass, centre, quat, principal = SOURCE[name]
+    body = model.body(name)
+    assert body.mass[0] == mass
+    np.testing.assert_allclose(body.ipos, centre, rtol=0, atol=1e-12)
+    # Numbers of six digits, turned by quaternions of six digits.
+    expected = tensor(quat, principal)
+    np.testing.assert_allclose(tensor(body.iquat, body.inertia), expected, rtol=0, atol=1e-5 * principal[0])
+    np.testing.assert_allclose(np.sort(body.inertia)[::-1], principal, rtol=1e-5)
+
+
+def test_source_names_every_body(model):
+    """No body but the world's is left out above."""
+    assert set(SOURCE) == {model.body(i).name for i in range(1, model.nbody)}
+
+
+def test_joints_are_those_of_the_source(model):
+    """Ranges are Menagerie's, armatures a rotor of 1.11842e-4 kg m^2 behind gears of 6 and 9."""
+    limits = [(-0.863, 0.863), (-0.686, 4.501), (-2.818, -0.888)]  # [rad]: hip, thigh, calf
+    np.testing.assert_array_equal(model.jnt_range[1:], limits * 4)
+    np.testing.assert_allclose(model.dof_armature[6:], [0.0040263, 0.0040263, 0.0090592] * 4, rtol=1e-5)
+    assert not model.dof_armature[:6].any()
+    np.testing.assert_array_equal(model.actuator_forcerange[:, 1], [23.7, 23.7, 35.55] * 4)
+    places = {
+        "FL_hip": (0.1881, 0.04675, 0.0), "FR_hip": (0.1881, -0.04675, 0.0), "RL_hip": (-0.1881, 0.04675, 0.0),
+        "RR_hip": (-0.1881, -0.04675, 0.0), "FL_thigh": (0.0, 0.08, 0.0), "RR_thigh": (0.0, -0.08, 0.0),
+        "FL_calf": (0.0, 0.0, -0.213), "RR_calf": (0.0, 0.0, -0.213),
+    }  # fmt: skip
+    for name, place in places.items():
+        np.testing.assert_allclose(model.body(name).pos, place, rtol=0, atol=1e-12)
 
 
 def test_robot_is_a_mirror_image(robot, model):

@@ -24,6 +24,7 @@ from kernels.arm_rewards import ARM_TERMS, ArmWeights, vecA
 from kernels.goals import draw_candidates
 from kernels.locomotion_state import (
     COLUMNS,
+    COUNTERS,
     NUM_COLUMNS,
     LocomotionParams,
     LocomotionState,
@@ -41,7 +42,7 @@ ORIGIN = np.add(rx150.SHOULDER, (0.0, 0.0, 0.325))
 BODY_LOW, BODY_HIGH = np.array([-0.3, -0.2, -9.0]), np.array([0.3, 0.2, -0.06])
 MIDDLE, HALF = (np.array(SHELL_HIGH) + SHELL_LOW) / 2, (np.array(SHELL_HIGH) - SHELL_LOW) / 2
 MOST = 64  # draws of one goal
-INTEGERS = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count", "overflow", "rows")
+INTEGERS = (*COUNTERS, "overflow")
 
 
 @wp.kernel
@@ -141,7 +142,7 @@ def make_world(n, seed=0):
             rng.uniform(-1.5, 1.5, (n, J)),
         ], axis=1),
         "qvel": rng.normal(size=(n, 6 + J)), "ctrl": rng.normal(size=(n, J)), "torque": rng.normal(size=(n, J)),
-        "part_force": np.zeros((4, n, 13)), "overflow": np.zeros(n), "rows": np.zeros(n),
+        "part_force": np.zeros((4, n, 13)), "overflow": np.zeros(n),
         "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": np.zeros((n, J)),
         "air_time": np.zeros((n, 4)), "tracked": np.zeros((n, 2)), "wanted": rng.normal(size=(n, J)),
         "foot_contact": np.zeros(n), "level": np.zeros(n), "goal_clock": np.zeros(n), "episode_step": np.zeros(n),
@@ -267,7 +268,10 @@ def test_a_goal_that_is_met_earns_all(device):
     np.testing.assert_allclose(out["obs"][far, OBS_START:63], seen, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize(("name", "column", "value"), [("qpos", 20, np.nan), ("qvel", 8, np.inf), ("qvel", 0, 99.0)])
+@pytest.mark.parametrize(
+    ("name", "column", "value"),
+    [("qpos", 20, np.nan), ("qvel", 8, np.inf), ("qvel", 0, 99.0), ("goal", 1, np.nan), ("goal", 5, np.inf)],
+)
 def test_worlds_that_are_not_physical_are_left_alone(device, name, column, value):
     """Nothing is written of a broken world, and no bit of its neighbours' changes."""
     arrays = make_world(5)
@@ -423,6 +427,27 @@ def test_judge_rejects_arrays_of_another_shape(device, struct, name, shape, mess
     dtype = wp.vec3 if struct == "arm" else wp.float32
     setattr(getattr(world, struct), name, wp.zeros(shape, dtype=dtype, device=device))
     with pytest.raises(ValueError, match=message):
+        world.judge()
+
+
+@pytest.mark.parametrize("call", ["judge", "reset"])
+@pytest.mark.parametrize("name", LocomotionState.vars)
+def test_rejects_a_wrong_state(device, call, name):
+    """Judgement and reset check every array of the state, and the message names it."""
+    world = World(make_world(5), device)
+    array = getattr(world.state, name)
+    setattr(world.state, name, wp.zeros((4, *array.shape[1:]), dtype=array.dtype, device=device))
+    with pytest.raises(ValueError, match=rf"^state.{name} must be \w+\(5,.*got \w+\(4,"):
+        world.judge() if call == "judge" else world.reset(np.ones(5, bool), np.ones(G))
+
+
+@pytest.mark.parametrize("name", ["qpos", "qvel", "torque", "overflow"])
+def test_judge_rejects_a_wrong_simulation(device, name):
+    """So does the judgement with what it reads of the simulator."""
+    world = World(make_world(5), device)
+    array = getattr(world.sim, name)
+    setattr(world.sim, name, wp.zeros((4, *array.shape[1:]), dtype=array.dtype, device=device))
+    with pytest.raises(ValueError, match=rf"^sim.{name} must be \w+\(5,.*got \w+\(4,"):
         world.judge()
 
 

@@ -9,7 +9,9 @@ import warp as wp
 from kernels.locomotion import apply_actions, judge_step
 from kernels.locomotion_rewards import TERMS, RewardWeights, vec12, vecT
 from kernels.locomotion_state import (
+    BROKEN,
     COLUMNS,
+    COUNTERS,
     NUM_COLUMNS,
     NUM_PARTS,
     Joints,
@@ -24,7 +26,6 @@ from kernels.random import Purpose
 J, G, OBS, SUBSTEPS = 12, 3, 48, 4
 DT = 0.02
 FLOATS = {"goal": G, "action": J, "joint_speed": J, "air_time": 4}
-COUNTERS = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count")
 FLAGS = ("terminated", "truncated", "goal_due", "invalid")
 GOAL_SCALE = np.array([2.0, 2.0, 0.25], np.float32)
 POSE = np.tile([0.1, 0.8, -1.5], 4).astype(np.float32)
@@ -63,14 +64,14 @@ def make_world(n, seed=0):
         "ctrl": np.full((n, J), np.nan),
         "torque": rng.normal(scale=10, size=(n, J)),
         "part_force": rng.exponential(size=(SUBSTEPS, n, NUM_PARTS)) * (rng.random((SUBSTEPS, n, NUM_PARTS)) < 0.15),
-        "overflow": np.zeros(n), "rows": np.zeros(n),
+        "overflow": np.zeros(n),
         "wanted": rng.normal(size=(n, J)),
         "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": rng.normal(size=(n, J)),
         "air_time": rng.integers(0, 40, (n, 4)) * DT, "tracked": np.stack([rng.uniform(0, 9, n), np.full(n, 9.0)], 1),
         **{name: np.zeros(n) for name in COUNTERS},
         "foot_contact": rng.integers(0, 16, n),
     }  # fmt: skip
-    integers = (*COUNTERS, "overflow", "rows")
+    integers = (*COUNTERS, "overflow")
     return {name: value.astype(np.int32 if name in integers else np.float32) for name, value in w.items()}
 
 
@@ -275,7 +276,24 @@ FAULTS = {
     "position": ("qpos", (2, 9), np.nan, 2), "far": ("qpos", (2, 0), np.inf, 2),
     "velocity": ("qvel", (2, 7), -np.inf, 4),
     "speed": ("qvel", (2, 1), 21.0, 8), "spin": ("qvel", (2, 17), -501.0, 8), "contacts": ("overflow", (2,), 2, 16),
+    "goal": ("goal", (2, 2), np.nan, 32), "far goal": ("goal", (2, 0), np.inf, 32),
 }  # fmt: skip
+
+
+def test_every_fault_has_a_name():
+    """The bit of every fault stands for the quantity that is at fault."""
+    for name, (array, _, _, bit) in FAULTS.items():
+        named = BROKEN[bit.bit_length() - 1]
+        assert named == (name if name in BROKEN else {"qpos": "position", "qvel": "speed", "goal": "goal"}[array])
+
+
+def test_a_reward_that_is_not_a_number_is_none(device):
+    """A torque that is NaN, which leaves the state sound, makes the reward NaN, and not 0 as a maximum would."""
+    arrays = make_world(3)
+    arrays["torque"][1, 4] = np.nan
+    out = World(arrays, device).judge(make_params())
+    assert np.isnan(out["reward"]).tolist() == [False, True, False]
+    assert not out["invalid"].any()
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -380,19 +398,68 @@ def test_a_fresh_episode_is_not_pushed(device):
     np.testing.assert_array_equal(world.sim.qvel.numpy(), arrays["qvel"])
 
 
+def shorten(struct, name, device):
+    """Replace an array of a struct by one that lacks the last of its rows, or of its numbers where it has no rows."""
+    array = getattr(struct, name)
+    shape = list(array.shape)
+    axis = 1 if name == "part_force" else 0
+    shape[axis] -= 1
+    setattr(struct, name, wp.zeros(tuple(shape), dtype=array.dtype, device=device))
+
+
+@pytest.mark.parametrize("call", ["judge", "apply"])
+@pytest.mark.parametrize(
+    ("struct", "name"),
+    [
+        *(("state", name) for name in LocomotionState.vars),
+        *(("sim", name) for name in Simulation.vars),
+        *(("joints", name) for name in Joints.vars),
+    ],
+)
+def test_rejects_arrays_that_are_too_short(device, call, struct, name):
+    """Both launchers check every array of worlds, simulator and joints, and the message names it."""
+    world = World(make_world(5), device)
+    shorten(getattr(world, struct), name, device)
+    # The state is as long as there are actions, so that a struct's every array is the one that does not fit.
+    with pytest.raises(ValueError, match=rf"^{struct}.{name} must be \w+\(.*got \w+\("):
+        getattr(world, call)(make_params())
+
+
+@pytest.mark.parametrize("name", LocomotionStep.vars)
+def test_rejects_outputs_that_are_too_short(device, name):
+    """Every output of a step is checked."""
+    world = World(make_world(5), device)
+    shorten(world.out, name, device)
+    with pytest.raises(ValueError, match=rf"^out.{name} must be \w+\(.*got \w+\("):
+        world.judge(make_params())
+
+
 @pytest.mark.parametrize(
     ("struct", "name", "shape", "message"),
     [
         ("sim", "qpos", (5, 18), r"sim.qpos must be float32\(5, 19\).*got float32\(5, 18\)"),
         ("sim", "part_force", (4, 5, 3), r"sim.part_force must be float32\(4, 5, 13\)"),
         ("state", "air_time", (5, 3), r"state.air_time must be float32\(5, 4\)"),
+        ("state", "goal", (5, 2), r"state.goal must be float32\(5, 3\)"),
         ("out", "term", (5, 3), r"out.term must be float32\(5, 12\)"),
+        ("out", "tracking", (5, 1), r"out.tracking must be float32\(5, 2\)"),
+        ("out", "obs", (5, 47), r"out.obs must be float32\(5, 48\)"),
         ("joints", "pose", (11,), r"joints.pose must be float32\(12,\)"),
     ],
 )
-def test_rejects_arrays_of_another_shape(device, struct, name, shape, message):
+def test_rejects_arrays_that_are_too_narrow(device, struct, name, shape, message):
     """The message names the array, what it must be and what it was."""
     world = World(make_world(5), device)
     setattr(getattr(world, struct), name, wp.zeros(shape, dtype=wp.float32, device=device))
     with pytest.raises(ValueError, match=message):
         world.judge(make_params())
+
+
+@pytest.mark.parametrize(("name", "dtype", "shape"), [("action", wp.float32, (5, 11)), ("fault", wp.int32, (2,))])
+def test_rejects_other_arguments(device, name, dtype, shape):
+    """What is no part of a struct is checked too."""
+    world = World(make_world(5), device)
+    array = wp.zeros(shape, dtype=dtype, device=device)
+    right = {"action": world.action, "fault": world.out.fault} | {name: array}
+    with pytest.raises(ValueError, match=r"must be \w+\(.*got \w+\("):
+        apply_actions(make_params(), world.joints, right["action"], world.state, world.sim, right["fault"])

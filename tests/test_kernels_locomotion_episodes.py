@@ -7,7 +7,7 @@ import warp as wp
 from kernels.locomotion_episodes import change_of_level, reset_worlds, set_goals, update_levels
 from kernels.locomotion_obs import finish_obs
 from kernels.locomotion_rewards import vec12, vecT
-from kernels.locomotion_state import Ground, Joints, LevelRule, LocomotionParams, LocomotionState
+from kernels.locomotion_state import COUNTERS, Ground, Joints, LevelRule, LocomotionParams, LocomotionState
 from kernels.random import Purpose
 
 N, J, G, SCAN = 40, 12, 3, 10
@@ -18,7 +18,6 @@ POSE = np.tile([0.1, 0.8, -1.5], 4)
 LOW, HIGH = POSE - 0.5, POSE + 0.3
 GOAL_SCALE = np.array([2.0, 2.0, 0.25])
 SHAPES = {"goal": (G,), "action": (J,), "joint_speed": (J,), "air_time": (4,)}
-COUNTERS = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count")
 
 
 def make_params(**changes):
@@ -247,24 +246,111 @@ def test_heights_and_noise_match_reference(device, uniform_reference, wanted):
     np.testing.assert_array_equal(found[mask != wanted], body[mask != wanted])
 
 
-def test_rejects_arrays_of_another_shape(device):
-    """Each launcher names the array, what it must be and what it was."""
+def launch_by_name(call, world, **wrong):
+    """Call a launcher with arguments that fit, but for what is given."""
+    state, device = world.state, world.device
+    mask, params = world.flags(True), make_params()
+    right = {
+        "reset": {
+            "joints": world.joints, "ground": world.ground, "mask": mask, "goal_range": world.goal_range,
+            "goal_scale": world.goal_scale, "state": state, "qpos": world.qpos, "qvel": world.qvel, "obs": world.obs,
+        },
+        "levels": {
+            "origin": world.ground.origin, "mask": mask, "terminated": mask, "truncated": mask, "invalid": mask,
+            "qpos": world.qpos, "state": state,
+        },
+        "finish": {
+            "mask": mask, "heights": world.ground.heights, "point": wp.zeros(SCAN, dtype=wp.vec2, device=device),
+            "noise": world.array(np.zeros(OBS)), "qpos": world.qpos, "state": state, "obs": world.obs, "wanted": True,
+        },
+        "goals": {
+            "row": wp.zeros(2, dtype=wp.int32, device=device), "goal": world.array(np.zeros((2, G))),
+            "goal_scale": world.goal_scale, "state": state, "obs": world.obs,
+        },
+    }[call]  # fmt: skip
+    launcher = {"reset": reset_worlds, "levels": update_levels, "finish": finish_obs, "goals": set_goals}[call]
+    launcher(*(() if call == "goals" else (params,)), **(right | wrong))
+
+
+CALLS = ("reset", "levels", "finish", "goals")
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_right_arguments_are_taken(device, call):
+    """What the following tests spoil is sound before."""
+    launch_by_name(call, World(device))
+
+
+@pytest.mark.parametrize("rows", [0, N - 1])
+@pytest.mark.parametrize("name", LocomotionState.vars)
+@pytest.mark.parametrize("call", CALLS)
+def test_rejects_a_wrong_state(device, call, name, rows):
+    """Every launcher checks every array of the state, and the message names it."""
     world = World(device)
-    short = wp.zeros(N - 1, dtype=wp.bool, device=device)
-    with pytest.raises(ValueError, match=r"qpos must be float32\(39, 19\) on .*got float32\(40, 19\)"):
-        reset_worlds(
-            make_params(), world.joints, world.ground, short, world.goal_range, world.goal_scale, world.state,
-            world.qpos, world.qvel, world.obs,
-        )  # fmt: skip
-    mask = world.flags(True)
-    with pytest.raises(ValueError, match=r"truncated must be bool\(40,\) on .*got bool\(39,\)"):
-        update_levels(make_params(), world.ground.origin, mask, mask, short, mask, world.qpos, world.state)
-    row = wp.zeros(2, dtype=wp.int32, device=device)
-    with pytest.raises(ValueError, match=r"goal must be float32\(2, 3\) on .*got float32\(2, 4\)"):
-        set_goals(row, world.array(np.zeros((2, 4))), world.goal_scale, world.state, world.obs)
-    point = wp.zeros(SCAN + 1, dtype=wp.vec2, device=device)
-    with pytest.raises(ValueError, match=r"point must be vec2f\(10,\) on .*got vec2f\(11,\)"):
-        finish_obs(
-            make_params(), mask, world.ground.heights, point, world.array(np.zeros(OBS)), world.qpos, world.state,
-            world.obs, wanted=True,
-        )  # fmt: skip
+    array = getattr(world.state, name)
+    setattr(world.state, name, wp.zeros((rows, *array.shape[1:]), dtype=array.dtype, device=device))
+    # A goal is set in as many worlds as have one, so there it is the others that do not fit.
+    wrong = "state.action" if (call, name) == ("goals", "goal") else f"state.{name}"
+    with pytest.raises(ValueError, match=rf"^{wrong} must be \w+\(.*got \w+\("):
+        launch_by_name(call, world)
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_rejects_goals_without_three_components(device, call):
+    """A goal begins with three components of velocity."""
+    world = World(device)
+    world.state.goal = world.array(np.zeros((N, 2)))
+    with pytest.raises(ValueError, match=r"^state.goal must be float32\(40, 3\).*got float32\(40, 2\)"):
+        launch_by_name(call, world)
+
+
+@pytest.mark.parametrize("shape", [(N, 47), (N, 5), (N - 1, OBS), (0, OBS)])
+@pytest.mark.parametrize("call", ["reset", "finish", "goals"])
+def test_rejects_observations_without_room(device, call, shape):
+    """An observation has a row for every world and room for 9 numbers, the goal and three for every joint."""
+    world = World(device)
+    right = rf"40, {max(48, shape[1])}"
+    with pytest.raises(ValueError, match=rf"^obs must be float32\({right}\).*got float32\({shape[0]}, {shape[1]}\)"):
+        launch_by_name(call, world, obs=world.array(np.zeros(shape)))
+
+
+@pytest.mark.parametrize("name", Joints.vars)
+def test_rejects_wrong_joints(device, name):
+    """A reset needs all numbers of all joints, as many as the robot has angles."""
+    world = World(device)
+    setattr(world.joints, name, world.array(np.zeros(J - 1)))
+    with pytest.raises(ValueError, match=r"(joints.\w+|state.action) must be float32\(.*1[12].*got float32\(.*1[12]"):
+        launch_by_name("reset", world)
+
+
+@pytest.mark.parametrize(
+    ("call", "name", "dtype", "shape", "right"),
+    [
+        ("reset", "goal_range", wp.float32, (2,), r"float32\(3,\)"),
+        ("reset", "goal_scale", wp.float32, (4,), r"float32\(3,\)"),
+        ("reset", "qpos", wp.float32, (N, 18), r"float32\(40, 19\)"),
+        ("reset", "qvel", wp.float32, (39, 18), r"float32\(40, 18\)"),
+        ("levels", "truncated", wp.bool, (39,), r"bool\(40,\)"),
+        ("levels", "qpos", wp.float32, (39, 19), r"float32\(40, 19\)"),
+        ("levels", "origin", wp.float32, (3, 4), r"vec3f\(3, 4\)"),
+        ("finish", "heights", wp.float32, (1, 9), r"float32\(2, 9\)"),
+        ("finish", "point", wp.vec2, (SCAN + 1,), r"vec2f\(10,\)"),
+        ("finish", "noise", wp.float32, (OBS - 1,), r"float32\(58,\)"),
+        ("finish", "qpos", wp.float32, (0, 19), r"float32\(40, 19\)"),
+        ("goals", "goal", wp.float32, (2, 4), r"float32\(2, 3\)"),
+        ("goals", "goal_scale", wp.float32, (4,), r"float32\(3,\)"),
+    ],
+)
+def test_rejects_a_wrong_argument(device, call, name, dtype, shape, right):
+    """Each launcher names the array, what it must be and what it was."""
+    wrong = {name: wp.zeros(shape, dtype=dtype, device=device)}
+    with pytest.raises(ValueError, match=rf"^{name} must be {right} on .*got \w+\({shape[0]},"):
+        launch_by_name(call, World(device), **wrong)
+
+
+def test_rejects_a_ground_of_one_row(device):
+    """A robot is placed on at least 2 x 2 samples."""
+    world = World(device)
+    world.ground.heights = world.array(np.zeros((1, 9)))
+    with pytest.raises(ValueError, match=r"^ground.heights must be float32\(2, 9\).*got float32\(1, 9\)"):
+        launch_by_name("reset", world)

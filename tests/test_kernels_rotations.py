@@ -11,9 +11,7 @@ from kernels.rotations import (
     heading,
     rotate,
     rotate_by_heading,
-    rotate_by_yaw,
     rotate_inverse,
-    yaw,
 )
 
 # A rotation is about ten float32 operations on numbers of the vector's size.
@@ -28,26 +26,21 @@ def _rotate_all(
     forth: wp.array[wp.vec3],
     back: wp.array[wp.vec3],
     down: wp.array[wp.vec3],
-    flat: wp.array[wp.vec3],
     direction: wp.array[wp.vec2],
     turned: wp.array[wp.vec2],
-    angle: wp.array[float],
     upright: wp.array[wp.vec4],
 ):
     i = wp.tid()
     forth[i] = rotate(quat[i], v[i])
     back[i] = rotate_inverse(quat[i], v[i])
     down[i] = down_in_body(quat[i])
-    flat[i] = rotate_by_yaw(quat[i], v[i])
     direction[i] = heading(quat[i])
-    turned[i] = rotate_by_heading(heading(quat[i]), v[i][0], v[i][1])
-    angle[i] = yaw(quat[i])
-    upright[i] = from_yaw(yaw(quat[i]))
+    turned[i] = rotate_by_heading(direction[i], v[i][0], v[i][1])
+    upright[i] = from_yaw(wp.atan2(direction[i][1], direction[i][0]))
 
 
 OUTPUTS = {
-    "forth": wp.vec3, "back": wp.vec3, "down": wp.vec3, "flat": wp.vec3, "direction": wp.vec2, "turned": wp.vec2,
-    "angle": wp.float32, "upright": wp.vec4,
+    "forth": wp.vec3, "back": wp.vec3, "down": wp.vec3, "direction": wp.vec2, "turned": wp.vec2, "upright": wp.vec4,
 }  # fmt: skip
 
 
@@ -77,7 +70,7 @@ def matrices(quat):
 
 
 def test_matches_mujoco(device, case):
-    """Both ways, gravity's direction and the yaw agree with MuJoCo's own rotation matrix."""
+    """Both ways, gravity's direction and the heading agree with MuJoCo's own rotation matrix."""
     quat, v = case
     out, matrix = run(quat, v, device), matrices(quat)
     np.testing.assert_allclose(out["forth"], np.einsum("nij,nj->ni", matrix, v), **TOLERANCE)
@@ -85,7 +78,7 @@ def test_matches_mujoco(device, case):
     np.testing.assert_allclose(out["down"], -matrix[:, 2], **TOLERANCE)
     # The direction is divided by the length of the x axis's shadow, which may be short.
     shadow = np.linalg.norm(matrix[:, :2, 0], axis=1)
-    error = np.abs(np.angle(np.exp(1j * (out["angle"] - np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0])))))
+    error = np.linalg.norm(out["direction"] - matrix[:, :2, 0] / shadow[:, None], axis=1)
     assert np.all(error <= 20 * 2.0**-23 / shadow)
 
 
@@ -97,23 +90,22 @@ def test_turning_there_and_back_is_nothing(device, case):
     np.testing.assert_allclose(np.linalg.norm(forth, axis=1), 1.0, rtol=0, atol=10 * 2.0**-23)
 
 
-def test_yaw_ignores_pitch_and_roll(device, case):
-    """Turning by the yaw alone keeps the height of a vector, and turns as the upright body of that yaw does."""
+def test_heading_ignores_pitch_and_roll(device, case):
+    """Turning by the heading turns as the upright body of that yaw does."""
     quat, v = case
     out = run(quat, v, device)
-    np.testing.assert_array_equal(out["flat"][:, 2], v[:, 2].astype(np.float32))
-    np.testing.assert_array_equal(out["flat"][:, :2], out["turned"])
     upright = run(out["upright"], v, device)
     # The yaw goes through atan2, sin and cos, each good to a few units in the last place.
-    np.testing.assert_allclose(upright["forth"], out["flat"], rtol=0, atol=30 * 2.0**-23)
+    np.testing.assert_allclose(upright["forth"][:, :2], out["turned"], rtol=0, atol=30 * 2.0**-23)
+    np.testing.assert_allclose(upright["forth"][:, 2], v[:, 2], rtol=0, atol=2.0**-23)
     np.testing.assert_allclose(np.linalg.norm(out["direction"], axis=1), 1.0, rtol=0, atol=4 * 2.0**-23)
 
 
 def test_known_turn(device):
-    """A quarter turn to the left takes x to y; a body on its nose has no yaw, and that counts as none."""
+    """A quarter turn to the left takes x to y; a body on its nose has no heading, and that counts as x."""
     half = np.sqrt(0.5)
     out = run([[half, 0, 0, half], [half, 0, half, 0]], [[1, 0, 0], [1, 2, 3]], device)
     np.testing.assert_allclose(out["forth"][0], [0, 1, 0], **TOLERANCE)
-    np.testing.assert_allclose(out["angle"][0], np.pi / 2, **TOLERANCE)
+    np.testing.assert_allclose(out["direction"][0], [0, 1], **TOLERANCE)
     np.testing.assert_array_equal(out["direction"][1], [1, 0])
-    np.testing.assert_array_equal(out["flat"][1], [1, 2, 3])
+    np.testing.assert_array_equal(out["turned"][1], [1, 2])

@@ -93,7 +93,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             ValueError: If the actions have another shape.
-            SimulationError: If an action or a state is not finite.
+            SimulationError: If an action is not finite, or more worlds become invalid than may.
         """
         env = self.loop.env
         action = np.array(actions, dtype=np.float32)

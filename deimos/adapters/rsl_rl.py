@@ -70,7 +70,7 @@ class RslRlVecEnv(VecEnv):
             bool, shape (num_envs,); and ``time_outs``: 1 where a world was truncated, else 0, shape (num_envs,).
 
         Raises:
-            SimulationError: If an action or a state is not finite.
+            SimulationError: If an action is not finite, or more worlds become invalid than may.
         """
         step = self.env.step(actions)
         self.env.check()  # rsl_rl looks for NaN in what comes back, but a clipped NaN is a number

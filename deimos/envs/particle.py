@@ -10,9 +10,9 @@ import warp as wp
 from torch import Tensor
 
 from deimos.checks import SimulationError, check_at_least, check_choice, check_positive, check_range
-from deimos.env import Env, EnvConfig, ObsField, Step
+from deimos.env import EnvConfig, ObsField
 from deimos.shared import Shared
-from kernels.goals import draw_candidates
+from deimos.warp_env import WarpEnv
 from kernels.particle import (
     BROKEN,
     OBS_DIM,
@@ -26,7 +26,6 @@ from kernels.particle import (
     step_particles,
 )
 from kernels.particle_rewards import RewardShape
-from kernels.random import Purpose, draw_uniforms
 
 LARGEST = 1e6  # [u] or [u/step]; beyond, float32 positions no longer tell one step from the next
 HALF_SIDE = 1000.0  # [u]; thesis, 4.1.1: the cube is 2000 length units a side
@@ -128,8 +127,8 @@ class Config(EnvConfig):
         return params
 
 
-class Particle(Env):
-    """Particle Gym on Warp kernels; see ``Config``."""
+class Particle(WarpEnv):
+    """Particle Gym; see ``Config``. Actions are forces [u/step^2]."""
 
     config: Config
 
@@ -152,14 +151,12 @@ class Particle(Env):
             ObsField("last_action", 3, "u/step^2", params.force_scale),
             ObsField("goal", 3, goal_unit, goal_scale),
         )
-        self._ones = torch.ones(3, device=device)
-        self._goal_box = torch.full((3,), config.goal_half_side * goal_scale, device=device)
-        self._allocate()
+        seen_range = torch.full((3,), config.goal_half_side * goal_scale, device=device)
+        self._allocate(seen_range, seed, env_offset)
         self._record()
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
 
-    def _allocate(self) -> None:
-        """Allocate every array once; nothing is allocated or rebound later."""
+    def _allocate(self, seen_range: Tensor, seed: int, env_offset: int) -> None:
         n, device = self.num_envs, self.device
         vectors = {name: Shared.zeros(n, wp.vec3, device) for name in ("position", "velocity", "force", "target")}
         counters = {
@@ -174,25 +171,12 @@ class Particle(Env):
             "count": Shared.zeros(2, wp.int32, device),
             "fault": Shared.zeros(3, wp.int32, device),
         }
-        self.state_arrays, self.step_arrays = ParticleState(), ParticleStep()
-        for struct, arrays in ((self.state_arrays, vectors | counters), (self.step_arrays, out)):
-            for name, shared in arrays.items():
-                setattr(struct, name, shared.array)
-        self.obs = out["obs"].tensor
-        # Observations are kept, not computed anew: what a policy saw is part of a bit-exact resume.
-        self.tensors = {name: shared.tensor for name, shared in (vectors | counters).items()} | {"obs": self.obs}
-        self.episode_step = self.tensors["episode_step"]
-        self._fault = out["fault"].tensor
+        self._share(
+            ParticleState(), vectors | counters, ParticleStep(), out, action=Shared.zeros(n, wp.vec3, device),
+            new_goal=Shared.zeros(n, wp.vec3, device), first_range=torch.ones(3, device=device),
+            seen_range=seen_range, seed=seed, env_offset=env_offset,
+        )  # fmt: skip
         self._clear_faults()
-        self._step = Step(**{name: out[name].tensor for name in Step.__dataclass_fields__ if name in out})
-        self.action = Shared.zeros(n, wp.vec3, device)
-        self._mask = Shared.zeros(n, wp.bool, device)
-        self._row = Shared.zeros(n, wp.int32, device)
-        self._new_goal = Shared.zeros(n, wp.vec3, device)
-        self._draw = Shared.zeros(n, wp.vec4, device)
-        self._goal_scale = Shared.zeros(3, wp.float32, device)
-        self._candidate_scale = Shared.zeros(3, wp.float32, device)
-        self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
 
     def _record(self) -> None:
         """Record the launches: replaying one costs half of making it (18 us against 34 us on a CPU).
@@ -200,77 +184,23 @@ class Particle(Env):
         A step is one kernel, so a graph around it would save nothing more.
         """
         params, state, out = self._params, self.state_arrays, self.step_arrays
-        row, obs = self._row.array, self.step_arrays.obs
+        reset = (params, self._mask.array, self._first_range.array, state, out.obs)
         self._launch_step = step_particles(params, self.action.array, state, out, record=True)
-        self._launch_reset = reset_particles(params, self._mask.array, self._goal_scale.array, state, obs, record=True)
-        self._launch_goals = set_goals(params, row, self._new_goal.array, state, obs, record=True)
-        self._launch_draw = draw_uniforms(
-            row, state.goal_count, self._draw.array, seed=int(params.seed), purpose=Purpose.GOAL,
-            world_offset=params.world_offset, record=True,
-        )  # fmt: skip
-
-    def step(self, action: Tensor) -> Step:
-        """See ``Env.step``. Actions are forces [u/step^2]."""
-        if action.shape != self.action.tensor.shape:
-            expected = tuple(self.action.tensor.shape)
-            raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
-        self.action.tensor.copy_(action)
-        self._step.count.zero_()
-        self.launch_step()
-        return self._step
+        self._launch_reset = reset_particles(*reset, record=True).launch
+        self._launch_goals = set_goals(params, self._row.array, self._new_goal.array, state, out.obs, record=True)
 
     def launch_step(self) -> None:
-        """Run the step kernel alone, on the action of before; for benchmarks."""
+        """See ``WarpEnv.launch_step``."""
         self._launch_step.launch()
 
-    def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
-        """See ``Env.reset``."""
-        self._mask.tensor.copy_(mask)
-        self._goal_scale.tensor.copy_(self._ones if goal_scale is None else goal_scale)
-        self._launch_reset.launch()
-
-    def sample_goals(self, rows: Tensor, count: int, scale: Tensor | None = None) -> Tensor:
-        """See ``Env.sample_goals``."""
-        if count not in self._candidates:
-            self._candidates[count] = self._record_candidates(count)
-        candidates, launches = self._candidates[count]
-        self._set_rows(rows)
-        torch.mul(self._goal_box, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
-        for launch in launches:
-            launch.set_dim((len(rows), launch.bounds.shape[1]))  # as many threads per row as were recorded
-            launch.launch()
-        return candidates.tensor[: len(rows)]
-
-    def _record_candidates(self, count: int) -> tuple[Shared, list[wp.Launch]]:
-        candidates = Shared.zeros((self.num_envs, count, 3), wp.float32, self.device)
-        launches = [
-            draw_candidates(
-                self._row.array, self.state_arrays.goal_count, self._candidate_scale.array, candidates.array,
-                seed=int(self._params.seed), world_offset=self._params.world_offset, record=True,
-            )
-        ]  # fmt: skip
-        if self.config.variant == "relative":
-            position = self.state_arrays.position
-            launches.append(make_relative(self._params, self._row.array, position, candidates.array, record=True))
-        return candidates, launches
-
-    def draw(self, rows: Tensor) -> Tensor:
-        """See ``Env.draw``."""
-        self._set_rows(rows)
-        self._launch_draw.set_dim(len(rows))
-        self._launch_draw.launch()
-        return self._draw.tensor[: len(rows)]
-
-    def set_goals(self, rows: Tensor, goal: Tensor) -> None:
-        """See ``Env.set_goals``."""
-        self._set_rows(rows)
-        self._new_goal.tensor[: len(rows)] = goal
-        self._launch_goals.set_dim(len(rows))
-        self._launch_goals.launch()
+    def _finish_candidates(self, candidates: wp.array) -> list[wp.Launch]:
+        if self.config.variant != "relative":
+            return []
+        return [make_relative(self._params, self._row.array, self.state_arrays.position, candidates, record=True)]
 
     def check(self) -> None:
         """See ``Env.check``."""
-        faults, world, bits = self._fault.tolist()
+        faults, world, bits = self._out["fault"].tolist()
         if faults == 0:
             return
         self._clear_faults()
@@ -280,8 +210,8 @@ class Particle(Env):
         )
 
     def _clear_faults(self) -> None:
-        self._fault.zero_()
-        self._fault[1] = self.num_envs
+        self._out["fault"].zero_()
+        self._out["fault"][1] = self.num_envs
 
     def reference_policy(self, brake: bool = True) -> Callable[[Tensor], Tensor]:
         """A controller that follows goals and brakes in time for the wall.
@@ -319,6 +249,3 @@ class Particle(Env):
             return (2.0 * (wanted - velocity)).clamp(-params.max_force, params.max_force)
 
         return act
-
-    def _set_rows(self, rows: Tensor) -> None:
-        self._row.tensor[: len(rows)] = rows

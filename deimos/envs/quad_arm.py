@@ -85,16 +85,16 @@ class QuadArm(Locomotion):
 
     def _reset_carried(self) -> None:
         reset_arms(
-            self._params, self._arm, self._ground.heights, self._mask.array, self._goal_range.array, self._goal_scale,
+            self._params, self._arm, self._ground.heights, self._mask.array, self._first_range.array, self._goal_scale,
             self._sim.qpos, self.state_arrays, self.step_arrays.obs, self._error.array,
         )  # fmt: skip
 
-    def _record_candidates(self, candidates: wp.array) -> list[wp.Launch]:
+    def _finish_candidates(self, candidates: wp.array) -> list[wp.Launch]:
         redraw = redraw_candidates(
             self._params, self._arm, self._ground.heights, self._sim.qpos, self._row.array,
             self.state_arrays.goal_count, self._candidate_scale.array, candidates, record=True,
         )  # fmt: skip
-        return [*super()._record_candidates(candidates), redraw]
+        return [redraw]
 
     def goal_point(self, world: int) -> np.ndarray:
         """See ``Env.goal_point``."""

@@ -38,7 +38,6 @@ OFFSETS = (
     (0.093575, 0.0, 0.0),
 )  # [m]: of every joint from the frame before it, then of the end effector
 SHOULDER = (0.03, 0.0, 0.16157)  # [m], of the shoulder's axis in the trunk
-REACH = 0.467  # [m], largest distance of the end effector from the shoulder's axis
 GRIPPER_RADIUS = 0.035  # [m], of what must not touch anything, about the end effector too
 MASS = 1.772  # [kg]
 

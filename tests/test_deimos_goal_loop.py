@@ -1,0 +1,69 @@
+"""What happens between two steps: how episodes begin under selectors that bound first goals."""
+
+import pytest
+import torch
+
+from deimos.envs import particle, quad
+from deimos.goal_loop import GoalLoop, spaces
+from deimos.selectors import cl, mix, schedule, uniform
+
+TASKS = {
+    "particle": particle.Config(goal_period=20, stagger_goals=True, spawn_range=100.0),
+    "quad": quad.Config(goal_period=20, episode_steps=50),
+}
+SCALED = {
+    "cl": cl.Config(start=0.25),
+    "schedule": schedule.Config(first="cl", second="p75"),
+    "mix": mix.Config(base="cl"),
+}
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("selector", SCALED)
+def test_only_first_goals_differ_where_they_are_scaled(torch_device, task, selector):
+    """Worlds start where and with the clocks that they have under Uniform; their first goals are those, scaled."""
+    goal, place = ("target", "position") if task == "particle" else ("goal", "qpos")
+    built = []
+    for config in (uniform.Config(), SCALED[selector]):
+        env = TASKS[task].build(64, torch_device, 5)
+        loop = GoalLoop(env, config.build(spaces(env, total_steps=1000), 0))
+        assert not loop.interactions.active.any()
+        assert bool((loop.learn == 1).all())
+        built.append(env.state_dict())
+    plain, scaled = built
+    layout = env.goal_slice
+    for tensors in built:
+        tensors["state"] = env.state(tensors.pop("obs"))
+    for name in plain.keys() - {goal}:
+        assert torch.equal(scaled[name], plain[name]), name
+    # A quarter is exact in float32, before the draw is multiplied by it or after.
+    assert torch.equal(scaled[goal], 0.25 * plain[goal])
+    assert len(plain["goal_clock"].unique()) > 10
+    assert len(plain[place][:, 0].unique()) == 64
+    assert layout.stop - layout.start == plain[goal].shape[1]
+
+
+def test_scaled_first_goals_do_not_fall_due_together(torch_device):
+    """Under the curriculum as under Uniform, no step gives all worlds a goal or ends all episodes."""
+    env = TASKS["quad"].build(64, torch_device, 1)
+    loop = GoalLoop(env, cl.Config().build(spaces(env), 0))
+    for _ in range(50):
+        step = env.step(torch.zeros(64, 12, device=torch_device))
+        assert max(step.count.tolist()) < 32
+        loop.advance(step)
+
+
+def test_starting_again_goes_on_to_new_episodes(torch_device):
+    """``start`` begins the next episode of every world, where ``restart`` begins the first one again."""
+    env = TASKS["particle"].build(16, torch_device, 2)
+    loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
+    first = env.state_dict()
+    loop.start()
+    assert env.tensors["episode_count"].tolist() == [2] * 16
+    assert not (env.tensors["position"] == first["position"]).any()
+    for _ in range(25):
+        loop.advance(env.step(torch.ones(16, 3, device=torch_device)))
+    assert env.tensors["goal_count"].any()
+    env.restart()
+    for name, tensor in first.items():
+        assert torch.equal(env.tensors[name], tensor), name
