@@ -1,5 +1,6 @@
 """The figures of a run."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -128,4 +129,6 @@ def _bars(axes: "Axes", evaluated: list[dict]) -> None:
 
 
 def _score_note(row: dict) -> str:
-    return "" if row["score"] is None else f"\nscore {row['score']:.2f}"
+    """Empty where the environment has no reference policy: NaN as it is evaluated, None as it is read from a file."""
+    score = row["score"]
+    return "" if score is None or math.isnan(score) else f"\nscore {score:.2f}"

@@ -34,7 +34,10 @@ def population(seeds=10, environments=ALL, level=level, spread=0.5, methods=None
         legged = environment.startswith("quad")
         for method in methods or (LEGGED_METHODS if legged else PARTICLE_METHODS):
             for seed in range(seeds):
-                key = {"environment": environment, "method": method, "seed": seed, "setting": environment}
+                key = {
+                    "environment": environment, "method": method, "seed": seed, "setting": environment,
+                    "selector": method,
+                }  # fmt: skip
                 for period in (100, 500) if legged else (100,):
                     for goals in ("naive", "adversary"):
                         crashes = int(np.exp(rng.normal(level(environment, method, goals, period), spread)))
@@ -128,11 +131,21 @@ def test_verdict_of_one_finding(p_for, p_against, detectable, verdict):
     assert (judged.verdict, judged.p) == (verdict, min(p_for, p_against))
 
 
-def test_findings_of_a_claim_are_corrected_together():
-    """Of two p-values of 0.03 neither survives Holm's correction; effects are detectable at the stricter level."""
-    pair = [finding(0.03, 1), finding(0.03, 1)]
-    assert [each.verdict for each in claims.judge(pair)] == ["undecided", "undecided"]
-    assert [each.p for each in claims.judge(pair)] == [0.06, 0.06]
+@pytest.mark.parametrize(("how", "alone", "together"), [("all", "supported", "contradicted"),
+                                                        ("any", "contradicted", "supported")])  # fmt: skip
+def test_only_what_one_finding_decides_is_corrected(how, alone, together):
+    """What needs every test of a claim takes p-values as they are; what one of them decides corrects them by Holm."""
+    of = {"supported": (0.03, 1), "contradicted": (1, 0.03)}
+    pair = [finding(*of[alone])] * 2
+    assert [(each.verdict, each.p) for each in claims.judge(pair, how)] == [(alone, 0.03)] * 2
+    assert claims.combined(claims.judge(pair, how), how, 2) == alone
+    pair = [finding(*of[together])] * 2
+    assert [(each.verdict, each.p) for each in claims.judge(pair, how)] == [("undecided", 0.06)] * 2
+    assert claims.combined(claims.judge(pair, how), how, 2) == "undecided"
+
+
+def test_effects_are_detectable_at_the_stricter_level():
+    """The minimum detectable effect is that at the level of Holm's first step."""
     levels = []
     spy = finding(1, 1)
     object.__setattr__(spy, "detectable", lambda alpha: levels.append(alpha) or 1.0)
@@ -154,10 +167,16 @@ def test_verdict_of_a_claim():
         ([yes, finding(1, 1, required=False)], "supported", "supported"),
         ([yes, finding(1, 1e-6, required=False)], "contradicted", "supported"),
     ):
-        judged = claims.judge(findings)
-        assert claims.combined(judged) == every
-        assert claims.combined(judged, "any") == one
-    assert claims.combined(claims.judge([no, no]), "any", planned=3) == "undecided"
+        assert claims.combined(claims.judge(findings)) == every
+        assert claims.combined(claims.judge(findings, "any"), "any") == one
+    assert claims.combined(claims.judge([no, no], "any"), "any", planned=3) == "undecided"
+
+
+def test_eight_seeds_can_support_a_claim_of_ten_tests():
+    """Signed ranks of 8 pairs reach p = 1 / 128 and no less: enough for a claim that needs all of its ten tests."""
+    rising = claim_tests.paired_more("", "here", np.arange(1.0, 9.0), np.zeros(8))
+    assert rising[0].p_for == 2 / 2**8
+    assert claims.combined(claims.judge(rising * 10), planned=10) == "supported"
 
 
 def test_planted_effects_are_found():
@@ -200,12 +219,26 @@ def test_best_p_needs_twenty_seeds():
         assert claims.test(BY_ID["C28"], Data(*population(seeds, ["relative"]))).verdict in verdict
 
 
-def test_settings_are_not_mixed():
-    """Cells of one environment that were run with different settings are refused together."""
-    rows, lines = population(3, ["relative"])
-    rows[0]["setting"] = "other"
-    with pytest.raises(RunError, match="environment 'relative' were run with 2 different settings"):
-        Data(rows, lines)
+@pytest.mark.parametrize("table", [0, 1])
+def test_what_cannot_be_compared_is_not_mixed(table):
+    """Another setting in an environment or another selector of a method is refused, in either table."""
+    for column, message in (
+        ("setting", "environment 'relative' were run with 2 different settings"),
+        ("selector", r"'coop' stands for 2 different selectors in environment 'relative' \(coop, other\)"),
+    ):
+        tables = population(3, ["relative"])
+        tables[table][0][column] = "other"
+        with pytest.raises(RunError, match=message):
+            Data(*tables)
+
+
+@pytest.mark.parametrize(("table", "ending"), [(0, ", goals naive, goal_period 100"), (1, "")])
+def test_policy_counts_once(table, ending):
+    """A second row of the same policy is refused: it does not take the place of the first."""
+    tables = population(3, ["relative"])
+    tables[table].append(tables[table][0] | {"hash": "another"})
+    with pytest.raises(RunError, match=f"two rows of environment relative, method coop, seed 0{ending};"):
+        Data(*tables)
 
 
 def test_paired_test_is_wilcoxons():
@@ -220,6 +253,14 @@ def test_paired_test_is_wilcoxons():
     assert claim_tests.paired_more("", "here", x, x)[0].p_for == 1.0
 
 
+@pytest.mark.parametrize(("pairs", "still", "alpha"), [(5, 0, 0.05), (6, 0, 0.05), (6, 1, 0.05), (8, 0, 0.005)])
+def test_paired_test_that_cannot_reject_detects_nothing(pairs, still, alpha):
+    """No effect is detectable exactly where even pairs that all moved the same way are not significant."""
+    moved = np.concatenate([np.arange(1.0, 1.0 + pairs - still), np.zeros(still)])
+    (found,) = claim_tests.paired_more("", "here", moved, np.zeros(pairs))
+    assert math.isinf(found.detectable(alpha)) == (found.p_for >= alpha)
+
+
 def test_one_sample_test_is_students():
     """Above and below its limit it gives SciPy's two-sided p-value."""
     x = np.random.default_rng(2).normal(1, 1, size=9)
@@ -229,16 +270,32 @@ def test_one_sample_test_is_students():
     assert claim_tests.positive("", "here", "", np.ones(4), 1.0)[0].p_for == 0.0
 
 
-def test_poisson_bound_of_few_crashes():
-    """3 crashes in 4 10^6 steps, five times over: 15 in 2 10^7, tested exactly against one in 10^6."""
+def test_policies_are_the_unit_of_nearly_no_crashes():
+    """Of five policies one crashes 1000 times in 4 10^6 steps and one 4 times: three of five are below the limit."""
     rows, lines = population(5, ["relative"], methods=["vds"])
-    for row in rows:
-        row["crashes"] = 3
+    for row, crashes in zip([row for row in rows if row["goals"] == "naive"], (0, 3, 4, 1000, 3), strict=True):
+        row["crashes"] = crashes
     (found,) = claim_custom.nearly_none(Data(rows, lines), "relative")
-    assert found.interval.estimate == pytest.approx(15 / 20)
-    assert found.interval.low == pytest.approx(scipy_stats.chi2.ppf(0.025, 30) / 40)
-    assert found.p_for == pytest.approx(scipy_stats.poisson.cdf(15, 20))
-    assert found.p_against == pytest.approx(1 - scipy_stats.poisson.cdf(14, 20))
+    assert found.interval.estimate == 0.6
+    assert (found.interval.low, found.interval.high) == pytest.approx((0.1466, 0.9473), abs=1e-4)
+    assert found.p_for == pytest.approx(16 / 32)  # 3, 4 or 5 heads of 5
+    assert found.p_against == pytest.approx(26 / 32)  # 3 or fewer
+    assert math.isinf(found.detectable(1 / 32))
+    assert found.detectable(0.05) == pytest.approx(0.8 ** (1 / 5))  # all five must be below it
+
+
+def test_mean_ranks_are_of_whole_policies():
+    """Ranks are meaned over the evaluations that all methods have; a policy that lacks one of them does not count."""
+    rows, lines = population(4, ["relative"], methods=["rnd", "vds"])
+    for row in rows:
+        row["crashes"] = 10 * row["seed"] + (row["method"] == "rnd") + 100 * (row["goals"] == "adversary")
+    rows[1]["weak_adversary"] = True  # rnd's first policy
+    theirs, own = claim_custom._mean_ranks(Data(rows, lines), "relative", "rnd", "vds")
+    assert (own.tolist(), theirs.tolist()) == ([1, 2, 4, 6], [3, 5, 7])
+    for row in rows:
+        row["weak_adversary"] = row["goals"] == "adversary" and row["method"] == "rnd"
+    theirs, own = claim_custom._mean_ranks(Data(rows, lines), "relative", "rnd", "vds")
+    assert (own.tolist(), theirs.tolist()) == ([1, 3, 5, 7], [2, 4, 6, 8])
 
 
 def test_vertex_of_a_known_parabola():
@@ -248,9 +305,11 @@ def test_vertex_of_a_known_parabola():
         for name, place in claim_custom.ACHIEVED.items()
         if name != "uniform"
     }
-    interval, _, curvature = claim_custom.vertex(samples, 50)
+    interval, slopes, places = claim_custom.vertex(samples, 50)
     assert (interval.estimate, interval.low, interval.high) == pytest.approx((62.0, 62.0, 62.0))
-    assert (curvature > 0).all()
+    assert places == pytest.approx(62.0)
+    assert slopes[0] == pytest.approx(50 * 0.004 * (0.5 - 62))
+    assert slopes[1] == pytest.approx(50 * 0.004 * (99.5 - 62))
     assert claim_custom.ACHIEVED["p25"] == 62.5
     assert claim_custom.ACHIEVED["p90"] == 95.0
 

@@ -3,8 +3,10 @@
 import pytest
 
 from deimos.run_folder import RunError
-from deimos.study import cli
+from deimos.study import cli, plan
+from deimos.study.folder import identity
 from deimos.study.presets import PRESETS
+from deimos.study.results import results
 
 
 @pytest.mark.parametrize(
@@ -69,6 +71,23 @@ def test_results_of_another_schema_stop_the_run(tmp_path):
     (tmp_path / "results.csv").write_text("method,seed\n")
     with pytest.raises(RunError, match="another schema; missing: environment, hash"):
         cli.run(cli.RunOptions(folder=tmp_path, preset="small"))
+    assert not (tmp_path / "cells").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"setting": "other"}, "environment 'directional' were run with 2 different settings"),
+        ({"selector": "other"}, "'p25' stands for 2 different selectors in environment 'directional'"),
+    ],
+)
+def test_cells_that_do_not_compare_with_the_results_stop_the_run(tmp_path, change, message):
+    """A study of another setting, or of another selector of the same name, is refused before its cells are made."""
+    (cell,) = plan.expand(PRESETS["small"], seeds=[7], methods=["p25"])
+    table, values = results(tmp_path), {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
+    table.append([{name: values[kind] for name, kind in table.columns.items()} | identity(cell) | change])
+    with pytest.raises(RunError, match=message):
+        cli.run(cli.RunOptions(folder=tmp_path, preset="small", methods=["p25"]))
     assert not (tmp_path / "cells").exists()
 
 

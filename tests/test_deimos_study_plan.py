@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from deimos.methods import METHODS
 from deimos.presets import preset as training_preset
 from deimos.run_folder import RunError
 from deimos.study import plan
@@ -121,17 +122,32 @@ def test_digest_is_a_function_of_all_that_matters():
     config = TrainConfig(method="p25", threads=1)
     cell = plan.Cell(environment="directional", config=config, goal_periods=(100,))
     same = plan.Cell(environment="directional", config=TrainConfig(method="p25", threads=1), goal_periods=(100,))
-    assert (cell.digest, cell.setting, cell.name) == (same.digest, same.setting, same.name)
+    assert (cell.digest, cell.setting, cell.selector, cell.name) == (
+        same.digest, same.setting, same.selector, same.name,
+    )  # fmt: skip
     for shares, change in (
-        (True, {"seed": 1}),
-        (True, {"method": "p50"}),
-        (False, {"env_steps": 4000}),
-        (False, {"eval": dataclasses.replace(config.eval, steps=1000)}),
+        (("setting", "selector"), {"seed": 1}),
+        (("setting",), {"method": "p50"}),
+        (("selector",), {"env_steps": 4000}),
+        (("selector",), {"eval": dataclasses.replace(config.eval, steps=1000)}),
     ):
         other = dataclasses.replace(cell, config=dataclasses.replace(config, **change))
         assert other.digest != cell.digest
-        assert (other.setting == cell.setting) == shares
+        assert (other.setting == cell.setting) == ("setting" in shares)
+        assert (other.selector == cell.selector) == ("selector" in shares)
     assert dataclasses.replace(cell, goal_periods=(50, 100)).setting != cell.setting
+
+
+@pytest.mark.parametrize("name", ["p75", "vds+p75"])
+def test_digests_know_what_a_method_stands_for(name, monkeypatch):
+    """Another configuration behind a method's name is another selector and cell, also where a schedule names it."""
+    cell = plan.Cell(environment="x", config=TrainConfig(method=name, threads=1), goal_periods=(100,))
+    before = cell.selector, cell.digest, cell.setting
+    monkeypatch.setitem(METHODS, "p75", dataclasses.replace(METHODS["p75"], percentile=74))
+    cell = dataclasses.replace(cell)
+    assert [new == old for new, old in zip((cell.selector, cell.digest, cell.setting), before, strict=True)] == [
+        False, False, True,
+    ]  # fmt: skip
 
 
 def test_cell_survives_its_file(tmp_path):

@@ -37,7 +37,8 @@ def row(name, **more):
 def result(hash, goals="naive", **more):
     """A row of the table of evaluations."""
     values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
-    return {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | {"hash": hash, "goals": goals} | more
+    own = {"hash": hash, "seed": int(hash), "goals": goals}
+    return {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | own | more
 
 
 def test_rows_come_back_as_they_were(table):
@@ -107,7 +108,7 @@ def test_merge_adds_what_is_new(tmp_path):
     results(tmp_path / "b").path.parent.mkdir()
     results(tmp_path / "a").append([result("1"), result("2")])
     results(tmp_path / "b").append([result("2"), result("3"), result("1", crashes=7)])
-    line = {"environment": "x", "method": "y", "seed": 0, "hash": "3", "setting": "s", "num_envs": 1}
+    line = {"environment": "x", "method": "y", "seed": 0, "hash": "3", "setting": "x", "selector": "x", "num_envs": 1}
     numbers = dict.fromkeys(("env_steps", "reward", "crashes_per_1000", "selected_share"), (1.0,))
     curves(tmp_path / "b").append([line | numbers])
     assert merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"]) == (3, 2, 1)
@@ -115,6 +116,28 @@ def test_merge_adds_what_is_new(tmp_path):
     assert results(tmp_path / "c").read()[0]["crashes"] == 1
     assert [each["hash"] for each in curves(tmp_path / "c").read()] == ["3"]
     assert merge(tmp_path / "c", [tmp_path / "a"]) == (0, 2, 0)
+
+
+OTHERS = {
+    "setting": ({"setting": "y"}, "environment 'x' were run with 2 different settings"),
+    "selector": ({"selector": "y"}, "'x' stands for 2 different selectors in environment 'x'"),
+    "doubled policy": ({"seed": 1}, "two rows of environment x, method x, seed 1"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_merge_refuses_what_is_no_one_study(tmp_path, name):
+    """Folders of another setting, another selector or the same policy from another cell are not merged."""
+    change, message = OTHERS[name]
+    for folder, row in (("a", result("1")), ("b", result("2", **change))):
+        (tmp_path / folder).mkdir()
+        results(tmp_path / folder).append([row])
+    with pytest.raises(RunError, match=message):
+        merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"])
+    assert not os.path.exists(tmp_path / "c")
+    with pytest.raises(RunError, match=message):
+        merge(tmp_path / "a", [tmp_path / "b"])
+    assert len(results(tmp_path / "a").read()) == 1
 
 
 def test_merge_checks_before_it_writes(tmp_path):

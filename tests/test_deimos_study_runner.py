@@ -96,7 +96,8 @@ def test_study_leaves_its_tables(whole):
         assert {name: row[name] for name in ("reward", "crashes", "weights")} == {
             name: twin[name] for name in ("reward", "crashes", "weights")
         }
-        assert (row["seed"], row["eval_seed"], row["setting"]) == (0, twin["seed"], cell.setting)
+        assert (row["seed"], row["eval_seed"]) == (0, twin["seed"])
+        assert (row["setting"], row["selector"]) == (cell.setting, cell.selector)
         assert "torch=" in row["versions"]
         assert (row["tracking"], row["errors"]) == ((), {})  # a particle's goal is all of a piece
         legged = twin | {"tracking": [0.6, 0.7], "errors": {"reach": 0.02}}

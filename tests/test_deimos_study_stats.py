@@ -1,5 +1,6 @@
 """Statistics of populations: against published formulas, SciPy, rliable where it is there, and hand calculation."""
 
+import itertools
 import math
 
 import numpy as np
@@ -178,7 +179,39 @@ def test_detectable_probability_is_noethers():
     z = 1.959964 + 0.841621
     assert stats.detectable_probability(10, 10) == pytest.approx(0.5 + z / math.sqrt(12 * 100 / 20), abs=1e-5)
     assert stats.detectable_probability(30, 30) == pytest.approx(0.7088, abs=1e-4)
-    assert stats.detectable_probability(3, 3) == 1.0
+    assert stats.detectable_probability(4, 4) == 1.0
+    assert stats.detectable_probability(3, 3) == math.inf  # 3 above 3 is p = 0.1
+
+
+def test_rosenbaum_counts_orders():
+    """Its p-value is the share of all orders of the pooled values that have as many on top; ties do not count."""
+    values = np.arange(7.0)
+    for x in ([6, 5, 4], [6, 5, 0], [6, 2, 1], [3, 2, 1]):
+        own = np.array(x, float)
+        others = np.setdiff1d(values, own)
+        above = (own > others.max()).sum()
+        orders = [(set(each) >= set(range(7 - above, 7))) for each in itertools.combinations(range(7), 3)]
+        assert stats.rosenbaum(own, others) == pytest.approx(np.mean(orders))
+    assert stats.rosenbaum(np.array([5.0, 5, 1]), np.array([5.0, 0, 0])) == 1.0
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.005])
+def test_detectable_reach_has_the_promised_power(alpha):
+    """Samples whose distribution is a power of the other's, at the P that is named, are told apart in 80 %."""
+    p = stats.detectable_reach(10, 8, alpha)
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(size=(4000, 10)) ** ((1 - p) / p), rng.uniform(size=(4000, 8))
+    assert (x[:, :, None] > y[:, None]).mean() == pytest.approx(p, abs=0.01)
+    found = np.mean([stats.rosenbaum(a, b) < alpha for a, b in zip(x, y, strict=True)])
+    assert found == pytest.approx(0.8, abs=0.02)  # 3 standard errors
+    assert stats.detectable_reach(3, 3) == math.inf
+
+
+def test_detectable_sign_has_the_promised_power():
+    """A share of 1/2 minus the distance keeps to the sign test's bound in 80 %."""
+    distance = stats.detectable_sign(10)
+    assert scipy_stats.binom(10, 0.5 - distance).cdf(1) == pytest.approx(0.8)  # 2 of 10 is p = 0.055
+    assert stats.detectable_sign(4) == math.inf
 
 
 def test_detectable_spread_has_the_promised_power():

@@ -53,80 +53,31 @@ def kruskal(goals: str) -> Findings:
     return findings
 
 
-def _resampled(samples: dict[str, Array], seed: int = 0) -> dict[str, Array]:
-    return dict(zip(samples, stats.resample(list(samples.values()), stats.RESAMPLES, seed), strict=True))
-
-
-def in_front(goals: str, best: tuple[str, ...]) -> Findings:
-    """Some methods have the lowest median crashes of all: share of resamples."""
-
-    def findings(data: Data, environment: str) -> list[Finding]:
-        found = []
-        for where in data.places(environment, goals):
-            samples = _samples(data, where, data.methods(environment))
-            if not set(best) < set(samples):
-                continue
-            medians = {name: np.median(x, axis=1) for name, x in _resampled(samples).items()}
-            others = np.min([value for name, value in medians.items() if name not in best], axis=0)
-            share = float((np.max([medians[name] for name in best], axis=0) < others).mean())
-            what = f"{' and '.join(best)} have the lowest median crashes"
-            found += tests.likely(what, where, share, tuple(map(len, samples.values())))
-        return found
-
-    return findings
-
-
 def highest_reward(goals: str, method: str) -> Findings:
-    """The single highest reward belongs to a method: share of resamples."""
+    """The single highest reward belongs to a method: against each other method, whose policies reach higher."""
 
     def findings(data: Data, environment: str) -> list[Finding]:
         found = []
         for where in data.places(environment, goals):
-            samples = _samples(data, where, data.methods(environment), "reward")
-            if method not in samples or len(samples) < 2:
-                continue
-            highest = {name: x.max(axis=1) for name, x in _resampled(samples).items()}
-            others = np.max([value for name, value in highest.items() if name != method], axis=0)
-            what = f"the highest reward is {method}'s"
-            share = float((highest[method] > others).mean())
-            found += tests.likely(what, where, share, tuple(map(len, samples.values())))
+            own = data.sample(where, method, "reward")
+            for rival in data.methods(environment):
+                if rival != method:
+                    what = f"highest reward: {method} > {rival}"
+                    found += tests.higher(what, where, own, data.sample(where, rival, "reward"))
         return found
 
     return findings
 
 
 def nearly_none(data: Data, environment: str) -> list[Finding]:
-    """A method's policies crash less than once in 10^6 steps: exact Poisson test of the pooled count."""
+    """Most of a method's policies crash less than once in 10^6 steps: sign test, policy by policy."""
     found = []
     for where in data.places(environment, "naive"):
         for method in data.methods(environment):
-            crashes = data.sample(where, method, "crashes")
-            if len(crashes) < tests.LEAST:
-                continue
-            steps = float((data.sample(where, method, "steps") * data.sample(where, method, "worlds")).sum())
-            count = crashes.sum()
-            low = scipy_stats.chi2.ppf(0.025, 2 * count) / 2 if count else 0.0
-            high = scipy_stats.chi2.ppf(0.975, 2 * count + 2) / 2
-            rate = Interval(*(1e6 * np.array([count, low, high]) / steps).tolist())
-            limit = scipy_stats.poisson(NEARLY_NONE * steps)
-            found.append(Finding(
-                what=f"{method}: less than 1 crash per 10^6 steps", where=where, effect="crashes per 10^6 steps",
-                interval=rate, p_for=float(limit.cdf(count)), p_against=float(limit.sf(count - 1)),
-                detectable=_detectable_rate(steps), wanted=0.5, n=(len(crashes),),
-            ))  # fmt: skip
+            crashes, steps, worlds = (data.sample(where, method, name) for name in ("crashes", "steps", "worlds"))
+            what = f"{method}: most policies crash less than once in 10^6 steps"
+            found += tests.mostly(what, where, crashes < NEARLY_NONE * steps * worlds)
     return found
-
-
-def _detectable_rate(steps: float) -> Callable[[float], float]:
-    """Smallest distance of the rate below its limit that is found with a power of 80 % [1 / 10^6 steps]."""
-
-    def detectable(alpha: float) -> float:
-        bound = scipy_stats.poisson(NEARLY_NONE * steps).ppf(alpha) - 1
-        rates = np.linspace(0.0, 1.0, 101)
-        enough = scipy_stats.poisson.cdf(bound, rates * 1e-6 * steps) >= stats.POWER
-        return float(1 - rates[enough].max()) if enough.any() else 1.0
-
-    return detectable
 
 
 def safe_more_unsafe_less(data: Data, environment: str) -> list[Finding]:
@@ -234,12 +185,13 @@ def vertex(samples: dict[str, Array], resamples: int = stats.RESAMPLES) -> tuple
     """Where the parabola through log crashes over the achieved percentile has its vertex.
 
     Returns:
-        The achieved percentile with its interval; and of every resample the vertex and the curvature.
+        The achieved percentile with its interval; and of every resample the slopes at Coop's and at Antagonist's
+        percentile, per half of the range, shape (2, resamples), and the vertices, shape (resamples,).
     """
     x = np.array([ACHIEVED[name] for name in samples])
 
     def place(c: Array) -> Array:
-        # A straight line has no vertex: it is put into the middle, and the curvature of 0 that is given beside says so.
+        # A straight line has no vertex: it is put into the middle; the slopes say that there is none.
         offset = np.divide(c[..., 1], 2 * c[..., 0], out=np.zeros_like(c[..., 1]), where=c[..., 0] != 0)
         return np.clip(50.0 - 50.0 * offset, -1000.0, 1000.0)
 
@@ -247,11 +199,17 @@ def vertex(samples: dict[str, Array], resamples: int = stats.RESAMPLES) -> tuple
     places = place(values)
     low, high = np.quantile(places, [0.025, 0.975])
     own = float(place(_parabola(*samples.values(), x=x)))
-    return Interval(own, float(low), float(high)), places, values[..., 0]
+    ends = [(ACHIEVED[name] - 50.0) / 50.0 for name in ("coop", "antagonist")]
+    slopes = np.stack([2 * end * values[:, 0] + values[:, 1] for end in ends])
+    return Interval(own, float(low), float(high)), slopes, places
 
 
 def hump(data: Data, environment: str) -> list[Finding]:
-    """Crashes over the achieved percentile curve upwards, with the lowest point inside."""
+    """Crashes over the achieved percentile curve upwards, with the lowest point inside.
+
+    It lies inside if the parabola falls at Coop's end and rises at Antagonist's: both, to support it (an
+    intersection-union test); either of them significantly otherwise, by Bonferroni's rule, to contradict it.
+    """
     found = []
     for where in [place for goals in ("naive", "adversary") for place in data.places(environment, goals)]:
         samples = _samples(data, where, DIRECTOR_METHODS)
@@ -261,11 +219,11 @@ def hump(data: Data, environment: str) -> list[Finding]:
         curvature = "curvature of log crashes over the achieved percentile > 0"
         found += tests.resampled(curvature, where, "curvature", list(samples.values()),
                                  lambda *s, x=x: _parabola(*s, x=x)[..., 0], math.log(2))  # fmt: skip
-        interval, places, curvatures = vertex(samples, stats.RESAMPLES)
-        inside = (places > ACHIEVED["coop"]) & (places < ACHIEVED["antagonist"]) & (curvatures > 0)
+        interval, slopes, places = vertex(samples, stats.RESAMPLES)
+        falls, rises = tests.above_zero(-slopes[0]), tests.above_zero(slopes[1])
         found += [Finding(
             what="the lowest point lies inside", where=where, effect="vertex [achieved percentile]", interval=interval,
-            p_for=float(1 - inside.mean()), p_against=float(inside.mean()),
+            p_for=max(falls[0], rises[0]), p_against=min(1.0, 2 * min(falls[1], rises[1])),
             detectable=tests.by_error(float(places.std())), wanted=25.0, n=tuple(map(len, samples.values())),
         )]  # fmt: skip
     return found
@@ -322,28 +280,33 @@ def energy_test(x: Array, y: Array, seed: int = 0) -> tuple[float, float]:
     return float(distance[0]), float((distance >= distance[0] - 1e-12).mean())
 
 
-def best_baseline(method: str, baselines: Sequence[str]) -> Findings:
-    """A baseline has the lowest mean rank of median crashes over goals and T: share of resamples."""
+def best_baseline(method: str, rivals: Sequence[str]) -> Findings:
+    """A baseline crashes less than each of its rivals over all goals and T: rank sums on the policies' mean ranks."""
 
     def findings(data: Data, environment: str) -> list[Finding]:
-        ranks: list[Array] = []
-        names: list[str] = []
-        n: tuple[int, ...] = ()
-        for where in [place for goals in ("naive", "adversary") for place in data.places(environment, goals)]:
-            samples = _samples(data, where, baselines)
-            if method not in samples or len(samples) < 2 or (names and names != list(samples)):
-                continue
-            names, n = list(samples), tuple(map(len, samples.values()))
-            medians = np.stack([np.median(x, axis=1) for x in _resampled(samples, len(ranks)).values()], axis=1)
-            ranks.append(scipy_stats.rankdata(medians, axis=1))
-        if not ranks:
-            return []
-        mean = np.mean(ranks, axis=0)
-        own = mean[:, names.index(method)]
-        share = float((own <= mean.min(axis=1)).mean())
-        return tests.likely(f"{method} has the best mean rank of {', '.join(names)}", environment, share, n)
+        found = []
+        for rival in rivals:
+            theirs, own = _mean_ranks(data, environment, rival, method)
+            what = f"mean rank of crashes over goals and T: {rival} > {method}"
+            found += tests.compare(what, environment, theirs, own)
+        return found
 
     return findings
+
+
+def _mean_ranks(data: Data, environment: str, *names: str) -> list[Array]:
+    """Of every policy of some methods the rank of its crashes among them all, meaned over goals and T.
+
+    Evaluations in which one of the methods has too few policies do not count, nor do policies without all others.
+    """
+    places = [place for goals in ("naive", "adversary") for place in data.places(environment, goals)]
+    places = [place for place in places if len(_samples(data, place, names)) == len(names)]
+    if not places:
+        return [np.empty(0) for _ in names]
+    seeds = {name: sorted(set.intersection(*(set(data.seeds(place, [name])) for place in places))) for name in names}
+    pooled = [np.concatenate([data.sample(place, name, CRASHES, seeds[name]) for name in names]) for place in places]
+    ranks = np.mean([scipy_stats.rankdata(values) for values in pooled], axis=0)
+    return np.split(ranks, np.cumsum([len(seeds[name]) for name in names])[:-1])
 
 
 def headline(directors: Sequence[str], baselines: Sequence[str]) -> Findings:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats as scipy_stats
 
 from deimos.study import stats
@@ -113,12 +114,29 @@ def paired_more(what: str, where: Where | str, x: Array, y: Array) -> list[Findi
     )]  # fmt: skip
 
 
-def likely(what: str, where: Where | str, share: float, n: tuple[int, ...]) -> list[Finding]:
-    """Something holds in nearly all bootstrap resamples: supported from 95 % on, contradicted up to 5 %."""
+def higher(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
+    """The highest value of both samples is one of ``x``'s: how many of one lie above all of the other (Rosenbaum)."""
+    if min(len(x), len(y)) < LEAST:
+        return []
+    above = float((x > y.max()).sum() - (y > x.max()).sum())
     return [Finding(
-        what=what, where=where, effect="share of resamples", interval=Interval(share, math.nan, math.nan),
-        p_for=1 - share, p_against=share, detectable=lambda alpha: stats.detectable_probability(min(n), min(n), alpha),
-        wanted=PROBABILITY, n=n,
+        what=what, where=where, effect="policies above all of the other's (negative: the other's)",
+        interval=Interval(above, math.nan, math.nan), p_for=stats.rosenbaum(x, y), p_against=stats.rosenbaum(y, x),
+        detectable=lambda alpha: stats.detectable_reach(len(x), len(y), alpha), wanted=PROBABILITY,
+        n=(len(x), len(y)),
+    )]  # fmt: skip
+
+
+def mostly(what: str, where: Where | str, holds: NDArray[np.bool_]) -> list[Finding]:
+    """Something holds for most policies: exact sign test, with Clopper and Pearson's interval of the share."""
+    if len(holds) < LEAST:
+        return []
+    n, count = len(holds), int(holds.sum())
+    interval = scipy_stats.binomtest(count, n).proportion_ci(stats.LEVEL)
+    return [Finding(
+        what=what, where=where, effect="share of policies", interval=Interval(count / n, interval.low, interval.high),
+        p_for=float(scipy_stats.binom.sf(count - 1, n, 0.5)), p_against=float(scipy_stats.binom.cdf(count, n, 0.5)),
+        detectable=lambda alpha: 0.5 + stats.detectable_sign(n, alpha), wanted=PROBABILITY, n=(n,),
     )]  # fmt: skip
 
 
@@ -130,13 +148,18 @@ def resampled(
         return []
     values = statistic(*stats.resample(samples, stats.RESAMPLES, 0))
     low, high = np.quantile(values, [0.025, 0.975])
-    below, above = ((values <= 0).sum() + 1) / (len(values) + 1), ((values >= 0).sum() + 1) / (len(values) + 1)
-    error = float(values.std())
+    p_for, p_against = above_zero(values)
     return [Finding(
         what=what, where=where, effect=effect, interval=Interval(float(statistic(*samples)), float(low), float(high)),
-        p_for=float(min(1.0, 2 * below)), p_against=float(min(1.0, 2 * above)), detectable=by_error(error),
-        wanted=wanted, n=tuple(len(x) for x in samples),
+        p_for=p_for, p_against=p_against, detectable=by_error(float(values.std())), wanted=wanted,
+        n=tuple(len(x) for x in samples),
     )]  # fmt: skip
+
+
+def above_zero(values: Array) -> tuple[float, float]:
+    """Two-sided p-values for and against a statistic above 0, from its bootstrap distribution."""
+    below, above = (((side * values <= 0).sum() + 1) / (len(values) + 1) for side in (1, -1))
+    return float(min(1.0, 2 * below)), float(min(1.0, 2 * above))
 
 
 def by_error(error: float) -> Callable[[float], float]:
@@ -194,5 +217,10 @@ def _name(metric: str) -> str:
 
 
 def _detectable_shift(difference: Array, alpha: float) -> float:
-    """Of the signed-rank test, by the t test and the least relative efficiency that the former can have, 0.864."""
+    """Of the signed-rank test, by the t test and the least relative efficiency that the former can have, 0.864.
+
+    Infinite where even n of n pairs that moved the same way are not significant.
+    """
+    if 2.0 ** (1 - np.count_nonzero(difference)) >= alpha:
+        return math.inf
     return stats.detectable_mean(difference, alpha) / math.sqrt(0.864)

@@ -47,7 +47,7 @@ class Judged:
     verdict: Verdict
     """What it says."""
     p: float
-    """The smaller of its two p-values, corrected."""
+    """The smaller of its two p-values, corrected as ``judge`` says."""
     detectable: float
     """Smallest effect that it could have found with a power of 80 %, at the corrected level."""
 
@@ -103,19 +103,30 @@ def test(claim: Claim, data: Data) -> Outcome:
     found = {environment: claim.findings(data, environment) for environment in claim.environments}
     findings = [finding for part in found.values() for finding in part]
     missing = tuple(environment for environment, part in found.items() if not part)
-    judged = judge(findings)
+    judged = judge(findings, claim.combine)
     return Outcome(claim, combined(judged, claim.combine, claim.planned), judged, missing)
 
 
-def judge(findings: Sequence[Finding], alpha: float = ALPHA) -> list[Judged]:
-    """Correct the p-values of the findings of one claim by Holm's rule, and say what each finding means.
+def judge(findings: Sequence[Finding], combine: Literal["all", "any"] = "all", alpha: float = ALPHA) -> list[Judged]:
+    """Say what each finding of a claim means, with p-values corrected so that the claim's verdicts have level alpha.
+
+    A claim that needs all its findings is supported only if every test rejects the opposite at level alpha. Such an
+    intersection-union test has level alpha as it is [1]_. One of its findings is enough to contradict it: there the
+    p-values are corrected by Holm's rule. Where one finding is enough to support, it is the other way round.
 
     A finding that neither supports nor contradicts is ``undecided`` if its test would probably have found the
-    smallest effect of interest, and ``underpowered`` if not.
+    smallest effect of interest at the stricter of the two levels, and ``underpowered`` if not.
+
+    References:
+        .. [1] Berger, *Multiparameter Hypothesis Testing and Acceptance Sampling*, Technometrics 24, 1982.
     """
     if not findings:
         return []
-    for_claim, against = (holm([getattr(f, name) for f in findings]) for name in ("p_for", "p_against"))
+    for_claim, against = ([getattr(f, name) for f in findings] for name in ("p_for", "p_against"))
+    if combine == "all":
+        against = holm(against).tolist()
+    else:
+        for_claim = holm(for_claim).tolist()
     judged = []
     for finding, p_for, p_against in zip(findings, for_claim, against, strict=True):
         detectable = finding.detectable(alpha / len(findings))

@@ -20,9 +20,9 @@ from rich.text import Text
 from deimos.checks import check_at_least
 from deimos.run_folder import RunError
 from deimos.study import plan
-from deimos.study.folder import StudyFolder
+from deimos.study.folder import StudyFolder, identity
 from deimos.study.presets import PRESETS
-from deimos.study.results import merge, results
+from deimos.study.results import check_comparable, merge, results
 from deimos.study.runner import Progress, Runner
 
 USAGE = """usage: deimos study COMMAND [OPTIONS]
@@ -149,8 +149,9 @@ def run(options: RunOptions, stopped: Callable[[], bool] = lambda: False) -> Non
     """
     study = StudyFolder(options.folder)
     if options.preset is not None or options.file is not None:
-        study.results.read()
-        study.add(_described(options))
+        cells = _described(options)
+        check_comparable([*study.results.read(), *map(identity, [*study.cells(), *cells])])
+        study.add(cells)
     if not study.cells():
         raise RunError(f"{study.path} holds no study; begin one with --preset or --file.")
     if options.retry_failed:
@@ -237,7 +238,7 @@ def merge_folders(options: MergeOptions) -> None:
     """Merge study folders and say what was added.
 
     Raises:
-        RunError: If one holds no results or has another schema.
+        RunError: If one holds no results or has another schema, or they do not make one study.
     """
     added, present, differing = merge(options.folder, options.sources)
     print(f"{added} rows added, {present} were there already.")

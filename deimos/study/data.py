@@ -12,7 +12,7 @@ import numpy as np
 from deimos.methods import METHODS
 from deimos.run_folder import RunError
 from deimos.study.presets import DIRECTORS
-from deimos.study.results import curves, results
+from deimos.study.results import check_one_population, curves, results
 from deimos.study.stats import Array
 
 DIRECTOR_METHODS = ("coop", *DIRECTORS, "antagonist")
@@ -53,7 +53,7 @@ class Data:
     """All rows of a study folder. Rows of a weak adversary are counted, and left out of every sample."""
 
     def __init__(self, rows: list[dict[str, Any]], lines: list[dict[str, Any]]) -> None:
-        _check_settings(rows)
+        check_one_population(rows, lines)
         self.rows = rows
         self.weak = [row for row in rows if row["weak_adversary"]]
         self._samples: dict[tuple[Where, str], dict[int, dict[str, Any]]] = {}
@@ -71,8 +71,8 @@ class Data:
         """Read the tables of a study folder.
 
         Raises:
-            RunError: If there are no results, a table has another schema, or the cells of an environment
-                were run with different settings.
+            RunError: If there are no results, a table has another schema, the cells of an environment were run with
+                different settings or those of a method with different selectors, or a policy stands there twice.
         """
         rows = results(folder).read()
         if not rows:
@@ -152,16 +152,3 @@ def _metric(row: dict[str, Any], name: str) -> float:
     if column == "tracking":
         return row[column][int(part)] if int(part) < len(row[column]) else math.nan
     return row[column].get(part, math.nan)
-
-
-def _check_settings(rows: list[dict[str, Any]]) -> None:
-    """Refuse to mix what cannot be compared."""
-    settings: dict[str, set[str]] = {}
-    for row in rows:
-        settings.setdefault(row["environment"], set()).add(row["setting"])
-    for environment, found in settings.items():
-        if len(found) > 1:
-            raise RunError(
-                f"The cells of environment '{environment}' were run with {len(found)} different settings "
-                f"({', '.join(sorted(found))}) and cannot be compared; keep one setting in a folder."
-            )

@@ -293,8 +293,9 @@ def _save(figure: "Figure", folder: Path, name: str) -> None:
     import matplotlib.pyplot as plt
 
     try:
-        for ending in ("png", "svg"):
-            figure.savefig(folder / f"{name}.{ending}", dpi=DPI, metadata={"Date": None} if ending == "svg" else None)
+        figure.savefig(folder / f"{name}.png", dpi=DPI)
+        with plt.rc_context({"svg.hashsalt": name}):  # the same file from the same data
+            figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
     except OSError as error:
         raise RunError(f"{folder / name} could not be written ({error.strerror}).") from error
     finally:

@@ -126,7 +126,7 @@ def result_rows(cell: Cell, run: RunFolder, evaluated: Iterable[dict[str, Any]])
     config = stored["config"]
     versions = stored["versions"]
     names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
-    shared = _identity(cell) | {
+    shared = identity(cell) | {
         "env_steps": config["env_steps"],
         "trained_period": cell.config.env.goal_period,
         "fps": _median([float(row["fps"]) for row in run.read_csv("timing.csv")]),
@@ -148,13 +148,14 @@ def curve_row(cell: Cell, run: RunFolder, points: int = 100) -> dict[str, Any]:
         name: tuple(sum(float(row[name]) for row in stretch) / len(stretch) for stretch in stretches)
         for name in ("reward", "crashes_per_1000", "selected_share")
     }
-    return _identity(cell) | {"env_steps": tuple(float(stretch[-1]["env_steps"]) for stretch in stretches)} | means
+    return identity(cell) | {"env_steps": tuple(float(stretch[-1]["env_steps"]) for stretch in stretches)} | means
 
 
-def _identity(cell: Cell) -> dict[str, Any]:
+def identity(cell: Cell) -> dict[str, Any]:
+    """What a cell's rows in both tables begin with."""
     return {
         "environment": cell.environment, "method": cell.config.label, "seed": cell.config.seed,
-        "hash": cell.digest, "setting": cell.setting, "num_envs": cell.config.num_envs,
+        "hash": cell.digest, "setting": cell.setting, "selector": cell.selector, "num_envs": cell.config.num_envs,
     }  # fmt: skip
 
 

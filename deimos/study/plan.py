@@ -3,6 +3,7 @@
 import hashlib
 import json
 import tomllib
+import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,8 +13,9 @@ from typing import Any
 from deimos import presets
 from deimos.config import from_dict, to_dict
 from deimos.env import EnvConfig
-from deimos.methods import method
+from deimos.methods import METHODS, method
 from deimos.run_folder import RunError
+from deimos.selector import SelectorConfig
 from deimos.study.presets import PRESETS
 from deimos.training import TrainConfig
 
@@ -43,16 +45,20 @@ class Cell:
     @cached_property
     def digest(self) -> str:
         """First 12 hexadecimal digits of the SHA-256 of everything that the numbers depend on."""
-        selector = to_dict(self.config.goals)  # what the method's name stands for
-        periods = list(self.goal_periods)
+        selector, periods = _spelled_out(self.config.goals), list(self.goal_periods)
         return _digest({"config": to_dict(self.config), "selector": selector, "goal_periods": periods})
 
     @cached_property
     def setting(self) -> str:
-        """The same of what the cells of one environment must share to be compared: all but method and seed."""
+        """The same of what the cells of one environment must share to be compared: all but selector and seed."""
         config = to_dict(self.config)
         shared = {name: value for name, value in config.items() if name not in ("method", "selector", "seed")}
         return _digest({"config": shared, "goal_periods": list(self.goal_periods)})
+
+    @cached_property
+    def selector(self) -> str:
+        """The same of what the cells of one method must share: what the method's name stands for."""
+        return _digest({"selector": _spelled_out(self.config.goals)})
 
     @cached_property
     def name(self) -> str:
@@ -65,6 +71,15 @@ class Cell:
             "schema": SCHEMA, "environment": self.environment, "config": to_dict(self.config),
             "goal_periods": list(self.goal_periods),
         }  # fmt: skip
+
+
+def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
+    """A selector's configuration with those of the methods that it names, as Schedule and Mix do."""
+    fields = to_dict(config)
+    hints = typing.get_type_hints(type(config))
+    names = [value for name, value in fields.items() if hints.get(name) is str and value in METHODS]
+    named = {name: _spelled_out(METHODS[name], (*known, name)) for name in names if name not in known}
+    return fields | ({"methods": named} if named else {})
 
 
 def _digest(data: dict) -> str:

@@ -259,12 +259,13 @@ def _details(outcome: Outcome) -> list[Block]:
         [
             str(each.finding.where), each.finding.what, " + ".join(map(str, each.finding.n)), each.finding.effect,
             _interval(each.finding.interval), f"{each.p:.2g}",
-            f"{each.detectable:.2g} (wanted {each.finding.wanted:.2g})",
+            f"{'none' if math.isinf(each.detectable) else format(each.detectable, '.2g')} "
+            f"(wanted {each.finding.wanted:.2g})",
             each.verdict + ("" if each.finding.required else " (can only contradict)"),
         ]
         for each in outcome.judged
     ]  # fmt: skip
-    header = ["where", "what", "n", "effect", "size [95 %]", "p (Holm)", "minimum detectable effect", "verdict"]
+    header = ["where", "what", "n", "effect", "size [95 %]", "p", "minimum detectable effect", "verdict"]
     return [*blocks, Table(header, rows)] if rows else [*blocks, Paragraph("There are no data for it here.")]
 
 
@@ -286,7 +287,12 @@ def _limits(data: Data) -> list[Block]:
         f"crashes within a factor of {FACTOR:g} and rewards within {100 * REWARD_SHARE:.0f} % of Uniform's median. "
         "`Undecided` is a test that would probably have found such an effect and did not; `underpowered` one that "
         "would not have.",
-        "p-values are corrected by Holm's rule over all tests of one claim, not over all claims together.",
+        "A claim that needs all its tests is supported only if each of them rejects the opposite at 5 % by itself (an "
+        "intersection-union test, of level 5 % as it is); one of them is enough to contradict it, so there the "
+        "p-values are corrected by Holm's rule over the claim's tests. For a claim that needs only one of its tests "
+        "it is the other way round. The p that is printed is the smaller one. Nothing is corrected over all claims "
+        "together. A minimum detectable effect of `none` is that of a test that cannot reject with so few policies "
+        "at the level that contradicts.",
         "The best p is chosen on one half of the seeds and tested on the other, from 20 seeds on.",
         COVERAGE,
         "CVaR over seeds is too low in small populations.",

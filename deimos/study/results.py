@@ -14,7 +14,7 @@ from deimos.run_folder import RunError
 
 RESULT_COLUMNS: dict[str, type] = {
     # What was run.
-    "environment": str, "method": str, "seed": int, "hash": str, "setting": str,
+    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str,
     "num_envs": int, "env_steps": int, "trained_period": int,
     # How it was judged.
     "goals": str, "goal_period": int, "eval_seed": int, "worlds": int, "steps": int,
@@ -32,7 +32,7 @@ TIMED = ("fps",)
 """Columns that two runs of the same cell may differ in."""
 
 CURVE_COLUMNS: dict[str, type] = {
-    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "num_envs": int,
+    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
     "env_steps": tuple, "reward": tuple, "crashes_per_1000": tuple, "selected_share": tuple,
 }  # fmt: skip
 CURVE_KEY = ("hash",)
@@ -145,7 +145,7 @@ def merge(target: Path, sources: Iterable[Path]) -> tuple[int, int, int]:
         have other numbers in the source: of those the first stay.
 
     Raises:
-        RunError: If a source has no results, or a table has another schema.
+        RunError: If a source has no results, a table has another schema, or the folders do not make one study.
     """
     tables = [(results(source).read(), curves(source).read()) for source in sources]
     for source, (rows, _) in zip(sources, tables, strict=True):
@@ -153,18 +153,72 @@ def merge(target: Path, sources: Iterable[Path]) -> tuple[int, int, int]:
             raise RunError(f"{source} holds no results; it is empty, or no study folder.")
     ours = results(target)
     known = {ours.key_of(row): row for row in ours.read()}
-    curves(target).read()
-    target.mkdir(parents=True, exist_ok=True)
-    added = present = differing = 0
+    drawn = {curves(target).key_of(line): line for line in curves(target).read()}
+    present = differing = 0
     for rows, lines in tables:
         for row in rows:
             old = known.setdefault(ours.key_of(row), row)
             if old is not row:
                 present += 1
                 differing += any(_text(old[name]) != _text(row[name]) for name in ("weights", "crashes", "reward"))
+        drawn = {curves(target).key_of(line): line for line in lines} | drawn
+    check_one_population(list(known.values()), list(drawn.values()))
+    target.mkdir(parents=True, exist_ok=True)
+    added = 0
+    for rows, lines in tables:
         added += ours.append(rows)
         curves(target).append(lines)
     return added, present, differing
+
+
+def check_one_population(rows: list[dict[str, Any]], lines: list[dict[str, Any]]) -> None:
+    """Refuse tables of evaluations and of training curves that do not make one study.
+
+    Raises:
+        RunError: If what cannot be compared is mixed, or a policy stands there twice.
+    """
+    check_comparable([*rows, *lines])
+    _check_single(rows, ("environment", "method", "seed", "goals", "goal_period"))
+    _check_single(lines, ("environment", "method", "seed"))
+
+
+def check_comparable(rows: Iterable[dict[str, Any]]) -> None:
+    """Refuse to mix what cannot be compared: an environment has one setting, and a method in it one selector.
+
+    Args:
+        rows: Rows of either table, or cells' identities.
+
+    Raises:
+        RunError: If there are more.
+    """
+    settings: dict[str, set[str]] = {}
+    selectors: dict[tuple[str, str], set[str]] = {}
+    for row in rows:
+        settings.setdefault(row["environment"], set()).add(row["setting"])
+        selectors.setdefault((row["environment"], row["method"]), set()).add(row["selector"])
+    for environment, found in settings.items():
+        if len(found) > 1:
+            raise RunError(
+                f"The cells of environment '{environment}' were run with {len(found)} different settings "
+                f"({', '.join(sorted(found))}) and cannot be compared; keep one setting in a folder."
+            )
+    for (environment, name), found in selectors.items():
+        if len(found) > 1:
+            raise RunError(
+                f"Method '{name}' stands for {len(found)} different selectors in environment '{environment}' "
+                f"({', '.join(sorted(found))}), which are no one population; keep one of them in a folder."
+            )
+
+
+def _check_single(rows: Iterable[dict[str, Any]], names: tuple[str, ...]) -> None:
+    """Refuse a policy that is there twice: one of the two would silently count for nothing."""
+    known: set[tuple] = set()
+    for row in rows:
+        key = tuple(row[name] for name in names)
+        if key in known:
+            what = ", ".join(f"{name} {value}" for name, value in zip(names, key, strict=True))
+            raise RunError(f"There are two rows of {what}; keep one of them in the table.")
+        known.add(key)
 
 
 def _value(kind: type, text: str) -> Any:

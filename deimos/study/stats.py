@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import optimize, stats
 
 Array = NDArray[np.float64]
 Statistic = Callable[..., Array]
@@ -228,6 +228,22 @@ def mann_whitney(x: Array, y: Array) -> float:
     return float(stats.mannwhitneyu(x, y, alternative="two-sided").pvalue)
 
 
+def rosenbaum(x: Array, y: Array) -> float:
+    """One-sided p-value of x reaching higher than y: by how many values of x lie above all of y [1]_.
+
+    Exact without ties; values that are equal to the highest of y do not count.
+
+    References:
+        .. [1] Rosenbaum, *Tables for a Nonparametric Test of Location*, Annals of Mathematical Statistics 25, 1954.
+    """
+    return _on_top(len(x), len(y), int((x > y.max()).sum()))
+
+
+def _on_top(n: int, m: int, count: int) -> float:
+    """Probability that the ``count`` highest of n + m exchangeable values are all of the n."""
+    return math.comb(n, count) / math.comb(n + m, count)
+
+
 def brown_forsythe(x: Array, y: Array) -> float:
     """p-value of equal spread: an F test on the distances from the medians [1]_.
 
@@ -285,11 +301,44 @@ def equivalence(x: Array, y: Array, margin: float, *, alpha: float = 0.05) -> Eq
 def detectable_probability(n: int, m: int, alpha: float = 0.05) -> float:
     """Smallest P(X > Y) above 1/2 that the rank-sum test finds with a power of 80 % (Noether's formula [1]_).
 
+    Infinite where the samples are so small that no order of their values is significant.
+
     References:
         .. [1] Noether, *Sample Size Determination for Some Common Nonparametric Tests*, JASA 82, 1987.
     """
+    if 2 / math.comb(n + m, n) >= alpha:
+        return math.inf
     z = stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(POWER)
     return min(1.0, 0.5 + float(z) * math.sqrt((n + m) / (12 * n * m)))
+
+
+@lru_cache
+def detectable_reach(n: int, m: int, alpha: float = 0.05) -> float:
+    """Smallest P(X > Y) above 1/2 that ``rosenbaum`` finds with a power of 80 %, where F_X is a power of F_Y [1]_.
+
+    Infinite where even all of x above all of y is not significant.
+
+    References:
+        .. [1] Lehmann, *The Power of Rank Tests*, Annals of Mathematical Statistics 24, 1953, section 3.
+    """
+    enough = [count for count in range(n + 1) if _on_top(n, m, count) < alpha]
+    if not enough:
+        return math.inf
+    # With F_X = F_Y^k the share of X below the highest of y is Beta(m / k, 1), and P(X > Y) is k / (k + 1).
+    found = optimize.brentq(lambda z: stats.betabinom.sf(enough[0] - 1, n, 1, m * math.exp(-z)) - POWER, -10, 30)
+    return 1 / (1 + math.exp(-found))
+
+
+@lru_cache
+def detectable_sign(n: int, alpha: float = 0.05) -> float:
+    """Smallest distance from 1/2 of a share that the exact one-sided sign test finds with a power of 80 %.
+
+    Infinite where even n of n is not significant.
+    """
+    enough = [count for count in range(n) if stats.binom.cdf(count, n, 0.5) < alpha]
+    if not enough:
+        return math.inf
+    return 0.5 - float(stats.beta.ppf(1 - POWER, enough[-1] + 1, n - enough[-1]))
 
 
 def detectable_margin(x: Array, y: Array, alpha: float = 0.05) -> float:
