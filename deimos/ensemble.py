@@ -1,7 +1,6 @@
 """Several value functions that differ by initialisation and by data, in one stack of weights."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Protocol
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor, nn
 
 from deimos.networks import rows_in_cache
 from deimos.ppo import value_gradient
-from deimos.products import activate_, multiply_by_slope_, onednn
+from deimos.products import activate_, multiply_by_slope_, on_threads, onednn
 
 
 class Critics(Protocol):
@@ -29,8 +28,8 @@ class Critics(Protocol):
 class Stack:
     """K multilayer perceptrons of one shape and one output.
 
-    The weights of a layer lie in one tensor, those of all layers in one vector. A layer of all members is one batched
-    product, unless somebody has kernels for the whole.
+    All weights lie in one vector, those of a member end to end. A layer of all members is one batched product, unless
+    somebody has kernels for the whole.
 
     Args:
         nets: Made by ``networks.mlp``, on one device. Their parameters become views of the stack.
@@ -39,44 +38,31 @@ class Stack:
 
     def __init__(self, nets: list[nn.Sequential], fuse: "Callable[[Stack], Critics | None] | None" = None) -> None:
         self.nets = nets
-        self._linears = [[layer for layer in net if isinstance(layer, nn.Linear)] for net in nets]
-        first = self._linears[0][0].weight
-        self.parameters = nn.Parameter(torch.zeros(self._pack(), device=first.device))
+        linears = [[layer for layer in net if isinstance(layer, nn.Linear)] for net in nets]
+        tensors = [[tensor for layer in own for tensor in (layer.weight, layer.bias)] for own in linears]
+        sizes = [-(-tensor.numel() // 16) * 16 for tensor in tensors[0]]  # 64 bytes: unaligned weights are slower
+        device = tensors[0][0].device
+        self.parameters = nn.Parameter(torch.zeros(len(nets) * sum(sizes), device=device))
         self.parameters.grad = torch.zeros_like(self.parameters)
-        self._pack(move=True)
+        self._gradient = self.parameters.grad.view(len(nets), -1)
+        views = []
+        parts = (memory.view(len(nets), -1).split(sizes, dim=1) for memory in (self.parameters.data, self._gradient))
+        for members, value, grad in zip(zip(*tensors, strict=True), *parts, strict=True):
+            shape, size = members[0].shape, members[0].numel()
+            views.append([part[:, :size].view(-1, *shape) for part in (value, grad)])
+            for tensor, own, own_grad in zip(members, *views[-1], strict=True):
+                own.copy_(tensor.data)
+                tensor.data, tensor.grad = own, own_grad
+        self.layers = [(*weights, *biases) for weights, biases in zip(views[::2], views[1::2], strict=True)]
+        """Weights (K, outputs, inputs), their gradients, biases (K, outputs) and theirs, of every layer: views."""
         self._activation = nets[0][1]
         self._inputs: list[Tensor] = []
         self.threads = torch.get_num_threads()
         """Threads that torch had when the stack was made; it uses them also where its caller keeps to one."""
-        widest = max(layer.in_features for layer in self._linears[0][1:]) * len(nets)
-        self._piece = rows_in_cache(widest) if first.device.type == "cpu" else max(1, 2**26 // widest)
+        widest = max(layer.in_features for layer in linears[0][1:]) * len(nets)
+        self._piece = rows_in_cache(widest) if device.type == "cpu" else max(1, 2**26 // widest)
         self.fused = fuse(self) if fuse else None
         """Kernels in the place of batched products, if there are any."""
-
-    def _pack(self, move: bool = False) -> int:
-        """Lay every layer's weights, then its biases, of all members end to end; returns their number."""
-        start, count = 0, len(self._linears)
-        self.layers: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-        """Weight, (K, outputs, inputs), and bias, (K, outputs), of every layer, and their gradients: views."""
-        for members in zip(*self._linears, strict=True):
-            views: list[Tensor] = []
-            for name in ("weight", "bias"):
-                tensors = [getattr(layer, name) for layer in members]
-                stop = start + count * tensors[0].numel()
-                if move:
-                    assert self.parameters.grad is not None
-                    shape = (count, *tensors[0].shape)
-                    value = self.parameters.data[start:stop].view(shape)
-                    grad = self.parameters.grad[start:stop].view(shape)
-                    for k, tensor in enumerate(tensors):
-                        value[k] = tensor.data
-                        tensor.data, tensor.grad = value[k], grad[k]
-                    views += [value, grad]
-                start = -(-stop // 16) * 16  # 64 bytes: products of unaligned weights are slower
-            if move:
-                weight, weight_grad, bias, bias_grad = views
-                self.layers.append((weight, bias, weight_grad, bias_grad))
-        return start
 
     @torch.no_grad()
     def values(self, x: Tensor) -> Tensor:
@@ -87,7 +73,7 @@ class Stack:
         """
         if self.fused is not None:
             return self.fused.values(x)
-        with self._all_threads():
+        with on_threads(self.threads):
             return torch.cat([self.forward(x[..., rows, :]).squeeze(2) for rows in self._pieces(range(x.shape[-2]))], 1)
 
     @torch.no_grad()
@@ -116,7 +102,7 @@ class Stack:
             share = weight[:, rows.start : rows.stop]
             share = share / share.sum(1, keepdim=True).clamp(min=1.0)
             losses = torch.zeros(len(x), device=x.device)
-            with self._all_threads():
+            with on_threads(self.threads):
                 for piece in self._pieces(rows):
                     value = self.forward(x[:, piece]).squeeze(2)
                     own = share[:, piece.start - rows.start : piece.stop - rows.start]
@@ -126,16 +112,6 @@ class Stack:
             return losses
 
         return lesson
-
-    @contextmanager
-    def _all_threads(self) -> Iterator[None]:
-        """Run on the stack's threads."""
-        threads = torch.get_num_threads()
-        torch.set_num_threads(self.threads)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(threads)
 
     def _pieces(self, rows: range) -> Iterator[slice]:
         """Consecutive parts of some rows; on a CPU such as suit its caches, on a GPU such as fit 256 MiB a layer."""
@@ -152,7 +128,7 @@ class Stack:
         x = x.expand(len(self.nets), -1, -1)
         self._inputs = []
         with onednn(x.device):
-            for i, (weight, bias, _, _) in enumerate(self.layers):
+            for i, (weight, _, bias, _) in enumerate(self.layers):
                 self._inputs.append(x)
                 x = torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
                 if i < len(self.layers) - 1:
@@ -164,7 +140,7 @@ class Stack:
         """Add the gradient of every weight to its ``grad``; ``delta`` is shaped like what ``forward`` gave last."""
         with onednn(delta.device):
             for i in reversed(range(len(self.layers))):
-                weight, _, weight_grad, bias_grad = self.layers[i]
+                weight, weight_grad, _, bias_grad = self.layers[i]
                 x = self._inputs[i]
                 weight_grad.baddbmm_(delta.transpose(1, 2), x)
                 bias_grad += delta.sum(1)
@@ -175,13 +151,8 @@ class Stack:
 
     def clip_gradients(self, max_norm: float) -> None:
         """Scale every member's own gradient down to a norm of at most ``max_norm``."""
-        squares = torch.zeros(len(self.nets), device=self.parameters.device)
-        for _, _, weight_grad, bias_grad in self.layers:
-            squares += weight_grad.flatten(1).square().sum(1) + bias_grad.square().sum(1)
-        factor = (max_norm / (squares.sqrt() + 1e-6)).clamp(max=1.0)
-        for _, _, weight_grad, bias_grad in self.layers:
-            weight_grad *= factor.view(-1, 1, 1)
-            bias_grad *= factor.view(-1, 1)
+        norm = torch.linalg.vector_norm(self._gradient, dim=1, keepdim=True)
+        self._gradient *= (max_norm / (norm + 1e-6)).clamp(max=1.0)
 
 
 def deviation(values: Tensor) -> Tensor:

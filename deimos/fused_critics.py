@@ -32,9 +32,9 @@ class FusedCritics:
         self._gradient = torch.zeros_like(self._table)
         self._loads, self._stores = _views(stack, layout, self._table, self._gradient)
         self._critics = Critics(layout, wp.from_torch(self._table), wp.from_torch(self._gradient))
-        threads = max(1, min(stack.threads, count))
-        self._members = [range(count * i // threads, count * (i + 1) // threads) for i in range(threads)]
-        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._others = max(1, min(stack.threads, count)) - 1
+        """Threads beside the caller's."""
+        self._pool = ThreadPoolExecutor(max(1, self._others))
         self._values: list[wp.Launch] = []
 
     @torch.no_grad()
@@ -72,14 +72,20 @@ class FusedCritics:
         return lesson
 
     def _record(self, launcher: Callable[..., wp.Launch | None]) -> list[wp.Launch]:
-        """A launch for every thread."""
-        launches = [launcher(members=members, record=True) for members in self._members]
+        """A launch for every member."""
+        launches = [launcher(members=range(k, k + 1), record=True) for k in range(len(self._table))]
         return [launch for launch in launches if launch is not None]
 
     def _run(self, launches: list[wp.Launch]) -> None:
-        """Run one launch per thread; Python's lock is free meanwhile."""
-        others = [self._pool.submit(launch.launch) for launch in launches[1:]] if self._pool else []
-        launches[0].launch()
+        """Run all launches; each thread takes the next one, as processors that others use too are not equally fast."""
+        waiting = iter(launches)
+
+        def work() -> None:
+            for launch in waiting:
+                launch.launch()  # without Python's lock
+
+        others = [self._pool.submit(work) for _ in range(self._others)]
+        work()
         for other in others:
             other.result()
 
@@ -93,7 +99,7 @@ def _views(stack: Stack, layout: Layout, table: Tensor, gradient: Tensor) -> tup
     """What fills the tables, and what their gradients go to."""
     loads: _Copies = []
     stores: _Copies = []
-    for layer, (weight, bias, weight_grad, bias_grad) in enumerate(stack.layers):
+    for layer, (weight, weight_grad, bias, bias_grad) in enumerate(stack.layers):
         outputs, inputs = weight.shape[1:]
         loads += zip(_places(layout, layer, inputs, outputs, table), (weight, bias), strict=True)
         stores += zip((weight_grad, bias_grad), _places(layout, layer, inputs, outputs, gradient), strict=True)

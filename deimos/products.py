@@ -117,3 +117,14 @@ def keep_freed_memory() -> None:
     ever freed, up to 32 MiB (``mallopt(3)``, M_MMAP_THRESHOLD); other libraries keep what is freed anyway.
     """
     torch.empty(31 * 2**20, dtype=torch.uint8)
+
+
+@contextmanager
+def on_threads(count: int) -> Iterator[None]:
+    """Run torch's CPU operations on so many threads; waking another for small ones costs more than it saves."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -5,8 +5,7 @@ import platform
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +24,7 @@ from deimos.goal_loop import GoalLoop, spaces
 from deimos.methods import method
 from deimos.policy import load_policy, save_policy
 from deimos.ppo import PPO, PPOConfig
-from deimos.products import keep_freed_memory
+from deimos.products import keep_freed_memory, on_threads
 from deimos.rollout import Rollout
 from deimos.run_folder import RunError, RunFolder, load_tensors, save_tensors
 from deimos.selector import SelectorConfig
@@ -109,17 +108,6 @@ def resolve_device(name: str) -> torch.device:
     return torch.device("cuda", 0) if name != "cpu" and torch.cuda.is_available() else torch.device("cpu")
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch's CPU operations on the calling thread: waking another for small ones costs more than it saves."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 def cores() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -147,7 +135,7 @@ class Trainer:
 
     def collect(self) -> None:
         """Let the policy act for one rollout."""
-        with one_thread():
+        with on_threads(1):
             self._collect()
 
     def _collect(self) -> None:
@@ -185,7 +173,7 @@ class Trainer:
             learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
             self.ppo.check()
             clock.lap("update")
-            with one_thread():
+            with on_threads(1):
                 selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
             self.loop.selector.check()
             clock.lap("selector")

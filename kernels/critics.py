@@ -22,6 +22,7 @@ wp.set_module_options(OPTIONS)
 
 _Floats = FLOATS[WIDE]
 _Eight = wp.types.vector(length=8, dtype=float)
+_Sixteen = wp.types.vector(length=16, dtype=float)
 _ROWS = WIDE  # a block: as many rows as lanes, so that what a row has once also fits a vector
 
 
@@ -73,6 +74,7 @@ class _Critics:
     scratch: wp.array3d[_Floats]
     number: wp.array3d[float]
     eights: wp.array3d[_Eight]
+    sixteens: wp.array3d[_Sixteen]
     gradient: wp.array3d[_Floats]
     slope: wp.array3d[float]
 
@@ -162,12 +164,13 @@ def _forward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int):
             products += wp.cw_mul(c.scratch[k, top + r, g], c.table[k, out, g])
         c.scratch[k, free + r, 0] = products
     # Lanes are added by way of memory: of anything else LLVM makes a long sequence of shuffles.
+    for r in range(_ROWS):
+        halves = c.sixteens[k, free + r, 0] + c.sixteens[k, free + r, 1]
+        c.sixteens[k, free + r, 0] = halves + (c.sixteens[k, free + r, 2] + c.sixteens[k, free + r, 3])
     value = _Floats()
     for r in range(_ROWS):
-        t = _Eight()
-        for i in range(WIDE // 8):
-            t += c.eights[k, free + r, i]
-        value[r] = c.weight[k, out + 1, 0] + (((t[0] + t[1]) + (t[2] + t[3])) + ((t[4] + t[5]) + (t[6] + t[7])))
+        s = c.eights[k, free + r, 0] + c.eights[k, free + r, 1]
+        value[r] = c.weight[k, out + 1, 0] + (((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7])))
     return value
 
 
@@ -350,6 +353,7 @@ class Critics:
         self.struct.table, self.struct.weight = _as_vectors(table), table
         self.struct.scratch, self.struct.number = _as_vectors(scratch), scratch
         self.struct.eights = _as_vectors(scratch, _Eight)
+        self.struct.sixteens = _as_vectors(scratch, _Sixteen)
         self.struct.gradient, self.struct.slope = _as_vectors(gradient), gradient
 
 

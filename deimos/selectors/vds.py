@@ -17,6 +17,7 @@ from deimos.ensemble import Stack, deviation
 from deimos.interactions import Interactions
 from deimos.networks import Activation, mlp, operations
 from deimos.ppo import advantages
+from deimos.products import on_threads
 from deimos.ranks import mean_over_ranks
 from deimos.rollout import Rollout
 from deimos.seeds import generator, restore, weights_from
@@ -185,19 +186,23 @@ class VDS(GoalSelector):
         minibatches = min(self.config.minibatches, rows)
         size = rows // minibatches
         order = torch.stack([torch.randperm(rows, generator=self.generator, device=old.device) for _ in worlds])
-        step, world = order // worlds.shape[1], worlds.gather(1, order % worlds.shape[1])
+        steps = torch.arange(rollout.num_steps, device=order.device) * rollout.obs.shape[1]
+        place = (steps.unsqueeze(1) + worlds.unsqueeze(1)).flatten(1).gather(1, order)  # in the flat rollout
+        obs = self._spaces.state_then_goal(rollout.obs[:-1]).flatten(0, 1)
         lesson = self.stack.gradients(
-            self._spaces.state_then_goal(rollout.obs[:-1])[step, world], old.flatten(1).gather(1, order),
-            returns.flatten(1).gather(1, order), rollout.weight[step, world], self.config.clip,
+            obs.index_select(0, place.flatten()).view(*order.shape, -1), old.flatten(1).gather(1, order),
+            returns.flatten(1).gather(1, order), rollout.weight.take(place), self.config.clip,
         )  # fmt: skip
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
-        for _ in range(self.config.epochs):
-            for start in range(0, minibatches * size, size):
-                losses += lesson(range(start, start + size))
-                mean_over_ranks(self.stack.parameters.grad)
-                self.stack.clip_gradients(self.config.max_grad_norm)
-                self.optimizer.step()
+        # A thread of torch's that has had work goes on waiting for more, and would take the processor from the lessons.
+        with on_threads(1):
+            for _ in range(self.config.epochs):
+                for start in range(0, minibatches * size, size):
+                    losses += lesson(range(start, start + size))
+                    mean_over_ranks(self.stack.parameters.grad)
+                    self.stack.clip_gradients(self.config.max_grad_norm)
+                    self.optimizer.step()
         return losses.mean().item() / (self.config.epochs * minibatches)
 
     def operations(self, decisions: float, transitions: int) -> float:
