@@ -303,9 +303,9 @@ class PPO:
         rollout.advantage.copy_(advantage)
         returns = advantage + value[:-1]
         weight = rollout.weight
-        total = weight.sum()
-        mean = mean_over_ranks((weight * advantage).sum() / total)
-        variance = mean_over_ranks((weight * (advantage - mean).square()).sum() / (total - 1))
+        total = mean_over_ranks(weight.sum())
+        mean = mean_over_ranks((weight * advantage).sum()) / total
+        variance = mean_over_ranks((weight * (advantage - mean).square()).sum()) / (total - 1)
         explained = 1 - variance / (returns.var() + 1e-8)
         advantage = (advantage - mean) / (variance.sqrt() + 1e-8)
         z = (rollout.action - rollout.mean) / self.actor.std

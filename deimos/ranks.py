@@ -6,8 +6,8 @@ from torch import Tensor
 def mean_over_ranks(value: Tensor) -> Tensor:
     """Average ``value`` over all learner processes, in place, and return it; with one process nothing changes.
 
-    Everything that is averaged over worlds for learning (gradients, KL divergences, advantage
-    statistics, class shares) passes through here, so that data-parallel training changes this
-    function and nothing else.
+    Gradients, KL divergences, sums of advantages and class shares pass through here. That is what PPO and the fear
+    network need for data-parallel training, but for one thing: ``Fear.fit`` begins only where its own process has seen
+    enough of both classes. What RND, CL, PLR, grid and the temperature gather stays with each process as yet.
     """
     return value

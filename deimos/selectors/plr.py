@@ -24,7 +24,7 @@ class Config(SelectorConfig):
     replay: float = 0.8
     """Share of decisions that replay a level, in [0, 1], once the buffer holds enough."""
     robust: bool = False
-    """Whether the learner takes gradients on replayed goals only."""
+    """Whether the learner takes gradients on replayed goals only, and on first goals, which nobody chooses."""
     capacity: int = 4000
     """Levels in the buffer, at least 1."""
     fill: float = 0.5
