@@ -36,7 +36,7 @@ class GoalLoop:
             env.num_envs, env.state_dim, env.goal_dim, env.goal_period, window or 2 * env.goal_period, env.device,
             groups=0 if env.goal_groups == (slice(None),) else len(env.goal_groups),
         )  # fmt: skip
-        self.learn = torch.ones(env.num_envs, device=env.device)
+        self.weight = torch.ones(env.num_envs, device=env.device)
         """1 where the learner may use the transitions under the goal in force, else 0, shape (num_envs,)."""
         if selector.first_goals_scaled:  # the goals that the environment was built with are not
             env.restart(selector.goal_range())
@@ -73,12 +73,12 @@ class GoalLoop:
         self.interactions.open(
             rows, state, goal, proposal.goal, proposal.score, probe=proposal.probe, note=proposal.note
         )
-        self.learn[rows] = 1.0 if proposal.learn is None else proposal.learn.float()
+        self.weight[rows] = 1.0 if proposal.learn is None else proposal.learn.float()
         env.set_goals(rows, proposal.goal)
 
     def _reset(self, mask: Tensor) -> None:
         self.env.reset(mask, self.selector.goal_range() if self.selector.first_goals_scaled else None)
-        self.learn.masked_fill_(mask, 1.0)
+        self.weight.masked_fill_(mask, 1.0)
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
@@ -86,7 +86,7 @@ class GoalLoop:
             "env": self.env.state_dict(),
             "selector": self.selector.state_dict(),
             "interactions": self.interactions.state_dict(),
-            "learn": self.learn.clone(),
+            "learn": self.weight.clone(),
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -94,7 +94,7 @@ class GoalLoop:
         self.env.load_state_dict(state["env"])
         self.selector.load_state_dict(state["selector"])
         self.interactions.load_state_dict(state["interactions"])
-        self.learn.copy_(state["learn"])
+        self.weight.copy_(state["learn"])
 
 
 def _rows(mask: Tensor, count: int) -> Tensor:

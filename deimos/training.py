@@ -148,7 +148,7 @@ class Trainer:
             clock.lap("policy")
             step = env.step(rollout.action[t])
             clock.lap("env")
-            rollout.record(t, step, loop.learn)
+            rollout.record(t, step, loop.weight)
             loop.advance(step)
             clock.lap("goals")
         rollout.obs[-1] = env.obs

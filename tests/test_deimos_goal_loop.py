@@ -28,7 +28,7 @@ def test_only_first_goals_differ_where_they_are_scaled(torch_device, task, selec
         env = TASKS[task].build(64, torch_device, 5)
         loop = GoalLoop(env, config.build(spaces(env, total_steps=1000), 0))
         assert not loop.interactions.active.any()
-        assert bool((loop.learn == 1).all())
+        assert bool((loop.weight == 1).all())
         built.append(env.state_dict())
     plain, scaled = built
     layout = env.goal_slice

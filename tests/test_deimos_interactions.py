@@ -206,7 +206,7 @@ def test_interaction_straddles_rollouts(torch_device):
     for _ in range(7):
         for t in range(rollout.num_steps):
             step = env.step(torch.zeros(2, 3, device=torch_device))
-            rollout.record(t, step, loop.learn)
+            rollout.record(t, step, loop.weight)
             loop.advance(step)
         loop.selector.learn(loop.interactions, rollout)
         found.append(loop.interactions.resolved())

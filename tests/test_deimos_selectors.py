@@ -473,7 +473,7 @@ def test_it_chooses_goals_for_robots(robots, name):
     for t in range(rollout.num_steps):
         rollout.obs[t] = robots.obs
         step = robots.step(torch.zeros(robots.num_envs, robots.action_dim))
-        rollout.record(t, step, loop.learn)
+        rollout.record(t, step, loop.weight)
         loop.advance(step)
     rollout.obs[-1] = robots.obs
     row = selector.learn(loop.interactions, rollout)
