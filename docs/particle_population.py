@@ -131,6 +131,16 @@ def print_tables(root: Path) -> None:
           f"Difference in crashes per interaction: median {np.median(gap):.4f} {interval(gap)}.")  # fmt: skip
 
 
+def write_rows(root: Path, audits: list[list[dict]]) -> None:
+    """Keep what the tables are made of in ``population.json``."""
+    names = [f"{variant}-{method}-s{seed}" for variant, method in CELLS for seed in SEEDS]
+    evaluations = [
+        {"run": name} | row for name in names for row in json.loads((root / name / "evaluation.json").read_text())
+    ]
+    rows = {"evaluations": evaluations, "audits": [row for found in audits for row in found]}
+    (root / "population.json").write_text(json.dumps(rows, indent=1) + "\n")
+
+
 def main() -> None:
     """See the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -151,6 +161,7 @@ def main() -> None:
         list(pool.map(lambda job: cell(*job), jobs))
         audits = list(pool.map(lambda seed: audit(options.root, seed), SEEDS)) if options.audit else []
     print_tables(options.root)
+    write_rows(options.root, audits)
     if audits:
         print("\n| seed | parallel steps | contexts | crash share | AUROC within contexts | 95 % interval |")
         print("|---|---|---|---|---|---|")
