@@ -11,7 +11,7 @@ from deimos.ppo import value_gradient
 from deimos.products import activate_, multiply_by_slope_, on_threads, onednn
 
 
-class Critics(Protocol):
+class StackKernels(Protocol):
     """What computes values and gradients of a stack in the place of batched products."""
 
     def values(self, x: Tensor) -> Tensor:
@@ -36,7 +36,7 @@ class Stack:
         fuse: Gives kernels for a stack, or ``None`` where it has none for this one; see ``selector.Spaces``.
     """
 
-    def __init__(self, nets: list[nn.Sequential], fuse: "Callable[[Stack], Critics | None] | None" = None) -> None:
+    def __init__(self, nets: list[nn.Sequential], fuse: "Callable[[Stack], StackKernels | None] | None" = None) -> None:
         self.nets = nets
         linears = [[layer for layer in net if isinstance(layer, nn.Linear)] for net in nets]
         tensors = [[tensor for layer in own for tensor in (layer.weight, layer.bias)] for own in linears]

@@ -233,7 +233,7 @@ def train_adversary(
 
     Returns:
         The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``,
-        ``adversary_auroc`` (under uniform goals, on every fifth world, which it did not learn from) and
+        ``adversary_auroc`` (on every fifth world, which it did not learn from; NaN where they hold no pair to rank) and
         ``weak_adversary``: whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
     """
     fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed, fuse)
@@ -255,20 +255,33 @@ def train_adversary(
     data = _whole(loop.interactions)
     fear.fit(_training_part(data))
     fear.check()
-    # Among goals of both kinds, to tell which are its own would tell much of what crashes.
-    held_out = data.where((data.env % HELD_OUT == 0) & data.probe)
-    quality = math.nan
-    if fear.fitted and len(held_out):
-        logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
-        quality = auroc(logits, held_out.crashed)
+    quality = _quality(fear, data.where(data.env % HELD_OUT == 0))
     crashes = int(data.crashed.sum())
     return fear, {
         "adversary_steps": t,
         "adversary_interactions": len(data),
         "adversary_crashes": crashes,
         "adversary_auroc": quality,
-        "weak_adversary": crashes < WEAK_CRASHES or not quality >= WEAK_AUROC,
+        "weak_adversary": not fear.fitted or crashes < WEAK_CRASHES or quality < WEAK_AUROC,
     }
+
+
+def _quality(fear: Fear, held_out: Resolved) -> float:
+    """How often the network ranks a crash above a survival under a goal of the same kind, its own or a uniform one.
+
+    Between the kinds, to tell which goals are its own would tell much of what crashes.
+    """
+    if not fear.fitted or not len(held_out):
+        return math.nan
+    logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
+    ranked = pairs = 0.0
+    for kind in (held_out.probe, ~held_out.probe):
+        crashed = held_out.crashed[kind]
+        count = float(crashed.sum() * (~crashed).sum())
+        if count:
+            ranked += count * auroc(logits[kind], crashed)
+            pairs += count
+    return ranked / pairs if pairs else math.nan
 
 
 def _enough(config: EvalConfig, interactions: int, crashes: int, steps: int) -> bool:

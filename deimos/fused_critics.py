@@ -9,8 +9,9 @@ import warp as wp
 from torch import Tensor, nn
 
 from deimos.ensemble import Stack
-from kernels.critics import Critics, Layout, gradients, values
+from kernels.critics import CriticTables, Layout, gradients, values
 
+LARGE = 2**18  # values that a call may ask for whose memory is kept until the next one
 _Copies = list[tuple[Tensor, Tensor]]  # destination and source
 
 
@@ -31,7 +32,7 @@ class FusedCritics:
         self._table = torch.zeros(count, layout.rows, layout.width)
         self._gradient = torch.zeros_like(self._table)
         self._loads, self._stores = _views(stack, layout, self._table, self._gradient)
-        self._critics = Critics(layout, wp.from_torch(self._table), wp.from_torch(self._gradient))
+        self._critics = CriticTables(layout, wp.from_torch(self._table), wp.from_torch(self._gradient))
         self._others = max(1, min(stack.threads, count)) - 1
         """Threads beside the caller's."""
         self._pool = ThreadPoolExecutor(max(1, self._others))
@@ -49,6 +50,8 @@ class FusedCritics:
                 launch.set_param_by_name(name, array)
         _copy(self._loads)
         self._run(self._values)
+        if value.numel() > LARGE:
+            self._values.clear()  # launches keep what they worked on
         return value
 
     @torch.no_grad()
@@ -60,13 +63,14 @@ class FusedCritics:
         arrays = [wp.from_torch(tensor.contiguous()) for tensor in (x, before, target, weight, loss)]
         launches = self._record(partial(gradients, self._critics, *arrays, clip=clip, rows=range(1)))
 
-        def lesson(rows: range, _alive: list[wp.array] = arrays) -> Tensor:  # launches know no more than addresses
+        def lesson(rows: range) -> Tensor:
             for launch in launches:
                 launch.set_param_by_name("start", rows.start)
                 launch.set_param_by_name("stop", rows.stop)
             _copy(self._loads)
             self._run(launches)
             _copy(self._stores)
+            assert arrays  # alive, whether launches keep what they work on or no more than addresses
             return loss
 
         return lesson
@@ -82,7 +86,7 @@ class FusedCritics:
 
         def work() -> None:
             for launch in waiting:
-                launch.launch()  # without Python's lock
+                launch.launch()  # Python's lock is free meanwhile
 
         others = [self._pool.submit(work) for _ in range(self._others)]
         work()

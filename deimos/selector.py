@@ -13,7 +13,7 @@ from deimos.interactions import Interactions
 from deimos.rollout import Rollout
 
 if TYPE_CHECKING:  # it needs PPO, which needs this module
-    from deimos.ensemble import Critics, Stack
+    from deimos.ensemble import Stack, StackKernels
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Spaces:
     """Steps of the whole training; 0 where nobody knows."""
     fuse: Fuse | None = None
     """Who scores candidates in one kernel, where the worlds have kernels (``fused.fuse``); ``None`` for torch alone."""
-    fuse_critics: "Callable[[Stack], Critics | None] | None" = None
+    fuse_critics: "Callable[[Stack], StackKernels | None] | None" = None
     """Who has kernels for an ensemble (``fused_critics.fuse_critics``); ``None`` for torch alone."""
 
     def state_then_goal(self, obs: Tensor) -> Tensor:

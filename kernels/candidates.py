@@ -66,7 +66,7 @@ def _by_three(
 
 @wp.func
 def _relu(h: Any):
-    """max(h, 0), and NaN where h is: Warp's ``max`` would take NaN for 0, and a broken state for a safe one."""
+    """max(h, 0), and NaN where h is NaN or -inf: Warp's ``max`` would take it for 0, a broken state for a safe one."""
     return h - wp.min(h, type(h)())
 
 

@@ -70,19 +70,21 @@ class _Critics:
     start: wp.array[int]
     turned: wp.array[int]
     table: wp.array3d[_Floats]
-    weight: wp.array3d[float]
+    table_number: wp.array3d[float]
     scratch: wp.array3d[_Floats]
-    number: wp.array3d[float]
+    scratch_number: wp.array3d[float]
     eights: wp.array3d[_Eight]
     sixteens: wp.array3d[_Sixteen]
     gradient: wp.array3d[_Floats]
-    slope: wp.array3d[float]
+    gradient_number: wp.array3d[float]
 
 
 @wp.func
 def _relu(h: _Floats):
     """max(h, 0), and NaN where h is: Warp's ``max`` would take NaN for 0."""
-    return h - wp.min(h, _Floats())
+    for lane in range(WIDE):
+        h[lane] = wp.where(h[lane] <= 0.0, 0.0, h[lane])
+    return h
 
 
 @wp.func
@@ -154,7 +156,7 @@ def _forward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int):
     hidden = c.units.shape[0] - 1
     _forward_layer(c, k, 0, x, first, last)
     for layer in range(1, hidden):
-        _forward_layer(c, k, layer, c.number, (layer - 1) * _ROWS, layer * _ROWS - 1)
+        _forward_layer(c, k, layer, c.scratch_number, (layer - 1) * _ROWS, layer * _ROWS - 1)
     top = (hidden - 1) * _ROWS
     free = hidden * _ROWS  # until the way back
     out = c.start[hidden]
@@ -170,7 +172,7 @@ def _forward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int):
     value = _Floats()
     for r in range(_ROWS):
         s = c.eights[k, free + r, 0] + c.eights[k, free + r, 1]
-        value[r] = c.weight[k, out + 1, 0] + (((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7])))
+        value[r] = c.table_number[k, out + 1, 0] + (((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7])))
     return value
 
 
@@ -189,10 +191,10 @@ def _backward_output(c: _Critics, k: int, delta: _Floats):
             total += delta[r] * h
             c.scratch[k, below + r, g] = _where_active(h, delta[r] * w)
         c.gradient[k, out, g] = total
-    bias = c.slope[k, out + 1, 0]
+    bias = c.gradient_number[k, out + 1, 0]
     for r in range(_ROWS):
         bias += delta[r]
-    c.slope[k, out + 1, 0] = bias
+    c.gradient_number[k, out + 1, 0] = bias
 
 
 @wp.func
@@ -238,7 +240,7 @@ def _backward_layer(c: _Critics, k: int, layer: int, delta: int, to: int):
         row = (layer - 1) * _ROWS + 4 * quad
         for g in range(_groups(c.units[layer])):
             y0, y1, y2, y3 = _products(
-                c.number, k, delta + 4 * quad, delta + _ROWS - 1, n, c.table, c.turned[layer], g, _Floats()
+                c.scratch_number, k, delta + 4 * quad, delta + _ROWS - 1, n, c.table, c.turned[layer], g, _Floats()
             )
             c.scratch[k, to + 4 * quad, g] = _where_active(c.scratch[k, row, g], y0)
             c.scratch[k, to + 4 * quad + 1, g] = _where_active(c.scratch[k, row + 1, g], y1)
@@ -254,7 +256,7 @@ def _backward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int, 
     for step in range(1, hidden):
         layer = hidden - step
         delta_at = (hidden + (step - 1) % 2) * _ROWS  # the gradients of two layers take turns
-        _add_gradient(c, k, layer, c.number, (layer - 1) * _ROWS, layer * _ROWS - 1, delta_at)
+        _add_gradient(c, k, layer, c.scratch_number, (layer - 1) * _ROWS, layer * _ROWS - 1, delta_at)
         _backward_layer(c, k, layer, delta_at, (hidden + step % 2) * _ROWS)
     _add_gradient(c, k, 0, x, first, last, (hidden + (hidden - 1) % 2) * _ROWS)
 
@@ -268,7 +270,8 @@ def _clipped_loss(value: float, before: float, target: float, clip: float):
     plain = error * error
     bound = clipped * clipped
     flat = wp.abs(step) > clip and plain < bound
-    return wp.where(flat, bound, plain), wp.where(flat, 0.0, 2.0 * error)
+    # Where the value or the old one is not a number, the loss is none either.
+    return wp.where(plain >= bound, plain, bound + (plain - plain)), wp.where(flat, 0.0, 2.0 * error)
 
 
 @wp.kernel
@@ -299,17 +302,17 @@ def _gradients(
     x: wp.array3d[float],
     before: wp.array2d[float],
     target: wp.array2d[float],
-    share: wp.array2d[float],
+    weight: wp.array2d[float],
     clip: float,
     # Out
     loss: wp.array[float],
 ):
     k = member + wp.tid()
     total = float(0.0)
-    weights = float(0.0)
+    total_weight = float(0.0)
     for row in range(start, stop):
-        weights += share[k, row]
-    scale = 1.0 / wp.max(weights, 1.0)
+        total_weight += weight[k, row]
+    scale = 1.0 / wp.max(total_weight, 1.0)
     for row in range(c.gradient.shape[1]):
         for g in range(c.gradient.shape[2]):
             c.gradient[k, row, g] = _Floats()
@@ -320,19 +323,19 @@ def _gradients(
         for lane in range(wp.min(_ROWS, stop - first)):
             row = first + lane
             row_loss, slope = _clipped_loss(value[lane], before[k, row], target[k, row], clip)
-            total += row_loss * share[k, row] * scale
-            delta[lane] = slope * share[k, row] * scale
+            total += row_loss * weight[k, row] * scale
+            delta[lane] = slope * weight[k, row] * scale
         _backward(c, k, x, first, stop - 1, delta)
     loss[k] = total
 
 
-class Critics:
+class CriticTables:
     """The memory of K critics, for the launchers below. A critic is worked on by one launch at a time.
 
     Args:
         layout: Where weights lie.
         table: Weights, float32, shape (K, rows, width) of the layout; idle numbers are 0. It may change, not move.
-        gradient: Gradients of the weights, of the same shape. Numbers at idle places, and in the turned rows, stay 0.
+        gradient: Gradients of the weights, of the same shape. Written whole; idle numbers and turned rows mean nothing.
 
     Raises:
         ValueError: If an array has another shape or dtype, is not contiguous, or does not lie on a CPU.
@@ -350,11 +353,11 @@ class Critics:
         self.struct = _Critics()
         self.struct.units, self.struct.start = whole
         self.struct.turned = wp.array(layout.turned, dtype=int, device=table.device)
-        self.struct.table, self.struct.weight = _as_vectors(table), table
-        self.struct.scratch, self.struct.number = _as_vectors(scratch), scratch
+        self.struct.table, self.struct.table_number = _as_vectors(table), table
+        self.struct.scratch, self.struct.scratch_number = _as_vectors(scratch), scratch
         self.struct.eights = _as_vectors(scratch, _Eight)
         self.struct.sixteens = _as_vectors(scratch, _Sixteen)
-        self.struct.gradient, self.struct.slope = _as_vectors(gradient), gradient
+        self.struct.gradient, self.struct.gradient_number = _as_vectors(gradient), gradient
 
 
 def _as_vectors(array: wp.array, dtype: type = _Floats) -> wp.array:
@@ -366,7 +369,9 @@ def _as_vectors(array: wp.array, dtype: type = _Floats) -> wp.array:
     return wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
 
 
-def values(critics: Critics, x: wp.array, value: wp.array, *, members: range, record: bool = False) -> wp.Launch | None:
+def values(
+    critics: CriticTables, x: wp.array, value: wp.array, *, members: range, record: bool = False
+) -> wp.Launch | None:
     """The value of every row by some of the critics. Others may run at the same time, in another thread of Python.
 
     Args:
@@ -382,17 +387,19 @@ def values(critics: Critics, x: wp.array, value: wp.array, *, members: range, re
     require_axes("value", value, 2)
     rows = value.shape[1]
     _require_range("members", members, critics.count)
-    require("x", x, dtype=wp.float32, shape=(critics.count, rows, critics.layout.units[0]), like=critics.struct.weight)
-    require("value", value, dtype=wp.float32, shape=(critics.count, rows), like=critics.struct.weight)
+    require(
+        "x", x, dtype=wp.float32, shape=(critics.count, rows, critics.layout.units[0]), like=critics.struct.table_number
+    )
+    require("value", value, dtype=wp.float32, shape=(critics.count, rows), like=critics.struct.table_number)
     return _launch(_values, [critics.struct, members.start, x], value, members, record)
 
 
 def gradients(
-    critics: Critics,
+    critics: CriticTables,
     x: wp.array,
     before: wp.array,
     target: wp.array,
-    share: wp.array,
+    weight: wp.array,
     loss: wp.array,
     *,
     clip: float,
@@ -407,7 +414,7 @@ def gradients(
         x: Inputs, float32, shape (K, n, inputs).
         before: Values before the update, float32, shape (K, n).
         target: What they should be, float32, shape (K, n).
-        share: Weight of every row in the average, 0 or more, float32, shape (K, n).
+        weight: Weight of every row in the average, 0 or more, float32, shape (K, n).
         loss: Averages, float32, shape (K,). Written for ``members``.
         clip: How far a value may move, positive; infinite for the plain squared error.
         members: Consecutive critics.
@@ -420,15 +427,15 @@ def gradients(
     """
     require_axes("before", before, 2)
     shape = (critics.count, before.shape[1])
-    require("x", x, dtype=wp.float32, shape=(*shape, critics.layout.units[0]), like=critics.struct.weight)
-    for name, array in (("before", before), ("target", target), ("share", share)):
-        require(name, array, dtype=wp.float32, shape=shape, like=critics.struct.weight)
-    require("loss", loss, dtype=wp.float32, shape=shape[:1], like=critics.struct.weight)
+    require("x", x, dtype=wp.float32, shape=(*shape, critics.layout.units[0]), like=critics.struct.table_number)
+    for name, array in (("before", before), ("target", target), ("weight", weight)):
+        require(name, array, dtype=wp.float32, shape=shape, like=critics.struct.table_number)
+    require("loss", loss, dtype=wp.float32, shape=shape[:1], like=critics.struct.table_number)
     _require_range("members", members, critics.count)
     _require_range("rows", rows, shape[1])
     if not clip > 0:
         raise ValueError(f"clip must be positive, got {clip}.")
-    inputs = [critics.struct, members.start, rows.start, rows.stop, x, before, target, share, float(clip)]
+    inputs = [critics.struct, members.start, rows.start, rows.stop, x, before, target, weight, float(clip)]
     return _launch(_gradients, inputs, loss, members, record)
 
 

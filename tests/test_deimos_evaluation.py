@@ -1,6 +1,7 @@
 """The judgement of policies: what is counted, the score, and the Adversary."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,9 +9,10 @@ import torch
 from deimos.audit import CANDIDATES, _next_contexts, audit_fear
 from deimos.checks import SimulationError
 from deimos.envs import particle
-from deimos.evaluation import EvalConfig, evaluate, play, train_adversary, weights_hash
-from deimos.fear import FearConfig, auroc
+from deimos.evaluation import EvalConfig, _Collector, _quality, evaluate, play, train_adversary, weights_hash
+from deimos.fear import Fear, FearConfig, auroc
 from deimos.goal_loop import GoalLoop, spaces
+from deimos.interactions import Resolved
 from deimos.networks import mlp
 from deimos.oracle import Clones
 from deimos.run_folder import RunError
@@ -126,6 +128,49 @@ def test_the_adversary_finds_what_crashes_a_policy():
     naive_row, attacked = rows
     assert attacked["adversary_auroc"] > 0.8
     assert attacked["crash_rate"] > 1.3 * naive_row["crash_rate"] > 0
+
+
+def held_out(probe, crashed):
+    """Interactions of which only the kind of the goal and the outcome are known; states hold the kind."""
+    probe, crashed = torch.tensor(probe), torch.tensor(crashed)
+    nothing = torch.zeros(len(probe))
+    return Resolved(
+        env=nothing.long(), state=torch.stack([probe.float(), crashed.float()], dim=1), goal=nothing.unsqueeze(1),
+        next_goal=nothing.unsqueeze(1), score=nothing, reward=nothing, tracking=nothing, probe=probe,
+        note=nothing.long(), crashed=crashed, issued=nothing.long(), resolved=nothing.long(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("column", "probe", "crashed", "expected"),
+    [
+        (0, [True] * 6 + [False] * 6, [True] + [False] * 5 + [True] * 5 + [False], 0.5),  # it knows the kind alone
+        (1, [True] * 6 + [False] * 6, [True] + [False] * 5 + [True] * 5 + [False], 1.0),
+        (1, [True] * 6 + [False] * 6, [False] * 9 + [True] * 3, 1.0),  # only its own goals crash the policy
+        (1, [True] * 6 + [False] * 6, [False] * 6 + [True] * 6, math.nan),  # no kind has both outcomes
+        (1, [True] * 6, [False] * 6, math.nan),
+    ],
+)
+def test_the_adversary_is_judged_within_each_kind_of_goals(column, probe, crashed, expected):
+    """To know which goals are its own is worth nothing, and where one kind never crashes the other one counts."""
+    network = SimpleNamespace(fitted=True, score=lambda state, goal, candidates: state[:, column : column + 1])
+    assert _quality(network, held_out(probe, crashed)) == pytest.approx(expected, nan_ok=True)
+    assert math.isnan(_quality(SimpleNamespace(fitted=False), held_out(probe, crashed)))
+
+
+def test_the_adversarys_uniform_goals_are_marked():
+    """While it collects, about half of its goals are Uniform's, and these are the ones that are marked as probes."""
+    env = particle.Config().build(400, CPU, 0)
+    fear = Fear(FearConfig(), env.state_dim, env.goal_dim, CPU, 0)
+    fear.fitted = True
+    collector, rows = _Collector(env, fear), torch.arange(400)
+    candidates, draws = env.sample_goals(rows, collector.num_candidates).clone(), env.draw(rows)
+    arguments = (rows, env.state(env.obs), env.goal, candidates, draws)
+    proposal, free = collector.propose(*arguments), naive(env).propose(*arguments)
+    same = (proposal.goal == free.goal).all(1)
+    assert bool(same[proposal.probe].all())
+    assert same[~proposal.probe].float().mean() < 0.1  # one of a hundred candidates, by chance
+    assert abs(proposal.probe.sum().item() - 200) < 4 * 10
 
 
 def test_collecting_goes_on_until_there_is_enough():

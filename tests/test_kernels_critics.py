@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.critics import Critics, Layout, gradients, values
+from kernels.critics import CriticTables, Layout, gradients, values
 from kernels.lanes import WIDE
 
 COUNT = 3
@@ -62,7 +62,7 @@ def critics(units, nets):
     layout = Layout(units)
     table = wp.array(tables(layout, nets), dtype=float, device="cpu")
     gradient = wp.full(table.shape, np.nan, dtype=float, device="cpu")
-    return Critics(layout, table, gradient), table, gradient
+    return CriticTables(layout, table, gradient), table, gradient
 
 
 def arrays(rows, inputs, seed=1):
@@ -70,7 +70,7 @@ def arrays(rows, inputs, seed=1):
     rng = np.random.default_rng(seed)
     numbers = {name: rng.standard_normal((COUNT, rows)) for name in ("before", "target")}
     share = (rng.random((COUNT, rows)) < 0.9).astype(float)
-    return {"x": rng.standard_normal((COUNT, rows, inputs)), **numbers, "share": share}
+    return {"x": rng.standard_normal((COUNT, rows, inputs)), **numbers, "weight": share}
 
 
 def on_cpu(numbers):
@@ -123,12 +123,37 @@ def test_rows_of_no_share_teach_nothing():
     numbers, loss = arrays(10, 4), wp.full(COUNT, np.nan, dtype=float, device="cpu")
     halves = []
     for share in (0.0, 0.01, 0.02):
-        numbers["share"][:] = share
+        numbers["weight"][:] = share
         gradients(memory, **on_cpu(numbers), loss=loss, clip=0.2, members=range(COUNT), rows=range(10))
         halves.append(gradient.numpy().copy())
     assert not halves[0].any()
     assert halves[1].any()
     np.testing.assert_allclose(2.0 * halves[1], halves[2], rtol=1e-5)
+
+
+def test_a_unit_that_is_infinitely_silent_is_silent():
+    """ReLU makes 0 of minus infinity, as torch's does."""
+    units = (4, 9)
+    nets = network(units)
+    for net in nets:
+        net[0][1][2] = -np.inf
+    memory, _, _ = critics(units, nets)
+    x, value = arrays(5, 4)["x"], wp.zeros((COUNT, 5), dtype=float, device="cpu")
+    values(memory, wp.array(x, dtype=float, device="cpu"), value, members=range(COUNT))
+    expected = np.stack([forward(net, own)[1] for net, own in zip(nets, x, strict=True)])
+    np.testing.assert_allclose(value.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_an_old_value_that_is_not_a_number_breaks_the_loss():
+    """It shows in the loss, as it does in ``ppo.value_gradient``, though no gradient comes of it."""
+    units = (4, 9)
+    memory, _, gradient = critics(units, network(units))
+    numbers, loss = arrays(5, 4), wp.zeros(COUNT, dtype=float, device="cpu")
+    numbers["weight"][:] = 1.0
+    numbers["before"][1, 2] = np.nan
+    gradients(memory, **on_cpu(numbers), loss=loss, clip=0.2, members=range(COUNT), rows=range(5))
+    np.testing.assert_array_equal(np.isnan(loss.numpy()), [False, True, False])
+    assert np.isfinite(gradient.numpy()).all()
 
 
 @pytest.mark.parametrize("place", ["x", "table"])
@@ -145,7 +170,7 @@ def test_what_is_not_a_number_stays_so(place):
         table.assign(broken)
     value, loss = wp.zeros((COUNT, 5), dtype=float, device="cpu"), wp.zeros(COUNT, dtype=float, device="cpu")
     values(memory, on_cpu(numbers)["x"], value, members=range(COUNT))
-    numbers["share"][:] = 1.0
+    numbers["weight"][:] = 1.0
     gradients(memory, **on_cpu(numbers), loss=loss, clip=0.2, members=range(COUNT), rows=range(5))
     assert np.isnan(value.numpy()[1, 2])
     assert np.isnan(loss.numpy()[1])
@@ -177,7 +202,7 @@ def test_replays_and_shared_inputs():
         ("x", wp.zeros((COUNT, 10, 5), dtype=float, device="cpu"), "x must be float32"),
         ("before", wp.zeros(10, dtype=float, device="cpu"), "before must have 2 axes"),
         ("target", wp.zeros((COUNT, 10), dtype=int, device="cpu"), "target must be float32"),
-        ("share", wp.zeros((COUNT, 9), dtype=float, device="cpu"), "share must be float32"),
+        ("weight", wp.zeros((COUNT, 9), dtype=float, device="cpu"), "weight must be float32"),
         ("loss", wp.zeros(1, dtype=float, device="cpu"), "loss must be float32"),
         ("rows", range(4, 11), "rows must be one or more of 10"),
         ("rows", range(4, 4), "rows must be one or more of 10"),
@@ -200,9 +225,9 @@ def test_bad_tables():
     layout = Layout((4, 9))
     table = wp.zeros((COUNT, layout.rows, layout.width), dtype=float, device="cpu")
     with pytest.raises(ValueError, match="table must be float32"):
-        Critics(Layout((5, 9)), table, table)
+        CriticTables(Layout((5, 9)), table, table)
     with pytest.raises(ValueError, match="gradient must be float32"):
-        Critics(layout, table, table[:2])
+        CriticTables(layout, table, table[:2])
     every_second = wp.zeros((2 * COUNT, layout.rows, layout.width), dtype=float, device="cpu")[::2]
     with pytest.raises(ValueError, match="contiguous"):
-        Critics(layout, every_second, table)
+        CriticTables(layout, every_second, table)

@@ -23,6 +23,8 @@ from deimos.rollout import Rollout
 from deimos.seeds import generator, restore, weights_from
 from deimos.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
 
+WORKSPACE = 2**24  # numbers that the inputs of the candidates of decisions made at once may take
+
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
@@ -104,9 +106,13 @@ class VDS(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
-        context = state.unsqueeze(1).expand(-1, candidates.shape[1], -1)
-        values = self.stack.values(torch.cat([context, candidates], dim=2).flatten(0, 1))
-        score = deviation(values).view(candidates.shape[:2])
+        count = candidates.shape[1]
+        at_once = max(1, WORKSPACE // (count * (state.shape[1] + candidates.shape[2])))
+        values = []
+        for context, options in zip(state.split(at_once), candidates.split(at_once), strict=True):
+            inputs = torch.cat([context.unsqueeze(1).expand(-1, count, -1), options], dim=2)
+            values.append(self.stack.values(inputs.flatten(0, 1)))
+        score = deviation(torch.cat(values, dim=1)).view(-1, count)
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
 
@@ -181,17 +187,23 @@ class VDS(GoalSelector):
         return self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
 
     def _fit(self, rollout: Rollout, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
-        """Adam on the clipped value loss; returns its mean over critics and minibatches."""
+        """Adam on the clipped value loss; returns its mean over critics and minibatches.
+
+        As PPO, it learns nothing, and gives NaN, where fewer transitions count than a minibatch has.
+        """
         rows = rollout.num_steps * worlds.shape[1]
         minibatches = min(self.config.minibatches, rows)
         size = rows // minibatches
         order = torch.stack([torch.randperm(rows, generator=self.generator, device=old.device) for _ in worlds])
         steps = torch.arange(rollout.num_steps, device=order.device) * rollout.obs.shape[1]
         place = (steps.unsqueeze(1) + worlds.unsqueeze(1)).flatten(1).gather(1, order)  # in the flat rollout
+        weight = rollout.weight.take(place)
+        if bool(mean_over_ranks(weight.sum(1).min()) < size):
+            return float("nan")
         obs = self._spaces.state_then_goal(rollout.obs[:-1]).flatten(0, 1)
         lesson = self.stack.gradients(
             obs.index_select(0, place.flatten()).view(*order.shape, -1), old.flatten(1).gather(1, order),
-            returns.flatten(1).gather(1, order), rollout.weight.take(place), self.config.clip,
+            returns.flatten(1).gather(1, order), weight, self.config.clip,
         )  # fmt: skip
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
