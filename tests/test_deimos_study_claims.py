@@ -284,6 +284,18 @@ def test_policies_are_the_unit_of_nearly_no_crashes():
     assert found.detectable(0.05) == pytest.approx(0.8 ** (1 / 5))  # all five must be below it
 
 
+@pytest.mark.parametrize(("worlds", "tested"), [(200, False), (690, False), (700, True), (1500, True)])
+def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, tested):
+    """Where a policy at the limit is most probably without a crash, C11 has no data; else those without one count."""
+    rows, lines = population(4, ["relative"], methods=["vds"])
+    for row in rows:
+        row |= {"crashes": row["seed"] % 2, "worlds": worlds, "steps": 1000}  # 1 is below 1.5, and yet too many
+    outcome = claims.test(BY_ID["C11"], Data(rows, lines))
+    assert [each.finding.interval.estimate for each in outcome.judged] == [0.5] * tested
+    assert outcome.missing == (() if tested else ("relative",))
+    assert (outcome.verdict == "not testable") != tested
+
+
 def test_mean_ranks_are_of_whole_policies():
     """Ranks are meaned over the evaluations that all methods have; a policy that lacks one of them does not count."""
     rows, lines = population(4, ["relative"], methods=["rnd", "vds"])
@@ -312,6 +324,26 @@ def test_vertex_of_a_known_parabola():
     assert slopes[1] == pytest.approx(50 * 0.004 * (99.5 - 62))
     assert claim_custom.ACHIEVED["p25"] == 62.5
     assert claim_custom.ACHIEVED["p90"] == 95.0
+
+
+@pytest.mark.parametrize(("shape", "p_for", "p_against", "verdict"), [
+    (lambda x: x**2, 2 / 1001, 1.0, "supported"),  # falls, then rises, in each of 1000 resamples
+    (lambda x: -(x**2), 1.0, 4 / 1001, "contradicted"),  # twice as much: either end would contradict
+    (lambda x: x, 1.0, 4 / 1001, "contradicted"),
+    (lambda x: -x, 1.0, 4 / 1001, "contradicted"),
+], ids=["hump", "upside down", "rising", "falling"])  # fmt: skip
+def test_lowest_point_is_inside_a_planted_hump_only(monkeypatch, shape, p_for, p_against, verdict):
+    """Populations on a curve give the p-values of slopes that have their sign in every resample."""
+    monkeypatch.setattr(stats, "RESAMPLES", 1000)
+    place = {name: (x - 50) / 50 for name, x in claim_custom.ACHIEVED.items()}
+
+    def level(environment, method, goals, period):
+        return 8.0 + 2.0 * shape(place.get(method, 0.0))
+
+    data = Data(*population(4, ["directional"], level, 0.01))
+    inside = [f for f in claim_custom.hump(data, "directional") if f.what == "the lowest point lies inside"]
+    assert [(f.p_for, f.p_against) for f in inside] == [(pytest.approx(p_for), pytest.approx(p_against))] * 2
+    assert claims.test(BY_ID["C25"], data).verdict == verdict
 
 
 def test_eta_squared_is_the_anova_share():

@@ -70,13 +70,19 @@ def highest_reward(goals: str, method: str) -> Findings:
 
 
 def nearly_none(data: Data, environment: str) -> list[Finding]:
-    """Most of a method's policies crash less than once in 10^6 steps: sign test, policy by policy."""
+    """Most of a method's policies crash less than once in 10^6 steps: sign test, policy by policy.
+
+    A policy counts where at most half of the evaluations of a policy at that limit have as few crashes, by Poisson's
+    distribution. Where more than half of them have none, the evaluation is too short: nothing is tested.
+    """
     found = []
     for where in data.places(environment, "naive"):
         for method in data.methods(environment):
             crashes, steps, worlds = (data.sample(where, method, name) for name in ("crashes", "steps", "worlds"))
-            what = f"{method}: most policies crash less than once in 10^6 steps"
-            found += tests.mostly(what, where, crashes < NEARLY_NONE * steps * worlds)
+            at_limit = scipy_stats.poisson(NEARLY_NONE * steps * worlds)
+            if (at_limit.pmf(0) <= 0.5).all():
+                what = f"{method}: most policies crash less than once in 10^6 steps"
+                found += tests.mostly(what, where, at_limit.cdf(crashes) <= 0.5)
     return found
 
 

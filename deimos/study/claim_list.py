@@ -157,7 +157,8 @@ CLAIMS: tuple[Claim, ...] = (
     Claim("C11", "Relative: some methods reach about 0 crashes.", ("relative",),
         "sign test for each method: most of its policies crash less than once in 10^6 steps", custom.nearly_none,
         combine="any",
-        note=_REPLACED,
+        note=f"{_REPLACED} An evaluation of fewer than 0.7 x 10^6 steps (the logarithm of 2) is too short for it: more "
+        "than half of those of a policy at the limit are without a crash.",
         planned=10),
     Claim("C12", "Relative: safe policies crash more under the Adversary than under Naive, unsafe ones less.",
         ("relative",), "signed ranks in the safer half and in the least safe quarter of all policies",
