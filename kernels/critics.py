@@ -2,8 +2,8 @@
 
 A critic is a multilayer perceptron of ReLU with one output. Products of a library write every layer of every critic to
 memory and read it back for ReLU, its slope and the next product; here blocks of rows pass forwards and backwards
-through all layers within a core's caches (10 critics of 11, 64, 64 and 1 units, one core of Zen 5: 180 GFLOP/s in
-all; batched products by oneDNN 90). A GPU's libraries want large products: there ``deimos.ensemble`` leaves it to them.
+through all layers within a core's caches (10 critics of 11, 64, 64 and 1 units, one core of Zen 5: 195 GFLOP/s in
+all; batched products by oneDNN 93). A GPU's libraries want large products: there ``deimos.ensemble`` leaves it to them.
 
 Weights lie in a table of rows of ``WIDE`` or more lanes, one table per critic; units beyond a layer's lie idle, as 0.
 For each hidden layer: a row for every input, with its weights to all units, and a row of biases. For the output: a row

@@ -12,9 +12,9 @@ OPTIONS = {
     "enable_backward": False,
     "cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast -funroll-loops -mllvm=-slp-recursion-max-depth=12",
 }
-"""Options for modules of such kernels. On a CPU a product and a sum become one instruction, as CUDA has it anyway: Warp's
-operators are functions of their own, across which Clang keeps them apart unless told so. Unrolled loops, and LLVM's own
-depth of the search for vectors, which Warp cuts to 4 for the sake of compile time, save ``critics`` another 3 %."""
+"""Options for modules of such kernels. On a CPU a product and a sum become one instruction, as CUDA has it anyway:
+Warp's operators are functions of their own, across which Clang keeps them apart unless told so. Unrolled loops, and
+LLVM's own depth of the search for vectors, which Warp cuts to 4 to compile faster, save ``critics`` another 3 %."""
 
 WIDE = 64  # what LLVM makes the best code of; with 16 or 32 some kernels take five times as long (Zen 5, AVX-512)
 
