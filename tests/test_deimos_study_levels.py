@@ -97,11 +97,9 @@ def test_best_method_far_ahead_is_found(monkeypatch, claim, populations):
 
 @pytest.mark.parametrize(("sd", "worlds"), [(1.0, 2000), (0.0, 2000), (0.0, 505)])
 def test_policies_at_the_limit_do_not_support_few_crashes(monkeypatch, sd, worlds):
-    """Where half of every method's policies have a crash in 10^6 steps or more, C11 is supported in at most 5 %.
-
-    Crashes are Poisson. In the shortest evaluation a policy at the limit is expected to crash 1.01 times, so with one
-    crash it would be below that more often than not.
-    """
+    """Where half of every method's policies have a crash in 10^6 steps or more, C11 is supported in at most 5 %."""
+    # Crashes are Poisson. In the shortest evaluation a policy at the limit is expected to crash 1.01 times, so with one
+    # crash it would be below that more often than not.
     limit = worlds * STEPS * NEARLY_NONE
     study = {"environment": "relative", "goals": ("naive",), "counted": True, "worlds": worlds, "sd": sd}
     assert rates(monkeypatch, BY_ID["C11"], ["supported"], at=math.log1p(limit), **study)[0] <= MOST
