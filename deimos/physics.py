@@ -125,15 +125,7 @@ class Physics:
             plain.delete(geom)
         model = plain.compile()
 
-        contacts, pairs, rows = _largest_demand(model, plane=terrain is None)
-        # Room costs time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's
-        # 120 rows a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown
-        # about by their own legs 93.
-        contact_share, row_share = (1 / 2, 1.0) if terrain is None else (1 / 4, 4 / 5)
-        # A few worlds alone may need all of the contacts at once.
-        shared = num_envs * max(pairs, math.ceil(contact_share * contacts)) + min(num_envs, 16) * contacts
-        self.max_contacts = config.contacts * num_envs or shared
-        self.max_rows = config.rows or math.ceil(row_share * rows)
+        self.max_contacts, self.max_rows = _room(model, num_envs, config, plane=terrain is None)
         batched: dict[str, int] = {}
         if friction is not None:
             batched |= {"geom_friction": num_envs}
@@ -316,6 +308,20 @@ def _dress(spec: "mujoco.MjSpec", ground: "mujoco.MjsGeom") -> None:
     material = spec.add_material(name="ground", texuniform=True, texrepeat=(1.0, 1.0))
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "squares"
     ground.material = "ground"
+
+
+def _room(model: "mujoco.MjModel", num_envs: int, config: PhysicsConfig, *, plane: bool) -> tuple[int, int]:
+    """Room for contacts in all worlds, and for constraint rows in each.
+
+    Room costs time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 120 rows
+    a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown about by their
+    own legs 93.
+    """
+    contacts, pairs, rows = _largest_demand(model, plane=plane)
+    contact_share, row_share = (1 / 2, 1.0) if plane else (1 / 4, 4 / 5)
+    # A few worlds alone may need all of the contacts at once.
+    shared = num_envs * max(pairs, math.ceil(contact_share * contacts)) + min(num_envs, 16) * contacts
+    return config.contacts * num_envs or shared, config.rows or math.ceil(row_share * rows)
 
 
 def _largest_demand(model: "mujoco.MjModel", *, plane: bool) -> tuple[int, int, int]:

@@ -106,7 +106,7 @@ def _import_mujoco() -> None:
         os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         import mujoco  # noqa: F401
-    except Exception as error:  # each of its back ends has its own
+    except Exception as error:  # ImportError, AttributeError (PyOpenGL without a library), RuntimeError, OSError
         raise _unrenderable(error) from error
 
 
@@ -151,7 +151,7 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
     model.vis.global_.offwidth, model.vis.global_.offheight = options.width, options.height
     try:
         renderer = mujoco.Renderer(model, options.height, options.width)
-    except Exception as error:  # likewise
+    except Exception as error:  # likewise, and MuJoCo's FatalError and PyOpenGL's GLError, which share no base
         raise _unrenderable(error) from error
     camera = mujoco.MjvCamera()
     camera.distance, camera.azimuth, camera.elevation = 1.8, 130.0, -18.0

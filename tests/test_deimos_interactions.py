@@ -375,19 +375,8 @@ def test_equals_a_plain_list(torch_device, goal_period, windows):
             issue(interactions, rows, rows.float() + now * n, torch_device)
 
         kept = [entry for entry in history if entry["resolved"] > now - window]
-        expected = sorted(
-            (
-                e["env"],
-                e["resolved"],
-                e["issued"],
-                e["crashed"],
-                e["reward"],
-                e["mark"],
-                e["mark"] + 0.25,
-                e["mark"] + 0.75,
-            )
-            for e in kept
-        )
+        names = ("env", "resolved", "issued", "crashed", "reward", "mark")
+        expected = sorted((*(e[name] for name in names), e["mark"] + 0.25, e["mark"] + 0.75) for e in kept)
         got = interactions.resolved()
         columns = (
             got.env, got.resolved, got.issued, got.crashed, got.reward, got.state[:, 0], got.goal[:, 1], got.score

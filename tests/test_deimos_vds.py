@@ -1,7 +1,9 @@
 """The ensemble of critics: against critics trained one by one, against PPO's own, and how it scores goals."""
 
 import copy
+import gc
 import math
+import weakref
 
 import pytest
 import torch
@@ -215,6 +217,24 @@ def test_what_a_member_computes_does_not_depend_on_the_threads():
         assert torch.equal(*[lesson(rows).clone() for lesson in lessons])
         assert torch.equal(*[stack.parameters.grad for stack in stacks])
         assert torch.equal(*[stack.values(data[0][:, start:]) for stack in stacks])
+
+
+def test_lessons_keep_what_they_learn_from():
+    """Nobody else needs to hold the data of a lesson: kernels know addresses, and those stay the data's."""
+    nets = [mlp(4, (8, 8), 1, "relu") for _ in range(2)]
+    plain, fused = Stack(copy.deepcopy(nets)), Stack(nets, fuse_critics)
+    x, targets = torch.randn(2, 50, 4), torch.randn(2, 50)
+    plain.gradients(x, targets, targets, torch.ones(2, 50), 0.2)(range(50))
+    data = [x.clone(), targets.clone(), targets.clone(), torch.ones(2, 50)]
+    alive = [weakref.ref(tensor) for tensor in data]
+    lesson = fused.gradients(*data, 0.2)
+    del data
+    gc.collect()
+    assert all(reference() is not None for reference in alive)
+    lesson(range(50))
+    torch.testing.assert_close(
+        [net[0].weight.grad for net in fused.nets], [net[0].weight.grad for net in plain.nets], rtol=1e-4, atol=1e-6
+    )
 
 
 def test_kernels_see_weights_that_changed():
