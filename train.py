@@ -2,7 +2,7 @@
 
 import sys
 
-from deimos.cli import train
+from deimos.app.cli import train
 
 if __name__ == "__main__":
     sys.exit(train())

@@ -2,6 +2,6 @@
 
 import sys
 
-from deimos.cli import main
+from deimos.app.cli import main
 
 sys.exit(main())

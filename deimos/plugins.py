@@ -1,7 +1,6 @@
-"""The file name is the registration: a module in ``deimos.envs`` or ``deimos.selectors`` *is* the plugin.
+"""The file name is the registration: a module in ``deimos.sim.envs`` or ``deimos.goals.selectors`` *is* the plugin.
 
-Packages outside this tree register a module through the entry-point group of the same name
-(``deimos.envs`` or ``deimos.selectors``).
+Packages outside this tree register a module through an entry-point group (``deimos.envs`` or ``deimos.selectors``).
 """
 
 import importlib
@@ -12,7 +11,11 @@ from types import ModuleType
 
 def names(package: ModuleType) -> list[str]:
     """Names of the plugins of ``package``, sorted: its public modules and the registered entry points."""
-    return sorted(_own(package) | set(entry_points(group=package.__name__).names))
+    return sorted(_own(package) | set(entry_points(group=_group(package)).names))
+
+
+def _group(package: ModuleType) -> str:
+    return "deimos." + package.__name__.rpartition(".")[2]
 
 
 def _own(package: ModuleType) -> set[str]:
@@ -29,4 +32,4 @@ def load(package: ModuleType, name: str) -> ModuleType:
         raise ValueError(f"{package.__name__} has no '{name}'; it has: {', '.join(names(package))}.")
     if name in _own(package):
         return importlib.import_module(f"{package.__name__}.{name}")
-    return next(iter(entry_points(group=package.__name__, name=name))).load()
+    return next(iter(entry_points(group=_group(package), name=name))).load()

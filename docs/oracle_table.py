@@ -16,16 +16,16 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from deimos import picks
-from deimos.env import Env
-from deimos.evaluation import EvalConfig, play, train_adversary
-from deimos.fear import Fear
-from deimos.goal_loop import spaces
-from deimos.oracle import Clones, Oracle
-from deimos.run_folder import RunFolder
-from deimos.selector import GoalSelector, Proposal, uniform_proposal
-from deimos.selectors import director
-from deimos.training import load, read_config
+from deimos.goals import picks
+from deimos.goals.fear import Fear
+from deimos.goals.selector import GoalSelector, Proposal, uniform_proposal
+from deimos.goals.selectors import director
+from deimos.run.evaluation import EvalConfig, play, train_adversary
+from deimos.run.folder import RunFolder
+from deimos.run.loop import spaces
+from deimos.run.oracle import Clones, Oracle
+from deimos.run.training import load, read_config
+from deimos.sim.env import Env
 
 WORLDS, STEPS = 200, 1000
 RULES = {"Uniform": ("percentile", 0.0), "p25": ("percentile", 25.0), "p75": ("percentile", 75.0)} | {

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos import training
-from deimos.presets import preset
-from deimos.run_folder import RunError
+from deimos.run import training
+from deimos.run.folder import RunError
+from deimos.run.presets import preset
 
 RESULTS = Path(__file__).parent / "results"
 ORIGINS = {"quad": RESULTS / "quad_flat", "quad-arm": RESULTS / "quad_arm_stand"}

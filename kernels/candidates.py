@@ -9,8 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from kernels.check import require, require_axes
-from kernels.lanes import FLOATS, OPTIONS, lanes, threads
+from .check import require, require_axes
+from .lanes import FLOATS, OPTIONS, lanes, threads
 
 wp.set_module_options(OPTIONS)
 

@@ -3,7 +3,7 @@
 A critic is a multilayer perceptron of ReLU with one output. Products of a library write every layer of every critic to
 memory and read it back for ReLU, its slope and the next product; here blocks of rows pass forwards and backwards
 through all layers within a core's caches (10 critics of 11, 64, 64 and 1 units, one core of Zen 5: 195 GFLOP/s in
-all; batched products by oneDNN 93). A GPU's libraries want large products: there ``deimos.ensemble`` leaves it to them.
+all; batched products by oneDNN 93). A GPU's libraries want large products: there ``nn.ensemble`` leaves it to them.
 
 Weights lie in a table of rows of ``WIDE`` or more lanes, one table per critic; units beyond a layer's lie idle, as 0.
 For each hidden layer: a row for every input, with its weights to all units, and a row of biases. For the output: a row
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from kernels.check import require, require_axes
-from kernels.lanes import FLOATS, OPTIONS, WIDE
+from .check import require, require_axes
+from .lanes import FLOATS, OPTIONS, WIDE
 
 wp.set_module_options(OPTIONS)
 
@@ -263,7 +263,7 @@ def _backward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int, 
 
 @wp.func
 def _clipped_loss(value: float, before: float, target: float, clip: float):
-    """The clipped value loss and its slope, as ``deimos.ppo.value_gradient`` has them."""
+    """The clipped value loss and its slope, as ``deimos.learn.ppo.value_gradient`` has them."""
     error = value - target
     step = value - before
     clipped = before + wp.clamp(step, -clip, clip) - target

@@ -4,9 +4,9 @@ from typing import Any
 
 import warp as wp
 
-from kernels.check import require, require_axes
-from kernels.lanes import WORDS, lanes, threads
-from kernels.random import Purpose, philox_lanes, unit
+from .check import require, require_axes
+from .lanes import WORDS, lanes, threads
+from .random import Purpose, philox_lanes, unit
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,10 +11,10 @@ from enum import IntEnum
 
 import warp as wp
 
-from kernels.check import require, require_axes
-from kernels.goals import count_events, goal_is_due, time_is_up
-from kernels.particle_rewards import shape_reward
-from kernels.random import Purpose, symmetric3, uniform4
+from .check import require, require_axes
+from .goals import count_events, goal_is_due, time_is_up
+from .particle_rewards import shape_reward
+from .random import Purpose, symmetric3, uniform4
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import warp as wp
 
-from kernels.check import require
-from kernels.lanes import WORDS
+from .check import require
+from .lanes import WORDS
 
 wp.set_module_options({"enable_backward": False})
 

@@ -9,7 +9,7 @@ to 0 x inf on their sides. Here a box of no width asks the same search tree, whi
 
 import warp as wp
 
-from kernels.check import require, require_axes
+from .check import require, require_axes
 
 wp.set_module_options({"enable_backward": False})
 

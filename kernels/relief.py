@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from kernels.check import require, require_axes
+from .check import require, require_axes
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,30 +7,31 @@ A shape builds a triangle mesh, a grid lays tiles of many shapes out, and the wh
     ground = terrain.build(terrain.read_grid("my.toml"))
 """
 
-from terrain.grid import Terrain, flat
-from terrain.presets import preset, read_grid
-from terrain.world import Grid, Share, build
+import importlib
+from typing import TYPE_CHECKING, Any
 
-load = Terrain.load
+if TYPE_CHECKING:
+    from .grid import Terrain as Terrain
+    from .grid import flat as flat
+    from .grid import load as load
+    from .presets import preset as preset
+    from .presets import read_grid as read_grid
+    from .presets import rough as rough
+    from .world import Grid as Grid
+    from .world import Share as Share
+    from .world import build as build
+
+_OFFERED = {
+    "Grid": "world", "Share": "world", "Terrain": "grid", "build": "world", "flat": "grid", "load": "grid",
+    "preset": "presets", "read_grid": "presets", "rough": "presets",
+}  # fmt: skip
+"""What the package offers, and the module that holds it."""
 
 __all__ = ["Grid", "Share", "Terrain", "build", "flat", "load", "preset", "read_grid", "rough"]
 
 
-def rough(
-    seed: int = 0, levels: int = 10, columns: int = 20, *, cell: float = 0.05, border: float = 5.0, device: str = "cpu"
-) -> Terrain:
-    """Legged Gym's grid of slopes, stairs and rectangles of rising difficulty, with steps that a Go1 can climb.
-
-    Args:
-        seed: Seed of all tiles, at least 0.
-        levels: Tiles along x, from the easiest to the hardest, at least 1.
-        columns: Tiles along y, at least 1.
-        cell: Distance of two samples of the height grid [m]; must divide the tile of 8 m and the border.
-        border: Width of the level border [m], at least 0.
-        device: Warp device that rasterises the mesh.
-
-    Raises:
-        ValueError: If an argument is out of its range, or the grid would not fit into memory.
-    """
-    grid = preset("go1", seed=seed, levels=levels, columns=columns, cell=cell, border=border)
-    return build(grid, device=device)
+def __getattr__(name: str) -> Any:
+    """Import what the package offers when it is first asked for, under one name also in ``python -m terrain``."""
+    if name not in _OFFERED:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"deimos.terrain.{_OFFERED[name]}"), name)

@@ -1,6 +1,6 @@
-"""``python -m terrain``."""
+"""``python -m terrain`` in a checkout, ``python -m deimos.terrain`` everywhere."""
 
-from terrain.cli import main
+from deimos.terrain.cli import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

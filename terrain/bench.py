@@ -16,11 +16,11 @@ from typing import Any
 
 import warp as wp
 
-from terrain import presets
-from terrain.checks import check_at_least
-from terrain.files import write_whole
-from terrain.heightfield import rasterise
-from terrain.world import build, build_mesh
+from . import presets
+from .checks import check_at_least
+from .files import write_whole
+from .heightfield import rasterise
+from .world import build, build_mesh
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, get_args, get_type_hints
 
-from terrain import shapes
-from terrain.shape import TileShape
+from . import shapes
+from .shape import TileShape
 
 
 def names() -> list[str]:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import tyro
 
-from terrain import catalog, console, export, presets
-from terrain.checks import check_range
-from terrain.grid import Terrain
-from terrain.mesh import highest_riser, steepest_slope
-from terrain.world import Grid, Share, build_with_mesh, require_memory
+from . import catalog, console, export, presets
+from .checks import check_range
+from .grid import Terrain
+from .mesh import highest_riser, steepest_slope
+from .world import Grid, Share, build_with_mesh, require_memory
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -178,7 +178,7 @@ def build_grid(arguments: list[str], program: str) -> None:
 
 def run_bench(arguments: list[str], program: str) -> None:
     """Measure."""
-    from terrain import bench
+    from . import bench
 
     options = console.parse(bench.BenchOptions, arguments, program)
     console.quiet_warp()
@@ -227,7 +227,7 @@ def _make(grid: Grid, outputs: Outputs, title: str) -> None:
         if outputs.mjcf is not None:
             jobs.append((outputs.mjcf, partial(export.save_mjcf, outputs.mjcf, terrain)))
         if outputs.preview is not None:
-            from terrain.preview import save_preview
+            from .preview import save_preview
 
             jobs.append((outputs.preview, partial(save_preview, outputs.preview, terrain, mesh, title)))
         for number, (path, job) in enumerate(jobs):

@@ -15,7 +15,7 @@ from typing import Any
 
 import tyro
 
-from terrain.world import Progress
+from .world import Progress
 
 
 class UsageError(Exception):

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrain.files import write_whole
-from terrain.grid import Terrain
+from .files import write_whole
+from .grid import Terrain
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

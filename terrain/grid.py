@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from terrain.checks import cells, check_positive
-from terrain.files import write_whole
+from .checks import cells, check_positive
+from .files import write_whole
 
 SCHEMA = 1  # of the file that ``Terrain.save`` writes
 
@@ -101,3 +101,6 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
         tile=size,
         difficulty=np.zeros(1, np.float32),
     )
+
+
+load = Terrain.load

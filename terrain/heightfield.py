@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
+from deimos.kernels.ray_cast import LARGEST, SNAP, cast_rays
 
-from kernels.ray_cast import LARGEST, SNAP, cast_rays
-from terrain.checks import check_positive
+from .checks import check_positive
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -27,7 +27,7 @@ def rasterise(
     """Height of the highest face above every sample of a grid, by exact ray casts.
 
     Vertices are moved to multiples of 1/4096 cell along x and y; then a ray misses no face, edge or corner
-    (see ``kernels.ray_cast``). A sample on a riser gets its upper edge: the upper tread keeps its whole depth,
+    (see ``deimos.kernels.ray_cast``). A sample on a riser gets its upper edge: the upper tread keeps its whole depth,
     and the riser is crossed within the first cell of the lower one.
 
     Args:

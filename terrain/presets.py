@@ -5,8 +5,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from terrain.catalog import convert, make
-from terrain.world import Grid, Share
+from .catalog import convert, make
+from .grid import Terrain
+from .world import Grid, Share, build
 
 Recipe = tuple[tuple[str, float, dict[str, Any]], ...]
 """Name, share and parameters of each shape."""
@@ -107,3 +108,23 @@ def _numbers(table: dict[str, Any]) -> dict[str, Any]:
 
 def _grid(recipe: Recipe, values: dict[str, Any]) -> Grid:
     return Grid(shapes=tuple(Share(shape=make(name, p), share=share) for name, share, p in recipe), **values)
+
+
+def rough(
+    seed: int = 0, levels: int = 10, columns: int = 20, *, cell: float = 0.05, border: float = 5.0, device: str = "cpu"
+) -> Terrain:
+    """Legged Gym's grid of slopes, stairs and rectangles of rising difficulty, with steps that a Go1 can climb.
+
+    Args:
+        seed: Seed of all tiles, at least 0.
+        levels: Tiles along x, from the easiest to the hardest, at least 1.
+        columns: Tiles along y, at least 1.
+        cell: Distance of two samples of the height grid [m]; must divide the tile of 8 m and the border.
+        border: Width of the level border [m], at least 0.
+        device: Warp device that rasterises the mesh.
+
+    Raises:
+        ValueError: If an argument is out of its range, or the grid would not fit into memory.
+    """
+    grid = preset("go1", seed=seed, levels=levels, columns=columns, cell=cell, border=border)
+    return build(grid, device=device)

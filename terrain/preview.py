@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from deimos.kernels.relief import draw_relief
 
-from kernels.relief import draw_relief
-from terrain.files import write_whole
-from terrain.grid import Terrain
-from terrain.mesh import from_quads, join
+from .files import write_whole
+from .grid import Terrain
+from .mesh import from_quads, join
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrain.checks import check_positive, check_range
+from .checks import check_positive, check_range
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

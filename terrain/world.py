@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from deimos.kernels.ray_cast import LARGEST
 
-from kernels.ray_cast import LARGEST
-from terrain import catalog
-from terrain.checks import cells, check_at_least, check_positive, check_range
-from terrain.grid import Terrain
-from terrain.heightfield import rasterise
-from terrain.mesh import from_quads, join
-from terrain.shape import TileShape
+from . import catalog
+from .checks import cells, check_at_least, check_positive, check_range
+from .grid import Terrain
+from .heightfield import rasterise
+from .mesh import from_quads, join
+from .shape import TileShape
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -5,7 +5,7 @@ import pytest
 import torch
 import warp as wp
 
-from deimos.shared import one_stream
+from deimos.sim.shared import one_stream
 
 wp.config.log_level = wp.LOG_WARNING
 torch.set_num_threads(1)

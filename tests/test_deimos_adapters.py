@@ -17,10 +17,10 @@ from rsl_rl.runners import OnPolicyRunner
 from deimos.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from deimos.adapters.rsl_rl import RslRlVecEnv
 from deimos.checks import SimulationError
-from deimos.envs import particle, quad
-from deimos.fear import FearConfig
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.selectors import director, uniform
+from deimos.goals.fear import FearConfig
+from deimos.goals.selectors import director, uniform
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.envs import particle, quad
 
 TIME_LIMIT = 12
 # Particles start anywhere in the cube and cross a tenth of it per step, so that some crash, some reach the
@@ -70,7 +70,7 @@ def rsl_rl_runner(env, num_steps=8):
 def test_adapters_are_optional():
     """Importing the package of adapters, or what they wrap, needs neither rsl_rl nor gymnasium."""
     code = (
-        "import sys, deimos.adapters, deimos.goal_loop, deimos.envs.particle; "
+        "import sys, deimos.adapters, deimos.run.loop, deimos.sim.envs.particle; "
         "assert not {'rsl_rl', 'gymnasium', 'tensordict'} & set(sys.modules)"
     )
     home = Path(__file__).resolve().parent.parent

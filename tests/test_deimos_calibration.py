@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from deimos.calibration import BINS, TEMPERATURES, Calibration, judge, reliability
-from deimos.fear import Fear, FearConfig
-from deimos.interactions import Resolved
+from deimos.goals.calibration import BINS, TEMPERATURES, Calibration, judge, reliability
+from deimos.goals.fear import Fear, FearConfig
+from deimos.goals.interactions import Resolved
 
 CPU = torch.device("cpu")
 

@@ -16,13 +16,14 @@ import pytest
 import torch
 
 import deimos
-from deimos import cli, training
-from deimos.config import from_dict
-from deimos.envs import particle
-from deimos.methods import METHODS
-from deimos.ppo import PPOConfig
-from deimos.run_folder import RunFolder
-from deimos.training import TrainConfig
+from deimos.app import cli
+from deimos.goals.methods import METHODS
+from deimos.learn.ppo import PPOConfig
+from deimos.run import training
+from deimos.run.config import from_dict
+from deimos.run.folder import RunFolder
+from deimos.run.training import TrainConfig
+from deimos.sim.envs import particle
 
 HOME = Path(deimos.__file__).resolve().parent.parent
 
@@ -344,7 +345,7 @@ def test_evaluation_of_a_run_without_policy_is_refused(copied, capfd):
 
 def test_broken_evaluation_is_refused_before_the_work(copied, capfd, monkeypatch):
     """An evaluation.json that cannot be added to is refused before anything is computed, and stays as it is."""
-    monkeypatch.setattr("deimos.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))
     (copied / "evaluation.json").write_text("{")
     assert "evaluation.json cannot be read" in refused(["evaluate", copied], capfd)
     assert (copied / "evaluation.json").read_text() == "{"
@@ -544,7 +545,7 @@ def test_interrupt_during_the_evaluation_is_one_line(copied, monkeypatch, capfd)
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("deimos.evaluation.evaluate", interrupt)
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", interrupt)
     before = contents(copied)
     assert cli.main(["evaluate", str(copied)]) == 130
     err = capfd.readouterr().err
@@ -563,7 +564,7 @@ def test_interrupt_at_the_last_iteration_skips_the_evaluation(here, monkeypatch,
         return row
 
     monkeypatch.setattr(training.Trainer, "iterate", interrupted)
-    monkeypatch.setattr("deimos.evaluation.evaluate", lambda *args: pytest.fail("evaluated"))
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated"))
     once = [argument if argument != "48" else "24" for argument in TINY]
     assert cli.main(["train", *once, "--out", "run"]) == 130
     assert "go on with --resume run" in capsys.readouterr().err

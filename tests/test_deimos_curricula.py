@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from deimos.env import Env, Step
-from deimos.envs import particle
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.interactions import Interactions
-from deimos.selector import Spaces
-from deimos.selectors import cl, grid
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import Spaces
+from deimos.goals.selectors import cl, grid
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import Env, Step
+from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
 GROUPS = (slice(0, 2), slice(2, 3))

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from deimos.kernels.particle import ParticleState
 
 from deimos.checks import SimulationError
-from deimos.env import Step
-from deimos.envs.particle import HALF_SIDE, Config
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.selectors import uniform
-from kernels.particle import ParticleState
+from deimos.goals.selectors import uniform
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import Step
+from deimos.sim.envs.particle import HALF_SIDE, Config
 
 STEP_FIELDS = [name for name in Step.__dataclass_fields__ if name != "tracking"]  # the reward says it
 VARIANTS = ["absolute", "directional", "relative"]

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from deimos.kernels.legged.height_scan import scan_points
+from deimos.kernels.legged.rewards import RewardWeights
+from deimos.kernels.legged.state import COLUMNS
+from deimos.kernels.random import Purpose
+from deimos.terrain import Grid, Share
+from deimos.terrain.shapes.stairs import Shape as Stairs
 
-import terrain
+from deimos import terrain
 from deimos.checks import SimulationError
-from deimos.env import Step
-from deimos.envs import quad_arm
-from deimos.envs.quad import Config
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.physics import PhysicsConfig
-from deimos.selectors import uniform
-from kernels.height_scan import scan_points
-from kernels.locomotion_rewards import RewardWeights
-from kernels.locomotion_state import COLUMNS
-from kernels.random import Purpose
-from terrain import Grid, Share
-from terrain.shapes.stairs import Shape as Stairs
+from deimos.goals.selectors import uniform
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import Step
+from deimos.sim.envs import quad_arm
+from deimos.sim.envs.quad import Config
+from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
 
 U = 2.0**-24
 POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)

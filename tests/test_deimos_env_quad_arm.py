@@ -8,16 +8,19 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from deimos.kernels.legged.arm_goals import SHELL_HIGH, SHELL_LOW
+from deimos.kernels.legged.arm_rewards import ARM_TERMS, ArmWeights
+from deimos.kernels.legged.state import COLUMNS
 
-from deimos import envs, locomotion, plugins, presets, warp_env
-from deimos.envs import particle, quad, quad_arm
-from deimos.envs.quad_arm import Config
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.robots import rx150
-from deimos.selectors import cl, director, uniform
-from kernels.arm_goals import SHELL_HIGH, SHELL_LOW
-from kernels.arm_rewards import ARM_TERMS, ArmWeights
-from kernels.locomotion_state import COLUMNS
+from deimos import plugins
+from deimos.goals.selectors import cl, director, uniform
+from deimos.run import presets
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim import envs, warp_env
+from deimos.sim.envs import particle, quad, quad_arm
+from deimos.sim.envs.quad_arm import Config
+from deimos.sim.legged import task as locomotion
+from deimos.sim.legged.robots import rx150
 
 MIDDLE, HALF = (np.array(SHELL_HIGH) + SHELL_LOW) / 2, (np.array(SHELL_HIGH) - SHELL_LOW) / 2
 SCALE = torch.tensor([2.0, 2.0, 0.25, 1.0, 1.0, 1.0])

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 
 from deimos.checks import SimulationError
-from deimos.fear import Fear, FearConfig, auroc
-from deimos.interactions import Resolved
+from deimos.goals.fear import Fear, FearConfig, auroc
+from deimos.goals.interactions import Resolved
 
 STATE_DIM, GOAL_DIM = 5, 2
 

@@ -6,8 +6,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from deimos import figures
-from deimos.run_folder import RunFolder
+from deimos.app import figures
+from deimos.run.folder import RunFolder
 
 
 def evaluated(score):

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from deimos import GoalDirector
-from deimos.envs import particle
-from deimos.fear import FearConfig
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.interactions import Resolved
-from deimos.selectors import director, learnability, mix, uniform
+from deimos.goals.fear import FearConfig
+from deimos.goals.interactions import Resolved
+from deimos.goals.selectors import director, learnability, mix, uniform
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
 N, PERIOD = 96, 5
@@ -198,7 +198,7 @@ def test_torch_is_all_that_it_imports():
     code = """
 import sys, torch
 from deimos import GoalDirector
-from deimos.selectors import director
+from deimos.goals.selectors import director
 goals = GoalDirector("p75", goal_period=2)
 no = torch.zeros(4, dtype=torch.bool)
 for _ in range(30):

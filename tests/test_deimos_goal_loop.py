@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from deimos.envs import particle, quad
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.selectors import cl, mix, schedule, uniform
+from deimos.goals.selectors import cl, mix, schedule, uniform
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.envs import particle, quad
 
 TASKS = {
     "particle": particle.Config(goal_period=20, stagger_goals=True, spawn_range=100.0),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from deimos.terrain import catalog
 
-import terrain
-from deimos.ground import add_height_field
-from terrain import catalog
+from deimos import terrain
+from deimos.sim.legged.height_field import add_height_field
 
 NAMES = tuple(catalog.names())
 RADIUS = 0.04  # [m]

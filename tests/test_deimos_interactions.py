@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from deimos.env import Step
-from deimos.envs import particle
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.interactions import Interactions, Resolved
-from deimos.rollout import Rollout
-from deimos.selectors import uniform
+from deimos.goals.interactions import Interactions, Resolved
+from deimos.goals.selectors import uniform
+from deimos.learn.rollout import Rollout
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import Step
+from deimos.sim.envs import particle
 
 STATE_DIM, GOAL_DIM = 4, 2
 

@@ -3,16 +3,16 @@
 import pytest
 import torch
 
-from deimos.audit import audit_calibration, audit_fear
-from deimos.envs import particle
-from deimos.evaluation import EvalConfig, evaluate, play
-from deimos.fear import Fear, FearConfig
-from deimos.goal_loop import GoalLoop
-from deimos.oracle import Clones, Oracle
-from deimos.ppo import PPOConfig
-from deimos.run_folder import RunError
-from deimos.selectors import director
-from deimos.training import TrainConfig, Trainer
+from deimos.goals.fear import Fear, FearConfig
+from deimos.goals.selectors import director
+from deimos.learn.ppo import PPOConfig
+from deimos.run.audit import audit_calibration, audit_fear
+from deimos.run.evaluation import EvalConfig, evaluate, play
+from deimos.run.folder import RunError
+from deimos.run.loop import GoalLoop
+from deimos.run.oracle import Clones, Oracle
+from deimos.run.training import TrainConfig, Trainer
+from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
 CONFIG = particle.Config(goal_period=20, max_speed=100.0, max_force=50.0)

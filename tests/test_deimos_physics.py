@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from deimos.terrain import Grid, Share, build
+from deimos.terrain.shapes.stairs import Shape as Stairs
 
-from deimos.physics import Captured, Physics, PhysicsConfig
-from deimos.robots import go1, rx150
-from terrain import Grid, Share, build
-from terrain.shapes.stairs import Shape as Stairs
+from deimos.sim.legged.engines.mujoco_warp import Captured, Physics, PhysicsConfig
+from deimos.sim.legged.robots import go1, rx150
 
 ROBOT = go1.build()
 ROBOTS = {"go1": ROBOT, "go1_rx150": rx150.mount(go1.build())}
@@ -213,7 +213,7 @@ def test_capture_replays_the_step(device):
 
 def test_a_long_silence_is_explained(torch_device, capsys, monkeypatch):
     """A first run that takes longer than a person's patience says what it waits for; a quick one says nothing."""
-    monkeypatch.setattr("deimos.physics.PATIENCE", 0.2)
+    monkeypatch.setattr("deimos.sim.legged.engines.mujoco_warp.PATIENCE", 0.2)
     Captured(lambda: time.sleep(0.01), torch_device)
     assert capsys.readouterr().err == ""
     Captured(lambda: time.sleep(0.3), torch_device)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy import stats
 
-from deimos import picks
+from deimos.goals import picks
 
 EVENLY = (torch.arange(1000) + 0.5) / 1000
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from deimos.playback import PlayOptions
+from deimos.app.playback import PlayOptions
 
 HOME = Path(__file__).parent.parent
 WALK = HOME / "docs" / "results" / "quad_flat"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from deimos.env import Step
-from deimos.interactions import Interactions
-from deimos.selector import Spaces
-from deimos.selectors import plr
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import Spaces
+from deimos.goals.selectors import plr
+from deimos.sim.env import Step
 
 CPU = torch.device("cpu")
 NUM_ENVS, PERIOD, STEPS = 24, 5, 8

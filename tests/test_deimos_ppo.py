@@ -10,12 +10,12 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from deimos.adam import Adam
 from deimos.checks import SimulationError
-from deimos.envs import particle
-from deimos.networks import Backprop, flatten_parameters, mlp
-from deimos.ppo import PPO, PPOConfig, advantages
-from deimos.rollout import Rollout
+from deimos.learn.ppo import PPO, PPOConfig, advantages
+from deimos.learn.rollout import Rollout
+from deimos.nn.adam import Adam
+from deimos.nn.networks import Backprop, flatten_parameters, mlp
+from deimos.sim.envs import particle
 
 NUM_ENVS, NUM_STEPS = 50, 24
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import nn
 
-from deimos import products
-from deimos.fused import fuse
-from deimos.networks import ManyCandidates, mlp
-from deimos.products import add_product_, fast_linear, onednn
-from deimos.selector import Whitening
+from deimos.goals.selector import Whitening
+from deimos.nn import matmul as products
+from deimos.nn.fused import fuse
+from deimos.nn.matmul import add_product_, fast_linear, onednn
+from deimos.nn.networks import ManyCandidates, mlp
 
 CPU = torch.device("cpu")
 MATMUL = torch.backends.mkldnn.matmul

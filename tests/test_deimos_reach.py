@@ -7,10 +7,10 @@ import pytest
 import torch
 
 import deimos
-from deimos.evaluation import play
-from deimos.goal_loop import spaces
-from deimos.presets import preset
-from deimos.selectors import uniform
+from deimos.goals.selectors import uniform
+from deimos.run.evaluation import play
+from deimos.run.loop import spaces
+from deimos.run.presets import preset
 
 HOME = Path(__file__).parent.parent / "docs" / "results" / "quad_arm_stand"
 

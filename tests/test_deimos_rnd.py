@@ -7,10 +7,10 @@ import sys
 import pytest
 import torch
 
-from deimos.fused import fuse
-from deimos.interactions import Interactions
-from deimos.selector import Spaces
-from deimos.selectors import rnd
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import Spaces
+from deimos.goals.selectors import rnd
+from deimos.nn.fused import fuse
 
 CPU = torch.device("cpu")
 NUM_ENVS, CANDIDATES = 200, 20

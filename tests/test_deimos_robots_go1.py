@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from deimos.terrain import Grid, Share, build
+from deimos.terrain.shapes.stairs import Shape as Stairs
 
-from deimos.physics import Physics, PhysicsConfig
-from deimos.robots import COLLISION_GROUP, VISUAL_GROUP, go1
-from terrain import Grid, Share, build
-from terrain.shapes.stairs import Shape as Stairs
+from deimos.sim.legged.engines.mujoco_warp import Physics, PhysicsConfig
+from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1
 
 HFIELD_BIT = 32  # of mujoco-warp's overflow: a geom covered more prisms than are tested
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from deimos.terrain import Grid, Share, build
+from deimos.terrain.shapes.stairs import Shape as Stairs
 
-from deimos.physics import Physics, PhysicsConfig
-from deimos.robots import COLLISION_GROUP, VISUAL_GROUP, go1, rx150
-from terrain import Grid, Share, build
-from terrain.shapes.stairs import Shape as Stairs
+from deimos.sim.legged.engines.mujoco_warp import Physics, PhysicsConfig
+from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1, rx150
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ import math
 import pytest
 import torch
 
-from deimos.envs import particle
-from deimos.methods import METHODS
-from deimos.ppo import PPOConfig
-from deimos.selector import GoalSelector, Proposal, SelectorConfig, Spaces
-from deimos.selectors import director, mix, plr, schedule, uniform
-from deimos.training import TrainConfig, Trainer
+from deimos.goals.methods import METHODS
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.goals.selectors import director, mix, plr, schedule, uniform
+from deimos.learn.ppo import PPOConfig
+from deimos.run.training import TrainConfig, Trainer
+from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
 SPACES = Spaces(num_envs=40, state_dim=9, goal_dim=3, goal_period=4, device=CPU, total_steps=96)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from deimos.networks import ManyCandidates, mlp
-from deimos.seeds import derive, generator, restore, weights_from
+from deimos.nn.networks import ManyCandidates, mlp
+from deimos.nn.seeds import derive, generator, restore, weights_from
 
 USES = ("policy weights", "policy noise", "fear weights", "fear minibatches", "vds critic 0", "vds critic 1", "")
 

@@ -10,18 +10,20 @@ import pytest
 import torch
 from scipy import stats
 
-from deimos import envs, plugins, selectors
+from deimos import plugins
 from deimos.checks import SimulationError
-from deimos.fear import FearConfig
-from deimos.fear_selector import fear_selector
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.interactions import Interactions
-from deimos.methods import METHODS, method
-from deimos.ppo import PPOConfig
-from deimos.rollout import Rollout
-from deimos.selector import Spaces
-from deimos.selectors import boltzmann, cl, director, grid, learnability, mix, plr, rnd, schedule, uniform, vds
-from deimos.training import TrainConfig, Trainer
+from deimos.goals import selectors
+from deimos.goals.fear import FearConfig
+from deimos.goals.fear_selector import fear_selector
+from deimos.goals.interactions import Interactions
+from deimos.goals.methods import METHODS, method
+from deimos.goals.selector import Spaces
+from deimos.goals.selectors import boltzmann, cl, director, grid, learnability, mix, plr, rnd, schedule, uniform, vds
+from deimos.learn.ppo import PPOConfig
+from deimos.learn.rollout import Rollout
+from deimos.run.loop import GoalLoop, spaces
+from deimos.run.training import TrainConfig, Trainer
+from deimos.sim import envs
 
 CPU = torch.device("cpu")
 SPACES = Spaces(num_envs=40, state_dim=9, goal_dim=3, goal_period=5, device=CPU, total_steps=96)

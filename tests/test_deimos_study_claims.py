@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 from deimos.study import claim_custom, claim_tests, claims, stats
 from deimos.study.claim_list import ALL, CLAIMS
 from deimos.study.claims import Claim, Finding

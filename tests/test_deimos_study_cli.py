@@ -2,7 +2,7 @@
 
 import pytest
 
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 from deimos.study import cli, plan
 from deimos.study.folder import identity
 from deimos.study.presets import PRESETS

@@ -6,12 +6,12 @@ import re
 
 import pytest
 
-from deimos.methods import METHODS
-from deimos.presets import preset as training_preset
-from deimos.run_folder import RunError
+from deimos.goals.methods import METHODS
+from deimos.run.folder import RunError
+from deimos.run.presets import preset as training_preset
+from deimos.run.training import TrainConfig
 from deimos.study import plan
 from deimos.study.presets import LEGGED_METHODS, PARTICLE_METHODS, PRESETS
-from deimos.training import TrainConfig
 
 TOML = """
 seeds = [3, 5]
@@ -171,7 +171,7 @@ ERRORS = {
     TOML.replace('"far"', '"../far"'): r"must have a name of letters, digits, '\.' and '_', got '\.\./far'",
     TOML.replace(
         '"particle", variant = "absolute"', '"hexapod"'
-    ): "'far': deimos.envs has no 'hexapod'; it has: particle",
+    ): "'far': deimos.sim.envs has no 'hexapod'; it has: particle",
     TOML.replace('variant = "absolute"', 'variant = "cubic"'): "'far': variant must be one of",
     TOML.replace('variant = "absolute"', "friction = 1"): "'far': .*Config has no friction; it has: ",
     TOML.replace("num_envs = 64", "num_worlds = 64"): "TrainConfig has no num_worlds; it has: ",

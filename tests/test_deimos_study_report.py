@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 from deimos.study import document, figures, report, stats
 from deimos.study.claim_list import CLAIMS
 from deimos.study.data import Data

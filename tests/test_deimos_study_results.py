@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 from deimos.study.results import RESULT_COLUMNS, GrowingTable, curves, merge, results
 
 COLUMNS = {"name": str, "count": int, "rate": float, "weak": bool, "points": tuple, "errors": dict}

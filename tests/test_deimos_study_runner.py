@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from deimos.run_folder import RunError, RunFolder
+from deimos.run.folder import RunError, RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, lease, plan
 from deimos.study.folder import StudyFolder, result_rows

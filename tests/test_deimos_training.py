@@ -16,20 +16,23 @@ import pytest
 import torch
 
 import deimos
-from deimos import cli, envs, plugins, presets, training
+from deimos import plugins
+from deimos.app import cli
 from deimos.checks import SimulationError
-from deimos.config import from_dict, kind, to_dict
-from deimos.env import EnvConfig
-from deimos.envs import particle
-from deimos.evaluation import EvalConfig
-from deimos.fear import FearConfig
-from deimos.methods import METHODS
-from deimos.ppo import PPOConfig
-from deimos.rollout import Rollout
-from deimos.run_folder import RunError, RunFolder, load_tensors
-from deimos.selector import SelectorConfig
-from deimos.selectors import director, uniform
-from deimos.training import TrainConfig
+from deimos.goals.fear import FearConfig
+from deimos.goals.methods import METHODS
+from deimos.goals.selector import SelectorConfig
+from deimos.goals.selectors import director, uniform
+from deimos.learn.ppo import PPOConfig
+from deimos.learn.rollout import Rollout
+from deimos.run import presets, training
+from deimos.run.config import from_dict, kind, to_dict
+from deimos.run.evaluation import EvalConfig
+from deimos.run.folder import RunError, RunFolder, load_tensors
+from deimos.run.training import TrainConfig
+from deimos.sim import envs
+from deimos.sim.env import EnvConfig
+from deimos.sim.envs import particle
 
 HOME = Path(deimos.__file__).resolve().parent.parent
 
@@ -56,7 +59,8 @@ EARLY = 5  # iterations after which everything that can be lost has been in use
 # The command line itself, with another time between checkpoints and a bound on the size of the files of iterations.
 DRIVER = """
 import resource, sys
-from deimos import cli, training
+from deimos.app import cli
+from deimos.run import training
 
 def train(*arguments, original=training.train):
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), -1))
@@ -548,9 +552,9 @@ def test_config_differs_from_the_default_in_every_field():
 @pytest.mark.parametrize(
     ("cls", "data", "message"),
     [
-        (TrainConfig, {"sed": 1}, "deimos.training.TrainConfig has no sed; it has: device, env"),
-        (TrainConfig, {"env": {"kind": "moon"}}, "deimos.envs has no 'moon'; it has: .*particle"),
-        (EnvConfig, {"variant": "relative"}, "deimos.envs must name its 'kind'"),
+        (TrainConfig, {"sed": 1}, "deimos.run.training.TrainConfig has no sed; it has: device, env"),
+        (TrainConfig, {"env": {"kind": "moon"}}, "deimos.sim.envs has no 'moon'; it has: .*particle"),
+        (EnvConfig, {"variant": "relative"}, "deimos.sim.envs must name its 'kind'"),
         (SelectorConfig, {"kind": "director", "percentile": 101}, r"percentile must be in \[0, 100\], got 101"),
     ],
 )

@@ -9,17 +9,17 @@ import pytest
 import torch
 from torch import nn
 
-from deimos.adam import Adam
-from deimos.ensemble import Stack
-from deimos.envs import particle
-from deimos.fused_critics import fuse_critics
-from deimos.goal_loop import spaces
-from deimos.interactions import Interactions
-from deimos.networks import mlp
-from deimos.ppo import PPO, PPOConfig, advantages
-from deimos.rollout import Rollout
-from deimos.selector import Spaces
-from deimos.selectors import vds
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import Spaces
+from deimos.goals.selectors import vds
+from deimos.learn.ppo import PPO, PPOConfig, advantages
+from deimos.learn.rollout import Rollout
+from deimos.nn.adam import Adam
+from deimos.nn.ensemble import Stack
+from deimos.nn.fused_critics import fuse_critics
+from deimos.nn.networks import mlp
+from deimos.run.loop import spaces
+from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
 NUM_ENVS, NUM_STEPS = 30, 12

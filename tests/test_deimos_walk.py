@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import deimos
-from deimos.envs import quad
-from deimos.evaluation import play
-from deimos.goal_loop import spaces
-from deimos.selectors import uniform
+from deimos.goals.selectors import uniform
+from deimos.run.evaluation import play
+from deimos.run.loop import spaces
+from deimos.sim.envs import quad
 
 HOME = Path(__file__).parent.parent / "docs" / "results" / "quad_flat"
 

@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from deimos import plugins, selectors
-from deimos.envs import particle
-from deimos.goal_loop import spaces
-from deimos.methods import METHODS
-from deimos.ppo import PPOConfig
-from deimos.training import TrainConfig, Trainer
+from deimos import plugins
+from deimos.goals import selectors
+from deimos.goals.methods import METHODS
+from deimos.learn.ppo import PPOConfig
+from deimos.run.loop import spaces
+from deimos.run.training import TrainConfig, Trainer
+from deimos.sim.envs import particle
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -28,7 +29,7 @@ def farthest(tmp_path, monkeypatch):
     monkeypatch.setattr(selectors, "__path__", [*selectors.__path__, str(tmp_path)])
     importlib.invalidate_caches()
     yield plugins.load(selectors, "farthest")
-    sys.modules.pop("deimos.selectors.farthest", None)
+    sys.modules.pop("deimos.goals.selectors.farthest", None)
 
 
 def test_worked_example_is_found_and_trains(farthest):

@@ -11,8 +11,12 @@ from pathlib import Path
 import pytest
 
 import deimos
-from deimos import cli, config, envs, plugins, selectors
-from deimos.run_folder import RunFolder
+from deimos import plugins
+from deimos.app import cli
+from deimos.goals import selectors
+from deimos.run import config
+from deimos.run.folder import RunFolder
+from deimos.sim import envs
 
 HOME = Path(deimos.__file__).resolve().parent.parent
 PACKAGES = ("deimos", "kernels", "terrain")
@@ -24,7 +28,7 @@ from dataclasses import dataclass
 
 import torch
 
-from deimos.selector import GoalSelector, Proposal, SelectorConfig
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +94,7 @@ def python(code, *, cwd, first=()):
 def test_imports_are_silent_and_light(tmp_path):
     """Importing the packages prints nothing and starts no device; none loads mujoco, and by themselves none torch."""
     modules = module_names("kernels", "terrain")
-    assert {"kernels", "kernels.particle", "terrain"} <= set(modules)
+    assert {"kernels", "deimos.kernels.particle", "terrain"} <= set(modules)
     code = f"""
 import importlib, sys
 for name in {modules}:
@@ -98,7 +102,8 @@ for name in {modules}:
 loaded = {{"torch", "mujoco", "mujoco_warp", "deimos"}} & set(sys.modules)
 assert not loaded, loaded
 import deimos
-from deimos import cli, plugins
+from deimos.app import cli
+from deimos import plugins
 assert deimos.__version__
 loaded = {{"mujoco", "mujoco_warp", "matplotlib", "tensorboard"}} & set(sys.modules)
 assert not loaded, loaded
@@ -171,9 +176,16 @@ def test_what_selectors_are_made_of_sees_tensors_only():
         found = set(imports(trees[name]))
         assert not {module for module in found if module.split(".")[0] in ("warp", "kernels", "terrain")}, name
         if name.startswith(("deimos/selector", "deimos/fear_selector")):
-            assert not {"deimos.env", "deimos.envs", "deimos.goal_loop", "deimos.ppo.PPO", "deimos.training"} & found, (
-                name
-            )
+            assert (
+                not {
+                    "deimos.sim.env",
+                    "deimos.sim.envs",
+                    "deimos.run.loop",
+                    "deimos.learn.ppo.PPO",
+                    "deimos.run.training",
+                }
+                & found
+            ), name
 
 
 @pytest.mark.parametrize("name", ["kernels", "terrain"])
@@ -296,16 +308,16 @@ def test_dropped_in_file_is_a_selector(tmp_path, monkeypatch, capsys):
         assert plugins.names(selectors) == sorted([*before, "longest"])
         assert_selector_works(tmp_path, "longest", capsys)
     finally:
-        sys.modules.pop("deimos.selectors.longest", None)
+        sys.modules.pop("deimos.goals.selectors.longest", None)
 
 
 def test_entry_point_is_a_selector(tmp_path, monkeypatch, capsys):
-    """A module of another distribution that is registered under ``deimos.selectors`` is a selector too."""
+    """A module of another distribution that is registered under ``deimos.goals.selectors`` is a selector too."""
     (tmp_path / "other_module.py").write_text(SELECTOR)
     information = tmp_path / "other-1.0.dist-info"
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[deimos.selectors]\nfurthest = other_module\n")
+    (information / "entry_points.txt").write_text("[deimos.goals.selectors]\nfurthest = other_module\n")
     before = plugins.names(selectors)
     monkeypatch.syspath_prepend(str(tmp_path))
     try:

@@ -6,11 +6,9 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from scipy import stats
-
-from deimos.robots import rx150
-from kernels.arm import judge_arms, reset_arms
-from kernels.arm_goals import (
+from deimos.kernels.goals import draw_candidates
+from deimos.kernels.legged.arm import judge_arms, reset_arms
+from deimos.kernels.legged.arm_goals import (
     SHELL_HIGH,
     SHELL_LOW,
     Arm,
@@ -20,9 +18,8 @@ from kernels.arm_goals import (
     place_of_goal,
     redraw_candidates,
 )
-from kernels.arm_rewards import ARM_TERMS, ArmWeights, vecA
-from kernels.goals import draw_candidates
-from kernels.locomotion_state import (
+from deimos.kernels.legged.arm_rewards import ARM_TERMS, ArmWeights, vecA
+from deimos.kernels.legged.state import (
     COLUMNS,
     COUNTERS,
     NUM_COLUMNS,
@@ -31,7 +28,10 @@ from kernels.locomotion_state import (
     LocomotionStep,
     Simulation,
 )
-from kernels.random import Purpose
+from deimos.kernels.random import Purpose
+from scipy import stats
+
+from deimos.sim.legged.robots import rx150
 
 J, G, OBS_START, OBS = 17, 6, 60, 70
 DT, CELL, CORNER = 0.02, 0.1, (-6.0, -8.0)

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-
-from kernels.candidates import (
+from deimos.kernels.candidates import (
     MOST_COMPONENTS,
     MOST_COMPONENTS_SQUARED,
     OUTPUTS_AT_ONCE,
     mean_square_of_candidates,
     score_candidates,
 )
-from kernels.lanes import WIDE, lanes, threads
+from deimos.kernels.lanes import WIDE, lanes, threads
 
 BOUND = 0.5  # so low that many components are clipped
 squares_of_candidates = functools.partial(mean_square_of_candidates, bound=BOUND)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.check import require, require_axes
+from deimos.kernels.check import require, require_axes
 
 
 def test_accepts_what_fits(device):

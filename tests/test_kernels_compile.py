@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-import kernels
+from deimos import kernels
 
 HOME = Path(kernels.__file__).resolve().parent.parent
 ARCHITECTURES = (80, 90)  # A100, H100
@@ -16,7 +16,7 @@ ARCHITECTURES = (80, 90)  # A100, H100
 
 def modules_with_kernels():
     """Names of the modules of ``kernels`` that define a kernel."""
-    names = [info.name for info in pkgutil.walk_packages(kernels.__path__, prefix="kernels.")]
+    names = [info.name for info in pkgutil.walk_packages(kernels.__path__, prefix="deimos.kernels.")]
     modules = {name: importlib.import_module(name) for name in names}
     return [
         name
@@ -28,8 +28,8 @@ def modules_with_kernels():
 def test_finds_the_modules():
     """The search finds the modules that are known to define kernels, and not those that define none."""
     found = modules_with_kernels()
-    assert {"kernels.goals", "kernels.particle", "kernels.random"} <= set(found)
-    assert "kernels.check" not in found
+    assert {"deimos.kernels.goals", "deimos.kernels.particle", "deimos.kernels.random"} <= set(found)
+    assert "deimos.kernels.check" not in found
 
 
 @pytest.mark.parametrize("name", modules_with_kernels())

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.contacts import TERRAIN, UNWATCHED, Contacts, gather_contacts, peak_force
+from deimos.kernels.legged.contacts import TERRAIN, UNWATCHED, Contacts, gather_contacts, peak_force
 
 WORLDS, PARTS, ROWS, SUBSTEPS = 7, 5, 40, 3
 PART_OF_GEOM = np.array([TERRAIN, 0, 0, 1, 2, 3, 4, UNWATCHED], np.int32)

@@ -5,9 +5,8 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.critics import CriticTables, Layout, gradients, values
-from kernels.lanes import WIDE
+from deimos.kernels.critics import CriticTables, Layout, gradients, values
+from deimos.kernels.lanes import WIDE
 
 COUNT = 3
 

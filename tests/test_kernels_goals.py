@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.goals import count_events, draw_candidates, goal_is_due, time_is_up
-from kernels.random import Purpose
+from deimos.kernels.goals import count_events, draw_candidates, goal_is_due, time_is_up
+from deimos.kernels.random import Purpose
 
 SIGMAS = 5.0  # a sound generator's mean is off by more than this once in 1.7 million tests
 

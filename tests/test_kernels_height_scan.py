@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.height_scan import require_heights, sample_height, sample_minimum, scan_points
+from deimos.kernels.legged.height_scan import require_heights, sample_height, sample_minimum, scan_points
 
 U = 2.0**-24  # relative error of one float32 operation
 CELL = 0.05  # [m]

@@ -5,10 +5,8 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.locomotion import apply_actions, judge_step
-from kernels.locomotion_rewards import TERMS, RewardWeights, vec12, vecT
-from kernels.locomotion_state import (
+from deimos.kernels.legged.rewards import TERMS, RewardWeights, vec12, vecT
+from deimos.kernels.legged.state import (
     BROKEN,
     COLUMNS,
     COUNTERS,
@@ -21,7 +19,8 @@ from kernels.locomotion_state import (
     LocomotionStep,
     Simulation,
 )
-from kernels.random import Purpose
+from deimos.kernels.legged.step import apply_actions, judge_step
+from deimos.kernels.random import Purpose
 
 J, G, OBS, SUBSTEPS = 12, 3, 48, 4
 DT = 0.02

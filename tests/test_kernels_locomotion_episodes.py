@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.locomotion_episodes import change_of_level, reset_worlds, set_goals, update_levels
-from kernels.locomotion_obs import finish_obs
-from kernels.locomotion_rewards import vec12, vecT
-from kernels.locomotion_state import COUNTERS, Ground, Joints, LevelRule, LocomotionParams, LocomotionState
-from kernels.random import Purpose
+from deimos.kernels.legged.observation import finish_obs
+from deimos.kernels.legged.reset import change_of_level, reset_worlds, set_goals, update_levels
+from deimos.kernels.legged.rewards import vec12, vecT
+from deimos.kernels.legged.state import COUNTERS, Ground, Joints, LevelRule, LocomotionParams, LocomotionState
+from deimos.kernels.random import Purpose
 
 N, J, G, SCAN = 40, 12, 3, 10
 OBS = 48 + SCAN

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.locomotion_rewards import (
+from deimos.kernels.legged.rewards import (
     TERMS,
     LegMotion,
     RewardWeights,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.particle import (
+from deimos.kernels.particle import (
     BROKEN,
     GOAL_START,
     OBS_DIM,
@@ -17,8 +16,8 @@ from kernels.particle import (
     set_goals,
     step_particles,
 )
-from kernels.particle_rewards import RewardShape
-from kernels.random import Purpose
+from deimos.kernels.particle_rewards import RewardShape
+from deimos.kernels.random import Purpose
 
 U = 2.0**-24  # relative error of one float32 operation
 VECTORS = ("position", "velocity", "force", "target")

@@ -6,10 +6,10 @@ import typing
 import numpy as np
 import pytest
 import warp as wp
+from deimos.kernels.particle import ParticleState, ParticleStep, step_particles
+from deimos.kernels.particle_rewards import RewardShape, shape_reward
 
-from deimos.envs.particle import HALF_SIDE, Config
-from kernels.particle import ParticleState, ParticleStep, step_particles
-from kernels.particle_rewards import RewardShape, shape_reward
+from deimos.sim.envs.particle import HALF_SIDE, Config
 
 U = 2.0**-24  # relative error of one float32 operation
 VARIANTS = ["absolute", "directional", "relative"]

@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.random import Purpose, draw_uniforms, draw_words, vec4u
+from deimos.kernels.random import Purpose, draw_uniforms, draw_words, vec4u
 
 ONES = 0xFFFFFFFF
 # Of the paper's own implementation, Random123: examples/kat_vectors, philox4x32 with 10 rounds.

@@ -5,8 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.ray_cast import cast_rays
+from deimos.kernels.ray_cast import cast_rays
 
 LOW, HIGH, MISS = -100.0, 100.0, -200.0
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.relief import draw_relief
+from deimos.kernels.relief import draw_relief
 
 U = 2.0**-24  # relative error of one float32 operation
 

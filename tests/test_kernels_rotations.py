@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
-
-from kernels.rotations import (
+from deimos.kernels.rotations import (
     down_in_body,
     from_yaw,
     heading,

@@ -5,9 +5,9 @@ import zipfile
 
 import numpy as np
 import pytest
+from deimos.terrain import files
 
-import terrain
-from terrain import files
+from deimos import terrain
 
 
 def make_terrain(**changes):

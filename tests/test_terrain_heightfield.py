@@ -4,10 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-from terrain import catalog, heightfield
-from terrain.heightfield import rasterise
-from terrain.mesh import UPRIGHT, from_triangles, normals, rings, sheet, steepest_slope
+from deimos.terrain import catalog, heightfield
+from deimos.terrain.heightfield import rasterise
+from deimos.terrain.mesh import UPRIGHT, from_triangles, normals, rings, sheet, steepest_slope
 
 NAMES = catalog.names()
 CELL = 0.05  # [m]

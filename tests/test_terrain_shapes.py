@@ -4,10 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-
-from terrain import catalog, shapes
-from terrain.mesh import highest_riser, normals, steepest_slope
-from terrain.shape import TileShape
+from deimos.terrain import catalog, shapes
+from deimos.terrain.mesh import highest_riser, normals, steepest_slope
+from deimos.terrain.shape import TileShape
 
 NAMES = catalog.names()
 DIFFICULTIES = (0.0, 0.5, 1.0)
@@ -265,8 +264,8 @@ def test_dropped_in_file_is_a_shape(tmp_path, monkeypatch):
 
 from dataclasses import dataclass
 
-from terrain.mesh import rings
-from terrain.shape import TileShape
+from deimos.terrain.mesh import rings
+from deimos.terrain.shape import TileShape
 import numpy as np
 
 

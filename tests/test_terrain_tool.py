@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from deimos.terrain import catalog, cli, console, export, presets
+from deimos.terrain.world import build_with_mesh
 from PIL import Image
 
-import terrain
-from terrain import catalog, cli, console, export, presets
-from terrain.world import build_with_mesh
+from deimos import terrain
 
 ENDINGS = (".stl", ".obj", ".ply", ".glb", ".npz", ".png")
 SMALL = ["--levels", "2", "--columns", "3", "--cell", "0.2", "--border", "1"]
@@ -205,7 +205,7 @@ def test_mistakes_give_one_line(folder, capsys, arguments, message):
 
 def test_grid_that_does_not_fit_is_refused(folder, capsys, monkeypatch):
     """A grid beyond the free memory says how much it needs, and writes nothing."""
-    monkeypatch.setattr("terrain.world._free_memory", lambda: 2**27)
+    monkeypatch.setattr("deimos.terrain.world._free_memory", lambda: 2**27)
     assert run("grid", "--out", "a.npz") == 2
     assert "needs about 1.0 GiB of memory and 0.1 GiB are free; enlarge cell" in capsys.readouterr().err
     assert not list(folder.iterdir())

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from deimos.terrain import catalog, presets, world
+from deimos.terrain.mesh import highest_riser, steepest_slope
 
-import terrain
-from terrain import catalog, presets, world
-from terrain.mesh import highest_riser, steepest_slope
+from deimos import terrain
 
 HOME = Path(terrain.__file__).resolve().parent.parent
 ALL = tuple(world.Share(shape=catalog.make(name)) for name in catalog.names())
@@ -189,7 +189,7 @@ def test_estimate_of_memory_holds(tmp_path):
     """A process that builds and saves a grid needs no more memory than was estimated, and at least a quarter."""
     code = """
 import sys, terrain
-from terrain import catalog, world
+from deimos.terrain import catalog, world
 def peak():
     return next(1024 * int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM"))
 names = ("rough-slope-up", "waves", "stepping-stones")

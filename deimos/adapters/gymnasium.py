@@ -12,10 +12,10 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from deimos.checks import check_at_least
-from deimos.env import EnvConfig
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.selector import SelectorConfig
-from deimos.selectors import uniform
+from deimos.goals.selector import SelectorConfig
+from deimos.goals.selectors import uniform
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import EnvConfig
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):

@@ -8,11 +8,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from deimos.checks import check_positive
-from deimos.env import Env
-from deimos.goal_loop import GoalLoop, spaces
-from deimos.ppo import PPOConfig
-from deimos.selector import GoalSelector
-from deimos.selectors import uniform
+from deimos.goals.selector import GoalSelector
+from deimos.goals.selectors import uniform
+from deimos.learn.ppo import PPOConfig
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import Env
 
 
 class RslRlVecEnv(VecEnv):

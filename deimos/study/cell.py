@@ -15,12 +15,12 @@ from pathlib import Path
 
 import torch
 
-from deimos import training
 from deimos.checks import SimulationError
-from deimos.evaluation import evaluate, weights_hash
-from deimos.policy import load_policy
-from deimos.run_folder import RunError, RunFolder
-from deimos.shared import one_stream
+from deimos.learn.policy import load_policy
+from deimos.run import training
+from deimos.run.evaluation import evaluate, weights_hash
+from deimos.run.folder import RunError, RunFolder
+from deimos.sim.shared import one_stream
 from deimos.study.folder import StudyFolder, curve_row, result_rows
 from deimos.study.plan import Cell
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from deimos.checks import check_at_least
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 from deimos.study import plan
 from deimos.study.folder import StudyFolder, identity
 from deimos.study.presets import PRESETS

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from deimos.methods import METHODS
-from deimos.run_folder import RunError
+from deimos.goals.methods import METHODS
+from deimos.run.folder import RunError
 from deimos.study.presets import DIRECTORS
 from deimos.study.results import check_one_population, curves, results
 from deimos.study.stats import Array

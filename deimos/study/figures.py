@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 from deimos.study import stats
 from deimos.study.claim_custom import ACHIEVED
 from deimos.study.data import DIRECTOR_METHODS, Curve, Data, Where

@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from deimos.run_folder import RunError, RunFolder
+from deimos.run.folder import RunError, RunFolder
 from deimos.study.plan import Cell, read_cell
 from deimos.study.results import GrowingTable, curves, results
 

@@ -10,14 +10,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from deimos import presets
-from deimos.config import from_dict, to_dict
-from deimos.env import EnvConfig
-from deimos.methods import METHODS, method
-from deimos.run_folder import RunError
-from deimos.selector import SelectorConfig
+from deimos.goals.methods import METHODS, method
+from deimos.goals.selector import SelectorConfig
+from deimos.run import presets
+from deimos.run.config import from_dict, to_dict
+from deimos.run.folder import RunError
+from deimos.run.training import TrainConfig
+from deimos.sim.env import EnvConfig
 from deimos.study.presets import PRESETS
-from deimos.training import TrainConfig
 
 SCHEMA = 1  # of cell.json
 _KEYS = {"about", "preset", "seeds", "methods", "train", "environment"}
@@ -120,7 +120,7 @@ def read(path: Path) -> dict:
     Its keys: ``seeds`` (a number of seeds, or a list of them), ``methods`` (names), ``train`` (fields of
     ``TrainConfig`` for all cells), and an ``[[environment]]`` for each environment or variant, with ``name``,
     ``env`` (its ``kind`` and fields) and, if they differ there, ``methods``, ``train`` and ``goal_periods``; its
-    ``preset`` is one of ``deimos.presets``, where its environment and settings come from that are not said.
+    ``preset`` is one of ``deimos.run.presets``, where its environment and settings come from that are not said.
     ``preset`` names a ready-made study, where everything comes from that is not said.
 
     Raises:

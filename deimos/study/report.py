@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 from deimos.study import claims, stats
 from deimos.study.claim_list import CLAIMS
 from deimos.study.claim_tests import FACTOR, LEAST, PROBABILITY, REWARD_SHARE, SPREAD
@@ -18,7 +18,7 @@ from deimos.study.document import Block, Bullets, Heading, Paragraph, Picture, T
 from deimos.study.figures import draw_all
 from deimos.study.presets import LEGGED_METHODS
 from deimos.study.stats import Array, Interval
-from deimos.thesis import TABLE_4_1
+from reproduction.thesis import TABLE_4_1
 
 FIGURES = "figures"
 COVERAGE = (  # deimos study coverage, its defaults

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from deimos.run_folder import RunError
+from deimos.run.folder import RunError
 
 RESULT_COLUMNS: dict[str, type] = {
     # What was run.

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrain.mesh import rings
-from terrain.shape import TileShape
+from ..mesh import rings
+from ..shape import TileShape
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

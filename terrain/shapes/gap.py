@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrain.checks import check_positive, check_ramp
-from terrain.mesh import rings
-from terrain.shape import Ramp, TileShape, at
+from ..checks import check_positive, check_ramp
+from ..mesh import rings
+from ..shape import Ramp, TileShape, at
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrain.checks import check_positive, check_ramp, check_range
-from terrain.mesh import sheet
-from terrain.noise import draw_noise
-from terrain.shape import Ramp, TileShape, at
+from ..checks import check_positive, check_ramp, check_range
+from ..mesh import sheet
+from ..noise import draw_noise
+from ..shape import Ramp, TileShape, at
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from terrain.checks import check_ramp
-from terrain.mesh import from_triangles
-from terrain.shape import Ramp, TileShape, at
+from ..checks import check_ramp
+from ..mesh import from_triangles
+from ..shape import Ramp, TileShape, at
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

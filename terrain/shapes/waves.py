@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrain.checks import check_at_least, check_positive, check_ramp, check_range
-from terrain.mesh import sheet
-from terrain.shape import Ramp, TileShape, at
+from ..checks import check_at_least, check_positive, check_ramp, check_range
+from ..mesh import sheet
+from ..shape import Ramp, TileShape, at
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

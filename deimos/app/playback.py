@@ -1,0 +1,232 @@
+"""``deimos play``: watch a trained policy, as a film or as single pictures."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import tyro
+
+from deimos.checks import check_at_least, check_positive
+from deimos.goals.fear_selector import FearSelector, fear_selector
+from deimos.goals.selectors import uniform
+from deimos.learn.policy import load_policy
+from deimos.run.folder import RunError, RunFolder, load_tensors
+from deimos.run.loop import GoalLoop, spaces
+from deimos.run.training import SCHEMA, TrainConfig, read_config
+from deimos.sim.env import Env
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions:
+    """Render the policy of a run in one world under uniform goals; the goal and its fear are written in the picture.
+
+    It renders without a display: MUJOCO_GL says how (egl or osmesa; Debian has libegl1 and libosmesa6).
+    """
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    video: Path | None = None
+    """Film to write (.mp4, .gif, ...)."""
+    frames: Path | None = None
+    """Folder for single pictures instead; must not exist."""
+    seconds: float = 10.0
+    """Simulated time [s], positive."""
+    fps: float = 25.0
+    """Pictures per simulated second, positive."""
+    width: int = 640
+    """Width of a picture [pixels], at least 16."""
+    height: int = 480
+    """Height of a picture [pixels], at least 16."""
+    world: int = 0
+    """Global number of the world, at least 0: where it stands, and which goals it gets."""
+    goal_period: int | None = None
+    """T: steps that a goal is in force. By default as in training."""
+    seed: int = 1_000_003
+    """Seed of the world and its goals, in [0, 2^32)."""
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "fps"):
+            check_positive(name, getattr(self, name), finite=True)
+        for name in ("width", "height"):
+            check_at_least(name, getattr(self, name), 16)
+        check_at_least("world", self.world, 0)
+        if (self.video is None) == (self.frames is None):
+            raise ValueError("Give one of --video FILE and --frames FOLDER.")
+
+
+def play(options: PlayOptions) -> Path:
+    """Render what ``options`` ask for; returns what was written.
+
+    Raises:
+        RunError: If there is nothing to render, or it cannot be written.
+    """
+    _import_mujoco()
+    folder = RunFolder.open(options.run)
+    config = read_config(folder)
+    policy = load_policy(folder.path)
+    env_config = config.env.for_evaluation()
+    if options.goal_period is not None:
+        env_config = env_config.with_goal_period(options.goal_period)
+    try:
+        env = env_config.build(1, torch.device("cpu"), options.seed, options.world)
+    except ValueError as error:
+        raise RunError(str(error)) from error
+    if env.scene(0) is None:
+        raise RunError("This environment has nothing to render; play shows robots.")
+    loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
+    afraid = _fear(folder, config, env)
+    every = max(1, round(1.0 / (options.fps * env.dt)))
+    target = options.video or options.frames
+    assert target is not None
+    with _camera(env, options) as picture, _writer(options, 1.0 / (every * env.dt)) as write:
+        for t in range(round(options.seconds / env.dt)):
+            if t % every == 0:
+                write(_captioned(picture(), _caption(env, afraid, t)))
+            loop.advance(env.step(policy.scaled(env.obs)))
+    env.check()
+    return target
+
+
+def _import_mujoco() -> None:
+    """Import MuJoCo, which decides then how it will render.
+
+    Raises:
+        RunError: If it cannot render in the way that MUJOCO_GL asks for.
+    """
+    if sys.platform.startswith("linux"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import mujoco  # noqa: F401
+    except Exception as error:  # ImportError, AttributeError (PyOpenGL without a library), RuntimeError, OSError
+        raise _unrenderable(error) from error
+
+
+def _unrenderable(error: Exception) -> RunError:
+    return RunError(
+        f"Nothing can be rendered with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({error}); "
+        "install libegl1 or libosmesa6 and set MUJOCO_GL=egl or osmesa."
+    )
+
+
+def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | None:
+    """The selector with the fear network that the run has learnt, if it has one."""
+    afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
+    if afraid is None or afraid.parts:
+        return None
+    state = load_tensors(folder.path / "checkpoint.pt", "checkpoint", SCHEMA)["loop"]["selector"]
+    if "fear" not in state:  # it is a part of another selector
+        return None
+    afraid.load_state_dict(state)
+    return afraid if afraid.fear.fitted else None
+
+
+def _caption(env: Env, afraid: FearSelector | None, t: int) -> str:
+    goal = env.obs[:, env.goal_slice]
+    field = next(field for field in env.layout if field.name == "goal")
+    physical = (goal[0] / torch.as_tensor(field.scale)).tolist()
+    text = f"{t * env.dt:5.2f} s   goal " + "  ".join(f"{value:+.2f}" for value in physical) + f"  [{field.unit}]"
+    if afraid is None:
+        return text
+    score = afraid.score(env.state(env.obs), goal, goal.unsqueeze(1))[:, 0]
+    return text + f"\nfear of keeping it {afraid.calibration.probability(score).item():.3f}"
+
+
+@contextmanager
+def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]]:
+    """A camera that follows the robot of world 0."""
+    import mujoco
+
+    scene = env.scene(0)
+    assert scene is not None
+    model = scene[0]
+    model.vis.global_.offwidth, model.vis.global_.offheight = options.width, options.height
+    try:
+        renderer = mujoco.Renderer(model, options.height, options.width)
+    except Exception as error:  # likewise, and MuJoCo's FatalError and PyOpenGL's GLError, which share no base
+        raise _unrenderable(error) from error
+    camera = mujoco.MjvCamera()
+    camera.distance, camera.azimuth, camera.elevation = 1.8, 130.0, -18.0
+
+    def picture() -> np.ndarray:
+        found = env.scene(0)
+        assert found is not None
+        camera.lookat[:] = found[1].qpos[:3]
+        renderer.update_scene(found[1], camera)
+        point = env.goal_point(0)
+        if point is not None:
+            _add_ball(renderer.scene, point)
+        return renderer.render()
+
+    with renderer:
+        yield picture
+
+
+def _add_ball(scene: "mujoco.MjvScene", point: np.ndarray) -> None:
+    """Show a place as a red ball, if the scene has room for it."""
+    import mujoco
+
+    if scene.ngeom == scene.maxgeom:
+        return
+    size, colour = np.array([0.025, 0.0, 0.0]), np.array([0.9, 0.15, 0.1, 0.9], np.float32)
+    mujoco.mjv_initGeom(
+        scene.geoms[scene.ngeom],
+        mujoco.mjtGeom.mjGEOM_SPHERE,
+        size,
+        point.astype(np.float64),
+        np.eye(3).ravel(),
+        colour,
+    )
+    scene.ngeom += 1
+
+
+def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    box = draw.multiline_textbbox((8, 6), text, font_size=14)
+    draw.rectangle((0, 0, box[2] + 8, box[3] + 6), fill=(255, 255, 255))
+    draw.multiline_text((8, 6), text, fill=(20, 20, 20), font_size=14)
+    return np.asarray(image)
+
+
+@contextmanager
+def _writer(options: PlayOptions, fps: float) -> Iterator[Callable[[np.ndarray], Any]]:
+    """Writes pictures one after another; a film that is cut off does not stay."""
+    if options.frames is not None:
+        from PIL import Image
+
+        folder = options.frames
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError as error:
+            raise RunError(f"{folder} exists already; name another folder.") from error
+        numbers = iter(range(10**6))
+        yield lambda picture: Image.fromarray(picture).save(folder / f"{next(numbers):06d}.png")
+        return
+    import imageio_ffmpeg
+
+    assert options.video is not None
+    if not options.video.parent.is_dir():
+        raise RunError(f"The folder of {options.video} does not exist.")
+    unfinished = options.video.with_name(f".unfinished-{options.video.name}")
+    film = imageio_ffmpeg.write_frames(
+        str(unfinished), (options.width, options.height), fps=fps, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    film.send(None)
+    try:
+        yield lambda picture: film.send(np.ascontiguousarray(picture))
+        film.close()
+        unfinished.replace(options.video)
+    finally:
+        film.close()
+        unfinished.unlink(missing_ok=True)

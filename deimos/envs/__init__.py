@@ -1,1 +1,0 @@
-"""One file, one environment: it holds a frozen dataclass ``Config`` (see ``deimos.env.EnvConfig``)."""

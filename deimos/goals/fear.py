@@ -1,0 +1,178 @@
+"""The fear network: how likely is this policy to crash within T steps of getting this goal?"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
+from deimos.goals.interactions import Resolved
+from deimos.goals.selector import Fuse
+from deimos.nn.adam import Adam
+from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, weights_of
+from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.seeds import generator, restore, weights_from
+
+
+@dataclass(frozen=True, kw_only=True)
+class FearConfig:
+    """The fear network and how it learns (thesis, 4.2)."""
+
+    hidden: tuple[int, ...] = (64,)
+    """Units of the hidden layers."""
+    activation: Activation = "relu"
+    """Between the layers."""
+    learning_rate: float = 1e-2
+    """Step size of Adam, positive."""
+    epochs: int = 1
+    """Passes over the window of interactions in every fit, at least 1."""
+    minibatches: int = 8
+    """Parts that the window is split into, at least 1."""
+    min_per_class: int = 32
+    """Crashes and survivals that the window must hold before a fit, at least 1."""
+    workspace: int = 64
+    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. One hidden layer
+    of ReLU needs none in training: a kernel scores them."""
+
+    def __post_init__(self) -> None:
+        check_hidden("hidden", self.hidden)
+        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_positive("learning_rate", self.learning_rate, finite=True)
+        for name in ("epochs", "minibatches", "min_per_class", "workspace"):
+            check_at_least(name, getattr(self, name), 1)
+
+
+class Fear:
+    """A fear network, an MLP of (state, goal, next goal) with one logit, and how it learns online.
+
+    Args:
+        config: Its sizes and how it learns.
+        state_dim: Components of a state.
+        goal_dim: Components of a goal.
+        device: Where it lives.
+        seed: Seed of its weights and of the order that it learns in.
+        fuse: Who scores candidates in one kernel; see ``selector.Spaces``.
+    """
+
+    def __init__(
+        self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int,
+        fuse: Fuse | None = None,
+    ) -> None:  # fmt: skip
+        self.config = config
+        with weights_from(seed, "fear weights"):
+            self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation).to(device)
+        self._parameters, _ = flatten_parameters(self.network)
+        self._pass = Backprop(self.network)
+        self._candidates = ManyCandidates(self.network, goal_dim, config.workspace)
+        self._fused = fuse(self.network, goal_dim) if fuse else None
+        self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
+        self.generator = generator(seed, "fear minibatches", device)
+        self.fitted = False
+        """Whether it has learnt anything yet; before, its ranking of goals would be an arbitrary bias."""
+        self.share = 0.5
+        """Share of crashes in the data of the last fit, in (0, 1); calibration takes it back."""
+
+    @torch.no_grad()
+    def fit(self, data: Resolved, epochs: int | None = None) -> float:
+        """Learn from interactions by class-balanced binary cross-entropy on logits.
+
+        The weights n / (2 n_class) use the class shares of all of ``data``, not of a minibatch, so
+        that the shift they cause is known exactly.
+
+        Args:
+            data: Resolved interactions.
+            epochs: Passes over the data; ``None`` for the configured number.
+
+        Returns:
+            Mean loss of the last pass; NaN, and nothing is learnt, where a class has too few rows.
+        """
+        crashes = int(data.crashed.sum())
+        if min(crashes, len(data) - crashes) < self.config.min_per_class:
+            return float("nan")
+        self.share = share = mean_over_ranks(data.crashed.float().mean()).item()
+        weight = torch.where(data.crashed, 0.5 / share, 0.5 / (1.0 - share)) / len(data)
+        inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
+        target = data.crashed.float()
+        size = -(-len(data) // self.config.minibatches)
+        loss = torch.full((), torch.nan)
+        for _ in range(self.config.epochs if epochs is None else epochs):
+            order = torch.randperm(len(data), generator=self.generator, device=target.device)
+            x, y, w = inputs[order], target[order], weight[order]
+            minibatches = zip(x.split(size), y.split(size), w.split(size), strict=True)
+            logit = torch.cat([self._learn(len(data) / len(part[0]), *part) for part in minibatches])
+            loss = nn.functional.binary_cross_entropy_with_logits(logit, y, w, reduction="sum")
+        self.fitted = True
+        return loss.item()
+
+    def _learn(self, scale: float, inputs: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        """One step of Adam on a minibatch; ``scale`` makes its gradient one of a mean. Returns the logits before it."""
+        assert self._parameters.grad is not None
+        self._parameters.grad.zero_()
+        logit = self._pass.forward(inputs).squeeze(1)
+        delta = torch.sigmoid(logit).sub_(target).mul_(weight * scale)  # slope of the cross-entropy by the logit
+        self._pass.backward(delta.unsqueeze(1))
+        mean_over_ranks(self._parameters.grad)
+        self.optimizer.step()
+        return logit
+
+    def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
+        """Logits of crashing for many candidates per decision.
+
+        Args:
+            state: States, shape (B, state_dim).
+            goal: Goals in force, shape (B, goal_dim).
+            candidates: Possible next goals, shape (B, N, goal_dim).
+
+        Returns:
+            Logits, shape (B, N); see ``ManyCandidates``.
+        """
+        context = torch.cat([state, goal], dim=1)
+        if self._fused is not None:
+            return self._fused(context, candidates)
+        return self._candidates(context, candidates).squeeze(2)
+
+    def operations(self, decisions: float, count: int) -> float:
+        """Multiplications and additions of scoring ``count`` candidates in each of ``decisions``."""
+        return self._candidates.operations(decisions, count)
+
+    def check(self) -> None:
+        """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
+        if not bool(self._parameters.isfinite().all()):
+            raise SimulationError("A weight of the fear network is not finite after a fit.")
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs."""
+        return {
+            "network": weights_of(self.network),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "fitted": self.fitted,
+            "share": self.share,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on from ``state_dict()``."""
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        restore(self.generator, state["generator"])
+        self.fitted, self.share = state["fitted"], state["share"]
+
+
+def auroc(score: Tensor, positive: Tensor) -> float:
+    """Area under the ROC curve: how often a positive outranks a negative, ties counting half.
+
+    Args:
+        score: Scores, higher for positives, shape (n,).
+        positive: The true classes, bool, shape (n,).
+
+    Returns:
+        A number in [0, 1]; NaN where a class is empty.
+    """
+    positives = int(positive.sum())
+    negatives = len(positive) - positives
+    if positives == 0 or negatives == 0:
+        return float("nan")
+    ranked = score[~positive].sort().values
+    found = score[positive].contiguous()
+    below, not_above = (torch.searchsorted(ranked, found, side=side) for side in ("left", "right"))
+    return (below.sum() + not_above.sum()).item() / (2 * positives * negatives)

@@ -1,0 +1,247 @@
+"""What every goal selector promises. A selector sees tensors only, never an environment or a learner."""
+
+import abc
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from deimos.goals import picks
+from deimos.goals.interactions import Interactions
+from deimos.learn.rollout import Rollout
+
+if TYPE_CHECKING:  # it needs PPO, which needs this module
+    from deimos.nn.ensemble import Stack, StackKernels
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """What a network sees of a candidate: clip((x - mean) * factor, -bound, bound). Tensors may change, not move."""
+
+    mean: Tensor
+    """Shape (goal_dim,)."""
+    factor: Tensor
+    """Shape (goal_dim,)."""
+    bound: float
+    """Above 0."""
+
+
+class Fuse(Protocol):
+    """Makes ``scores(context, candidates)``, shape (B, N), of a network; ``None`` where it cannot: ``fused.fuse``."""
+
+    def __call__(
+        self, net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None
+    ) -> Callable[[Tensor, Tensor], Tensor] | None:
+        """See ``fused.fuse``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """What a selector needs to know about the worlds that it serves."""
+
+    num_envs: int
+    """Number of worlds."""
+    state_dim: int
+    """Components of a state (the observation without its goal)."""
+    goal_dim: int
+    """Components of a goal."""
+    goal_period: int
+    """T: steps that a goal is in force."""
+    device: torch.device
+    """Where the tensors lie."""
+    groups: tuple[slice, ...] = (slice(None),)
+    """Components of a goal that are met or missed together; ``Resolved.tracking`` has one column for each."""
+    goal_start: int | None = None
+    """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
+    total_steps: int = 0
+    """Steps of the whole training; 0 where nobody knows."""
+    fuse: Fuse | None = None
+    """Who scores candidates in one kernel, where the worlds have kernels (``fused.fuse``); ``None`` for torch alone."""
+    fuse_critics: "Callable[[Stack], StackKernels | None] | None" = None
+    """Who has kernels for an ensemble (``fused_critics.fuse_critics``); ``None`` for torch alone."""
+
+    def state_then_goal(self, obs: Tensor) -> Tensor:
+        """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""
+        if self.goal_start is None or self.goal_start == self.state_dim:
+            return obs
+        start, stop = self.goal_start, self.goal_start + self.goal_dim
+        return torch.cat([obs[..., :start], obs[..., stop:], obs[..., start:stop]], dim=-1)
+
+    def require_total_steps(self, who: str) -> int:
+        """``total_steps``, for those who cannot do without.
+
+        Raises:
+            ValueError: If nobody knows it; ``who`` names the selector.
+        """
+        if self.total_steps < 1:
+            raise ValueError(f"{who} changes over the training, so Spaces.total_steps must be its steps, got 0.")
+        return self.total_steps
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The goals that a selector chose."""
+
+    goal: Tensor
+    """Shape (B, goal_dim)."""
+    score: Tensor
+    """What the selector thinks of each, NaN where it has no opinion, shape (B,)."""
+    learn: Tensor | None = None
+    """Whether the learner may use what follows, bool, shape (B,); ``None`` for everywhere."""
+    probe: Tensor | None = None
+    """True where the goal was drawn uniformly, whatever its score, bool, shape (B,); ``None`` for nowhere."""
+    note: Tensor | None = None
+    """A whole number that comes back with the interaction, int64 below 2^24, shape (B,); ``None`` for 0."""
+
+
+def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
+    """Any of the candidates, without an opinion.
+
+    Args:
+        candidates: Shape (B, N, goal_dim).
+        draw: Uniform numbers in [0, 1), shape (B,).
+    """
+    pick = picks.uniformly(draw, candidates.shape[1])
+    return Proposal(picks.take(candidates, pick), torch.full_like(draw, torch.nan))
+
+
+class Critic(Protocol):
+    """A value function that somebody else trains."""
+
+    def value(self, obs: Tensor) -> Tensor:
+        """Values, in units of scaled rewards, of observations of shape (..., obs_dim)."""
+        ...
+
+
+class SelectorConfig(abc.ABC):
+    """What the ``Config`` of a selector promises: a frozen dataclass in a file of ``deimos.goals.selectors``."""
+
+    @abc.abstractmethod
+    def build(self, spaces: Spaces, seed: int) -> "GoalSelector":
+        """Make the selector.
+
+        Args:
+            spaces: The worlds that it serves.
+            seed: Seed of its networks and of its own draws.
+        """
+
+
+class GoalSelector(abc.ABC):
+    """Chooses the goals of a training run."""
+
+    num_candidates: int = 1
+    """Candidates that it wants to choose from at every decision."""
+    parts: "tuple[GoalSelector, ...]" = ()
+    """The selectors that it is made of."""
+    needs_rollout: bool = False
+    """Whether ``learn`` needs the learner's transitions."""
+    first_goals_scaled: bool = False
+    """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
+
+    def goal_range(self) -> Tensor | None:
+        """Share of the goal range to draw candidates from, shape (goal_dim,), in (0, 1]; ``None`` for all of it."""
+        return None
+
+    @abc.abstractmethod
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """Choose the next goal of each listed world.
+
+        Args:
+            rows: Worlds, int64, shape (B,).
+            state: Their states, shape (B, state_dim).
+            goal: Their goals in force, shape (B, goal_dim).
+            candidates: Independent uniform goals for each, shape (B, num_candidates, goal_dim).
+            draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All chance
+                in the choice comes from here, so that it is the same in any batch.
+        """
+
+    def critic(self) -> "Critic | None":
+        """The value function that the learner shall use instead of its own, if this selector supplies one."""
+        return None
+
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """Learn from what happened, once per rollout.
+
+        Args:
+            interactions: The pending and the recently resolved ones.
+            rollout: The transitions since the last call; ``None`` in a loop that keeps none, where
+                selectors that learn from transitions raise ``ValueError``.
+
+        Returns:
+            Numbers for the log, the same keys every time.
+        """
+        return {}
+
+    def operations(self, decisions: float, transitions: int) -> float:
+        """Multiplications and additions of its matrix products in an iteration: what it cannot cost less than.
+
+        Args:
+            decisions: Goals that it chooses in an iteration.
+            transitions: Transitions of an iteration.
+        """
+        return sum(part.operations(decisions, transitions) for part in self.parts)
+
+    def check(self) -> None:  # noqa: B027 (a selector without weights has nothing to check)
+        """Raise ``SimulationError`` if a weight is not finite."""
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs."""
+        return {}
+
+    def load_state_dict(self, state: dict) -> None:  # noqa: B027 (nor anything to load)
+        """Go on from ``state_dict()``."""
+
+
+class Delegate(GoalSelector):
+    """Leaves everything to another selector, ``current``, but for what it overrides."""
+
+    @property
+    @abc.abstractmethod
+    def current(self) -> GoalSelector:
+        """Who chooses."""
+
+    @property
+    def num_candidates(self) -> int:  # type: ignore[override]
+        """See ``GoalSelector.num_candidates``."""
+        return self.current.num_candidates
+
+    @property
+    def needs_rollout(self) -> bool:  # type: ignore[override]
+        """See ``GoalSelector.needs_rollout``."""
+        return any(part.needs_rollout for part in self.parts)
+
+    @property
+    def first_goals_scaled(self) -> bool:  # type: ignore[override]
+        """See ``GoalSelector.first_goals_scaled``."""
+        return self.current.first_goals_scaled
+
+    def goal_range(self) -> Tensor | None:
+        """See ``GoalSelector.goal_range``."""
+        return self.current.goal_range()
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``."""
+        return self.current.propose(rows, state, goal, candidates, draws)
+
+    def critic(self) -> "Critic | None":
+        """See ``GoalSelector.critic``."""
+        return self.current.critic()
+
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """See ``GoalSelector.learn``."""
+        return self.current.learn(interactions, rollout)
+
+    def check(self) -> None:
+        """See ``GoalSelector.check``."""
+        self.current.check()
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        return self.current.state_dict()
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        self.current.load_state_dict(state)

@@ -1,0 +1,1 @@
+"""One file, one goal selector: a frozen dataclass ``Config``; see ``deimos.goals.selector.SelectorConfig``."""

@@ -1,0 +1,69 @@
+"""The Boltzmann Director: a soft adversary whose rationality grows (after Reddi et al. 2023, arXiv:2311.01642)."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from deimos.checks import check_range
+from deimos.goals import picks
+from deimos.goals.fear_selector import FearSelector, FearSelectorConfig
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import Spaces
+from deimos.learn.rollout import Rollout
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(FearSelectorConfig):
+    """A goal is drawn with a probability in proportion to exp(beta * logit of fear)."""
+
+    beta: float = 1.0
+    """Rationality at the end; 0 is Uniform, large is the Antagonist, negative cooperates. Finite."""
+    beta_start: float = 0.0
+    """Rationality at the start, finite."""
+    anneal: float = 0.5
+    """Share of the training over which it changes linearly, in [0, 1]; 0 begins with ``beta``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("beta", "beta_start"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite, got {getattr(self, name)}.")
+        check_range("anneal", self.anneal, 0.0, 1.0)
+
+    def build(self, spaces: Spaces, seed: int) -> "Boltzmann":
+        """See ``SelectorConfig.build``."""
+        return Boltzmann(self, spaces, seed)
+
+
+class Boltzmann(FearSelector):
+    """See ``Config``."""
+
+    config: Config
+
+    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
+        super().__init__(config, spaces, seed)
+        self._steps = config.anneal * spaces.require_total_steps("boltzmann") if config.anneal else 0.0
+        self.beta = config.beta_start if self._steps else config.beta
+        """Rationality now."""
+
+    def choose(self, score: Tensor, draw: Tensor) -> Tensor:
+        """See ``FearSelector.choose``."""
+        return picks.in_proportion(torch.softmax(self.beta * score, dim=1), draw)
+
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """See ``FearSelector.learn``."""
+        way = min(1.0, interactions.now / self._steps) if self._steps else 1.0
+        self.beta = self.config.beta_start + way * (self.config.beta - self.config.beta_start)
+        return super().learn(interactions, rollout) | {"fear/beta": self.beta}
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        return super().state_dict() | {"beta": self.beta, "steps": self._steps}
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        super().load_state_dict(state)
+        # A run that goes on with a larger budget keeps the schedule that it began with.
+        self.beta, self._steps = state["beta"], state["steps"]

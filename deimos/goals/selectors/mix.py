@@ -1,0 +1,58 @@
+"""Some uniform goals among a method's own."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from deimos.checks import check_range
+from deimos.goals.selector import Delegate, GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(SelectorConfig):
+    """A method chooses the goals, but a share of them is drawn uniformly."""
+
+    base: str = "p75"
+    """Name of the method."""
+    share: float = 0.2
+    """Share of uniform goals, in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        from deimos.goals.methods import method
+
+        method(self.base)
+        check_range("share", self.share, 0.0, 1.0)
+
+    def build(self, spaces: Spaces, seed: int) -> "Mix":
+        """See ``SelectorConfig.build``."""
+        return Mix(self, spaces, seed)
+
+
+class Mix(Delegate):
+    """See ``Config``. The uniform goals have no score and are marked as probes."""
+
+    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
+        from deimos.goals.methods import method
+
+        self.config = config
+        self.parts = (method(config.base).build(spaces, seed),)
+
+    @property
+    def current(self) -> GoalSelector:
+        """See ``Delegate.current``."""
+        return self.parts[0]
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``."""
+        own = self.current.propose(rows, state, goal, candidates, draws)
+        free = draws[:, 3] < self.config.share
+        anything = uniform_proposal(candidates, draws[:, 0]).goal
+        return replace(
+            own,
+            goal=torch.where(free.unsqueeze(1), anything, own.goal),
+            learn=None if own.learn is None else own.learn & ~free,
+            score=own.score.masked_fill(free, torch.nan),
+            probe=free if own.probe is None else free | own.probe,
+            note=None if own.note is None else own.note * ~free,
+        )

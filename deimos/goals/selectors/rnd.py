@@ -1,0 +1,216 @@
+"""Random network distillation over goals (Burda et al., ICLR 2019, arXiv:1810.12894; a rival in the thesis, 4.3)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from deimos.checks import SimulationError, check_at_least, check_choice, check_positive
+from deimos.goals import picks
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Whitening, uniform_proposal
+from deimos.learn.rollout import Rollout
+from deimos.nn.adam import Adam
+from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, operations, weights_of
+from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.seeds import generator, restore, weights_from
+
+CLIP = 5.0  # bound of whitened inputs, as in the paper
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(SelectorConfig):
+    """The goal whose (state, goal in force, next goal) a trained network predicts a frozen random one worst on."""
+
+    rule: Literal["argmax", "proportional"] = "argmax"
+    """Take the most surprising candidate, or draw in proportion to the surprise."""
+    candidates: int = 100
+    """N: uniform candidates per decision, at least 1."""
+    target: int = 32
+    """Units in the hidden layer of the frozen network, at least 1."""
+    predictor: int = 64
+    """Units in the hidden layer of the trained network, at least as many, so that it can become the frozen one."""
+    features: int = 16
+    """Outputs of both networks, at least 1."""
+    activation: Activation = "relu"
+    """Between the layers."""
+    learning_rate: float = 1e-3
+    """Step size of Adam, positive."""
+    epochs: int = 1
+    """Passes over the interactions that were issued since the last time, at least 1."""
+    minibatches: int = 4
+    """Parts that they are split into, at least 1."""
+
+    def __post_init__(self) -> None:
+        check_choice("rule", self.rule, ["argmax", "proportional"])
+        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_positive("learning_rate", self.learning_rate, finite=True)
+        for name in ("candidates", "target", "features", "epochs", "minibatches"):
+            check_at_least(name, getattr(self, name), 1)
+        if self.predictor < self.target:
+            raise ValueError(
+                f"predictor must have at least the target's {self.target} units, or it can never learn what the target "
+                f"says, got {self.predictor}."
+            )
+
+    def build(self, spaces: Spaces, seed: int) -> "RND":
+        """See ``SelectorConfig.build``."""
+        return RND(self, spaces, seed)
+
+
+class RND(GoalSelector):
+    """See ``Config``. Until inputs have been seen, and so can be whitened, it is uniform."""
+
+    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
+        self.config = config
+        self.num_candidates = config.candidates
+        inputs = spaces.state_dim + 2 * spaces.goal_dim
+        with weights_from(seed, "rnd weights"):
+            self.target = mlp(inputs, (config.target,), config.features, config.activation)
+            self.predictor = mlp(inputs, (config.predictor,), config.features, config.activation)
+            for layer in (*self.target, *self.predictor):
+                if isinstance(layer, nn.Linear):
+                    nn.init.orthogonal_(layer.weight, 2**0.5)
+            # The difference of two networks of one hidden layer is one such network, at half of the calls.
+            units = (config.target + config.predictor,)
+            self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
+        self.target.to(spaces.device)
+        self.predictor.to(spaces.device)
+        self._parameters, _ = flatten_parameters(self.predictor)
+        self._join()
+        self._error = ManyCandidates(self._difference, spaces.goal_dim)
+        self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
+        self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=spaces.device))
+        self.generator = generator(seed, "rnd minibatches", spaces.device)
+        # Inputs are whitened by the moments of states, goals in force and *uniform* candidates; those of the
+        # chosen goals would drift with what is chosen.
+        self._uniform = torch.full((spaces.num_envs, spaces.goal_dim), torch.nan, device=spaces.device)
+        self._moments = torch.zeros(3, inputs, dtype=torch.float64, device=spaces.device)  # count, sum, of squares
+        self._mean, self._scale = torch.zeros(inputs, device=spaces.device), torch.ones(inputs, device=spaces.device)
+        self._context = slice(0, inputs - spaces.goal_dim)
+        self._goal = slice(inputs - spaces.goal_dim, inputs)
+        whitening = Whitening(self._mean[self._goal], self._scale[self._goal], CLIP)
+        self._fused = spaces.fuse(self._difference, spaces.goal_dim, whitening=whitening) if spaces.fuse else None
+        self._learnt_at = 0  # step of the last call of learn
+        self.fitted = False
+        """Whether it has seen anything yet; before, nothing can be whitened."""
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``; scores are surprises."""
+        self._uniform[rows] = candidates[:, 0]
+        if not self.fitted:
+            return uniform_proposal(candidates, draws[:, 0])
+        score = self.surprise(state, goal, candidates)
+        pick = picks.by_rule(score, draws[:, 0], self.config.rule, 0.0)
+        return Proposal(picks.take(candidates, pick), picks.take(score, pick))
+
+    def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
+        """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
+        context = self._whiten(torch.cat([state, goal], dim=1), self._context)
+        if self._fused is not None:
+            return self._fused(context, candidates)
+        scores = []
+        # Features of all candidates together would not fit a cache; fresh memory for them costs more than the products.
+        size = self._error.contexts_at_once(candidates.shape[1])
+        for known, part in zip(context.split(size), candidates.split(size), strict=True):
+            scores.append(self._error(known, self._whiten(part, self._goal)).square_().mean(2))
+        return scores[0] if len(scores) == 1 else torch.cat(scores)
+
+    @torch.no_grad()
+    def _join(self) -> None:
+        """Make the network of the difference from the two; call it whenever one of them has changed."""
+        (first, last), (t_first, t_last), (p_first, p_last) = (
+            [layer for layer in net if isinstance(layer, nn.Linear)]
+            for net in (self._difference, self.target, self.predictor)
+        )
+        torch.cat([t_first.weight, p_first.weight], out=first.weight.data)
+        torch.cat([t_first.bias, p_first.bias], out=first.bias.data)
+        torch.cat([-t_last.weight, p_last.weight], dim=1, out=last.weight.data)
+        torch.sub(p_last.bias, t_last.bias, out=last.bias.data)
+
+    def _whiten(self, inputs: Tensor, part: slice) -> Tensor:
+        return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-CLIP, CLIP)
+
+    @torch.no_grad()
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """Whiten by, and learn from, what was issued since the last time; no outcome is needed."""
+        env, state, goal, next_goal = interactions.issued(self._learnt_at)
+        self._learnt_at = interactions.now
+        uniform = self._uniform[env]
+        known = uniform.isfinite().all(1)  # in a world whose goals somebody else chose so far, it has seen none
+        state, goal, next_goal, uniform = state[known], goal[known], next_goal[known], uniform[known]
+        if len(uniform) == 0:
+            return {"rnd/surprise": float("nan"), "rnd/loss": float("nan")}
+        context = torch.cat([state, goal], dim=1)
+        self._observe(torch.cat([context, uniform], dim=1).double())
+        everything = slice(0, len(self._mean))
+        inputs = self._whiten(torch.cat([context, next_goal], dim=1), everything)
+        target = self._target_pass.forward(inputs)
+        surprise = (self._pass.forward(inputs) - target).square_().mean().item()
+        return {"rnd/surprise": surprise, "rnd/loss": self._fit(inputs, target)}
+
+    def _observe(self, inputs: Tensor) -> None:
+        self._moments[0] += len(inputs)
+        self._moments[1] += inputs.sum(0)
+        self._moments[2] += inputs.square().sum(0)
+        mean = self._moments[1] / self._moments[0]
+        variance = (self._moments[2] / self._moments[0] - mean.square()).clamp(min=0)
+        self._mean.copy_(mean)
+        # A constant input tells nothing, and would explode on the first change.
+        self._scale.copy_(torch.where(variance > 1e-12, variance, torch.inf).rsqrt())
+        self.fitted = True
+
+    def _fit(self, inputs: Tensor, target: Tensor) -> float:
+        """Adam on the mean squared error; returns that of the last pass."""
+        assert self._parameters.grad is not None
+        size = -(-len(inputs) // self.config.minibatches)
+        total = torch.zeros((), device=inputs.device)
+        for _ in range(self.config.epochs):
+            total.zero_()
+            order = torch.randperm(len(inputs), generator=self.generator, device=inputs.device)
+            for rows in order.split(size):
+                self._parameters.grad.zero_()
+                error = self._pass.forward(inputs[rows]) - target[rows]
+                self._pass.backward(error * (2.0 / error.numel()))
+                mean_over_ranks(self._parameters.grad)
+                self.optimizer.step()
+                total += error.square().sum()
+        self._join()
+        return (total / (len(inputs) * self.config.features)).item()
+
+    def operations(self, decisions: float, transitions: int) -> float:
+        """See ``GoalSelector.operations``."""
+        score = self._error.operations(decisions, self.num_candidates)
+        return score + decisions * (operations(self.target) + 3 * operations(self.predictor)) * self.config.epochs
+
+    def check(self) -> None:
+        """See ``GoalSelector.check``."""
+        if not bool(self._parameters.isfinite().all()):
+            raise SimulationError("A weight of the RND predictor is not finite after a fit.")
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        return {
+            "predictor": weights_of(self.predictor),
+            "target": weights_of(self.target),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "uniform": self._uniform.clone(),
+            "moments": self._moments.clone(),
+            "mean": self._mean.clone(),
+            "scale": self._scale.clone(),
+            "learnt_at": self._learnt_at,
+            "fitted": self.fitted,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        self.predictor.load_state_dict(state["predictor"])
+        self.target.load_state_dict(state["target"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        restore(self.generator, state["generator"])
+        for name in ("uniform", "moments", "mean", "scale"):
+            getattr(self, f"_{name}").copy_(state[name])
+        self._learnt_at, self.fitted = state["learnt_at"], state["fitted"]
+        self._join()

@@ -1,0 +1,248 @@
+"""Value disagreement sampling (Zhang, Abbeel and Pinto, NeurIPS 2020, arXiv:2006.09641), on PPO as in the thesis, 4.3.
+
+Where critics that saw the same task disagree about a goal, there is something to learn. Each has returns of
+its own, bootstrapped from its own values: regressed on one shared target they would soon agree.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
+from deimos.goals import picks
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
+from deimos.learn.ppo import advantages
+from deimos.learn.rollout import Rollout
+from deimos.nn.adam import Adam
+from deimos.nn.ensemble import Stack, deviation
+from deimos.nn.matmul import on_threads
+from deimos.nn.networks import Activation, mlp, operations
+from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.seeds import generator, restore, weights_from
+
+WORKSPACE = 2**24  # numbers that the inputs of the candidates of decisions made at once may take
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(SelectorConfig):
+    """Goals by the standard deviation of an ensemble's values."""
+
+    rule: Literal["proportional", "argmax", "percentile"] = "proportional"
+    """Draw in proportion to the deviation, take its largest, or draw from above its percentile."""
+    percentile: float = 75.0
+    """Share of candidates that ``percentile`` discards, in [0, 100] [%]."""
+    role: Literal["replace", "auxiliary"] = "replace"
+    """Whether the ensemble's mean is the learner's baseline too (the thesis), or the learner keeps its own critic
+    (the comparison of goal selection alone)."""
+    data: Literal["all", "share"] = "all"
+    """Whether every critic learns from all transitions, or from those of its own part of the worlds, drawn anew
+    for every rollout: K times cheaper."""
+    critics: int = 10
+    """K, at least 2 where they are to disagree; 1 is a plain critic."""
+    candidates: int = 100
+    """N: uniform candidates per decision, at least 1."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of the hidden layers of every critic."""
+    activation: Activation = "relu"
+    """Between the layers."""
+    learning_rate: float = 1e-3
+    """Step size of Adam, positive."""
+    epochs: int = 5
+    """Passes over every critic's data, at least 1."""
+    minibatches: int = 4
+    """Parts that its data are split into, in an order of its own, at least 1."""
+    clip: float = 0.2
+    """How far a value may move in one update, positive; infinite for no clipping."""
+    max_grad_norm: float = 1.0
+    """Norm that every critic's gradient is clipped to, positive."""
+
+    def __post_init__(self) -> None:
+        check_choice("rule", self.rule, ["proportional", "argmax", "percentile"])
+        check_choice("role", self.role, ["replace", "auxiliary"])
+        check_choice("data", self.data, ["all", "share"])
+        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_range("percentile", self.percentile, 0.0, 100.0)
+        check_hidden("hidden", self.hidden)
+        for name in ("critics", "candidates", "epochs", "minibatches"):
+            check_at_least(name, getattr(self, name), 1)
+        check_positive("learning_rate", self.learning_rate, finite=True)
+        check_positive("clip", self.clip)
+        check_positive("max_grad_norm", self.max_grad_norm, finite=True)
+
+    def build(self, spaces: Spaces, seed: int) -> "VDS":
+        """See ``SelectorConfig.build``.
+
+        Raises:
+            ValueError: If there are fewer worlds than critics that share them.
+        """
+        if self.data == "share" and spaces.num_envs < self.critics:
+            raise ValueError(
+                f"critics must be at most the {spaces.num_envs} worlds that they share, got {self.critics}; "
+                "use data 'all'."
+            )
+        return VDS(self, spaces, seed)
+
+
+class VDS(GoalSelector):
+    """See ``Config``."""
+
+    needs_rollout = True
+
+    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
+        self.config, self._spaces = config, spaces
+        self.num_candidates = config.candidates
+        inputs, device = spaces.state_dim + spaces.goal_dim, spaces.device
+        nets = []
+        for k in range(config.critics):
+            with weights_from(seed, f"vds critic {k}"):
+                nets.append(mlp(inputs, config.hidden, 1, config.activation).to(device))
+        self.stack = Stack(nets, spaces.fuse_critics)
+        self.optimizer = Adam(self.stack.parameters, torch.tensor(config.learning_rate, device=device))
+        self.generator = generator(seed, "vds minibatches", device)
+        self._known: tuple[Tensor, Tensor] | None = None  # a whole rollout's observations and their values
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
+        count = candidates.shape[1]
+        at_once = max(1, WORKSPACE // (count * (state.shape[1] + candidates.shape[2])))
+        values = []
+        for context, options in zip(state.split(at_once), candidates.split(at_once), strict=True):
+            inputs = torch.cat([context.unsqueeze(1).expand(-1, count, -1), options], dim=2)
+            values.append(self.stack.values(inputs.flatten(0, 1)))
+        score = deviation(torch.cat(values, dim=1)).view(-1, count)
+        pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
+        return Proposal(picks.take(candidates, pick), picks.take(score, pick))
+
+    def critic(self) -> Critic | None:
+        """See ``GoalSelector.critic``."""
+        return self if self.config.role == "replace" else None
+
+    def value(self, obs: Tensor) -> Tensor:
+        """Mean value over the ensemble, shape (...,), of observations of shape (..., obs_dim)."""
+        values = self.values(obs)
+        if obs.dim() == 3:
+            self._known = obs, values
+        return values.mean(0)
+
+    def values(self, obs: Tensor) -> Tensor:
+        """Values by every critic, shape (K, ...), of observations of shape (..., obs_dim)."""
+        inputs = self._spaces.state_then_goal(obs).flatten(0, -2)
+        return self.stack.values(inputs).view(len(self.stack.nets), *obs.shape[:-1])
+
+    @torch.no_grad()
+    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+        """Move every critic towards the lambda-returns that it sees itself."""
+        if rollout is None:
+            raise ValueError("vds learns values, so it needs the learner's rollout, got None.")
+        worlds = self._worlds(rollout.obs.shape[1], rollout.obs.device)
+        old, returns = self._targets(rollout, worlds)
+        loss = self._fit(rollout, worlds, old, returns)
+        spread = deviation(old).mean().item() if self.config.data == "all" else float("nan")
+        self._known = None
+        return {"vds/loss": loss, "vds/deviation": spread, "vds/value": old.mean().item()}
+
+    def _worlds(self, num_envs: int, device: torch.device) -> Tensor:
+        """The worlds that every critic learns from, int64, shape (K, worlds of each)."""
+        count = self.config.critics
+        if self.config.data == "all":
+            return torch.arange(num_envs, device=device).expand(count, -1)
+        size = num_envs // count  # what does not divide evenly is left out, another part every time
+        return torch.randperm(num_envs, generator=self.generator, device=device)[: count * size].view(count, size)
+
+    def _targets(self, rollout: Rollout, worlds: Tensor) -> tuple[Tensor, Tensor]:
+        """Values before the update and lambda-returns, shape (K, num_steps, worlds of each)."""
+        shared = self.config.data == "all"
+        if shared and self._known is not None and self._known[0] is rollout.obs:
+            value = self._known[1]
+        elif shared:
+            value = self.values(rollout.obs)
+        else:
+            value = self._own_values(rollout.obs, worlds)
+        next_value = value[:, 1:]
+        if len(rollout.final_obs):
+            step, world = rollout.truncated.nonzero(as_tuple=True)
+            final = torch.zeros(len(worlds), *rollout.truncated.shape, device=value.device)
+            final[:, step, world] = self.values(rollout.final_obs[step, world])
+            own = final.gather(2, worlds.unsqueeze(1).expand(-1, rollout.num_steps, -1))
+            next_value = torch.where(_of_worlds(rollout.truncated, worlds), own, next_value)
+        old = value[:, :-1]
+
+        def along_time(tensor: Tensor) -> Tensor:  # (K, num_steps, m) -> (num_steps, K * m)
+            return tensor.transpose(0, 1).flatten(1)
+
+        advantage = advantages(
+            along_time(_of_worlds(rollout.reward, worlds)) * rollout.reward_scale, along_time(old),
+            along_time(next_value), along_time(_of_worlds(rollout.terminated, worlds)),
+            along_time(_of_worlds(rollout.truncated, worlds)),
+            discount=rollout.discount, gae_lambda=rollout.gae_lambda,
+        )  # fmt: skip
+        return old, advantage.view(rollout.num_steps, len(worlds), -1).transpose(0, 1) + old
+
+    def _own_values(self, obs: Tensor, worlds: Tensor) -> Tensor:
+        """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
+        own = self._spaces.state_then_goal(obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds of each, inputs)
+        return self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
+
+    def _fit(self, rollout: Rollout, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
+        """Adam on the clipped value loss; returns its mean over critics and minibatches.
+
+        As PPO, it learns nothing, and gives NaN, where fewer transitions count than a minibatch has.
+        """
+        rows = rollout.num_steps * worlds.shape[1]
+        minibatches = min(self.config.minibatches, rows)
+        size = rows // minibatches
+        order = torch.stack([torch.randperm(rows, generator=self.generator, device=old.device) for _ in worlds])
+        steps = torch.arange(rollout.num_steps, device=order.device) * rollout.obs.shape[1]
+        place = (steps.unsqueeze(1) + worlds.unsqueeze(1)).flatten(1).gather(1, order)  # in the flat rollout
+        weight = rollout.weight.take(place)
+        if bool(mean_over_ranks(weight.sum(1).min()) < size):
+            return float("nan")
+        obs = self._spaces.state_then_goal(rollout.obs[:-1]).flatten(0, 1)
+        lesson = self.stack.gradients(
+            obs.index_select(0, place.flatten()).view(*order.shape, -1), old.flatten(1).gather(1, order),
+            returns.flatten(1).gather(1, order), weight, self.config.clip,
+        )  # fmt: skip
+        losses = torch.zeros(len(worlds), device=old.device)
+        assert self.stack.parameters.grad is not None
+        # A thread of torch's that has had work goes on waiting for more, and would take the processor from the lessons.
+        with on_threads(1):
+            for _ in range(self.config.epochs):
+                for start in range(0, minibatches * size, size):
+                    losses += lesson(range(start, start + size))
+                    mean_over_ranks(self.stack.parameters.grad)
+                    self.stack.clip_gradients(self.config.max_grad_norm)
+                    self.optimizer.step()
+        return losses.mean().item() / (self.config.epochs * minibatches)
+
+    def operations(self, decisions: float, transitions: int) -> float:
+        """See ``GoalSelector.operations``."""
+        rows = transitions * (self.config.critics if self.config.data == "all" else 1)
+        learning = rows * operations(self.stack.nets[0]) * (1 + 3 * self.config.epochs)  # values, then the passes
+        return learning + decisions * self.num_candidates * self.config.critics * operations(self.stack.nets[0])
+
+    def check(self) -> None:
+        """See ``GoalSelector.check``."""
+        if not bool(self.stack.parameters.isfinite().all()):
+            raise SimulationError("A weight of the VDS ensemble is not finite after a fit.")
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        return {
+            "parameters": self.stack.parameters.detach().clone(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        self.stack.parameters.data.copy_(state["parameters"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        restore(self.generator, state["generator"])
+
+
+def _of_worlds(tensor: Tensor, worlds: Tensor) -> Tensor:
+    """The columns of ``tensor``, shape (steps, num_envs), that each critic has, shape (K, steps, worlds of each)."""
+    return tensor[:, worlds].transpose(0, 1)

@@ -1,0 +1,1 @@
+"""The learner: PPO, its rollouts, the policy that it leaves behind."""

@@ -1,0 +1,89 @@
+"""A trained policy in one file: weights, observation scaling and layout."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from deimos.nn.networks import Activation, Actor, weights_of
+from deimos.run.folder import RunError, load_tensors, save_tensors
+from deimos.sim.env import Env, ObsField
+
+SCHEMA = 1
+
+
+class Policy(nn.Module):
+    """Physical observations to actions, by the mean of the trained policy.
+
+    Attributes:
+        layout: What stands where in the observation, with units.
+        goal_slice: Where the goal stands.
+        dt: Duration of a step [s]; 1 where the world has no seconds.
+    """
+
+    scale: Tensor
+
+    def __init__(
+        self, actor: Actor, hidden: Sequence[int], activation: Activation,
+        layout: Sequence[ObsField], action_bound: float, dt: float,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.actor = actor
+        self.hidden = tuple(hidden)
+        self.activation = activation
+        self.layout = tuple(layout)
+        self.action_bound = action_bound
+        self.dt = dt
+        scale = [torch.as_tensor(field.scale, dtype=torch.float32).expand(field.size) for field in layout]
+        self.register_buffer("scale", torch.cat(scale).to(actor.std.device))
+        start = sum(field.size for field in self.layout[: [f.name for f in self.layout].index("goal")])
+        self.goal_slice = slice(start, start + next(f.size for f in self.layout if f.name == "goal"))
+
+    @torch.no_grad()
+    def forward(self, obs: Tensor) -> Tensor:
+        """Actions, shape (n, action_dim), for observations in physical units, shape (n, obs_dim)."""
+        return self.scaled(obs * self.scale)
+
+    @torch.no_grad()
+    def scaled(self, obs: Tensor) -> Tensor:
+        """Actions for observations as the environment gives them, already scaled."""
+        return self.actor(obs).clamp(-self.action_bound, self.action_bound)
+
+
+def save_policy(path: Path, actor: Actor, hidden: Sequence[int], activation: Activation, env: Env) -> None:
+    """Write a policy that needs nothing else to run."""
+    save_tensors(path, {
+        "schema": SCHEMA,
+        "actor": weights_of(actor),
+        "hidden": list(hidden),
+        "activation": activation,
+        "layout": [asdict(field) for field in env.layout],
+        "action_bound": env.action_bound,
+        "dt": env.dt,
+    })  # fmt: skip
+
+
+def load_policy(path: Path | str, device: str = "cpu") -> Policy:
+    """Read a policy.
+
+    Args:
+        path: A ``policy.pt``, or the run folder that holds one.
+        device: Where it shall act.
+
+    Raises:
+        RunError: If there is no policy.
+    """
+    path = Path(path)
+    path = path / "policy.pt" if path.is_dir() else path
+    data = load_tensors(path, "policy", SCHEMA)
+    try:
+        layout = [ObsField(**field) for field in data["layout"]]
+        weights = data["actor"]
+        actor = Actor(sum(field.size for field in layout), data["hidden"], len(weights["std"]), data["activation"], 1.0)
+        actor.load_state_dict(weights)
+        actor.to(device)
+        return Policy(actor, data["hidden"], data["activation"], layout, data["action_bound"], data["dt"])
+    except (KeyError, TypeError, RuntimeError, ValueError) as error:
+        raise RunError(f"{path} is not a policy of this version: {error}.") from error

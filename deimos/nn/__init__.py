@@ -1,0 +1,1 @@
+"""Networks and how they learn: the leaf that every other package may use; torch and NumPy alone."""

@@ -1,0 +1,121 @@
+"""Values and gradients of a stack of critics by Warp kernels, on the threads of a CPU."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import torch
+import warp as wp
+from torch import Tensor, nn
+
+from deimos.kernels.critics import CriticTables, Layout, gradients, values
+from deimos.nn.ensemble import Stack
+
+LARGE = 2**18  # values that a call may ask for whose memory is kept until the next one
+_Copies = list[tuple[Tensor, Tensor]]  # destination and source
+
+
+def fuse_critics(stack: Stack) -> "FusedCritics | None":
+    """Kernels for a stack; ``None`` unless it lies on a CPU, has ReLU between its layers and one output."""
+    linears = [layer for layer in stack.nets[0] if isinstance(layer, nn.Linear)]
+    fits = isinstance(stack.nets[0][1], nn.ReLU) and linears[-1].out_features == 1
+    return FusedCritics(stack, linears) if fits and stack.parameters.device.type == "cpu" else None
+
+
+class FusedCritics:
+    """See ``fuse_critics``. Threads share the members; what a member computes does not depend on their number."""
+
+    def __init__(self, stack: Stack, linears: list[nn.Linear]) -> None:
+        wp.init()
+        layout = Layout((linears[0].in_features, *(layer.out_features for layer in linears[:-1])))
+        count = len(stack.nets)
+        self._table = torch.zeros(count, layout.rows, layout.width)
+        self._gradient = torch.zeros_like(self._table)
+        self._loads, self._stores = _views(stack, layout, self._table, self._gradient)
+        self._critics = CriticTables(layout, wp.from_torch(self._table), wp.from_torch(self._gradient))
+        self._others = max(1, min(stack.threads, count)) - 1
+        """Threads beside the caller's."""
+        self._pool = ThreadPoolExecutor(max(1, self._others))
+        self._values: list[wp.Launch] = []
+
+    @torch.no_grad()
+    def values(self, x: Tensor) -> Tensor:
+        """See ``Stack.values``."""
+        value = torch.empty(len(self._table), x.shape[-2])
+        arrays = {"x": wp.from_torch(x.expand(len(self._table), -1, -1)), "value": wp.from_torch(value)}
+        if not self._values:
+            self._values = self._record(partial(values, self._critics, **arrays))
+        for launch in self._values:
+            for name, array in arrays.items():
+                launch.set_param_by_name(name, array)
+        _copy(self._loads)
+        self._run(self._values)
+        if value.numel() > LARGE:
+            self._values.clear()  # launches keep what they worked on
+        return value
+
+    @torch.no_grad()
+    def gradients(
+        self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor, clip: float
+    ) -> Callable[[range], Tensor]:
+        """See ``Stack.gradients``."""
+        loss = torch.zeros(len(self._table))
+        arrays = [wp.from_torch(tensor.contiguous()) for tensor in (x, before, target, weight, loss)]
+        # A recorded launch keeps its arguments alive.
+        launches = self._record(partial(gradients, self._critics, *arrays, clip=clip, rows=range(1)))
+
+        def lesson(rows: range) -> Tensor:
+            for launch in launches:
+                launch.set_param_by_name("start", rows.start)
+                launch.set_param_by_name("stop", rows.stop)
+            _copy(self._loads)
+            self._run(launches)
+            _copy(self._stores)
+            return loss
+
+        return lesson
+
+    def _record(self, launcher: Callable[..., wp.Launch | None]) -> list[wp.Launch]:
+        """A launch for every member."""
+        launches = [launcher(members=range(k, k + 1), record=True) for k in range(len(self._table))]
+        return [launch for launch in launches if launch is not None]
+
+    def _run(self, launches: list[wp.Launch]) -> None:
+        """Run all launches; each thread takes the next one, as processors that others use too are not equally fast."""
+        waiting = iter(launches)
+
+        def work() -> None:
+            for launch in waiting:
+                launch.launch()  # Python's lock is free meanwhile
+
+        others = [self._pool.submit(work) for _ in range(self._others)]
+        work()
+        for other in others:
+            other.result()
+
+
+def _copy(views: _Copies) -> None:
+    for to, source in views:
+        to.copy_(source)
+
+
+def _views(stack: Stack, layout: Layout, table: Tensor, gradient: Tensor) -> tuple[_Copies, _Copies]:
+    """What fills the tables, and what their gradients go to."""
+    loads: _Copies = []
+    stores: _Copies = []
+    for layer, (weight, weight_grad, bias, bias_grad) in enumerate(stack.layers):
+        outputs, inputs = weight.shape[1:]
+        loads += zip(_places(layout, layer, inputs, outputs, table), (weight, bias), strict=True)
+        stores += zip((weight_grad, bias_grad), _places(layout, layer, inputs, outputs, gradient), strict=True)
+        if 0 < layer < len(layout.turned):
+            turned = layout.turned[layer]
+            loads.append((table[:, turned : turned + outputs, :inputs], weight))
+    return loads, stores
+
+
+def _places(layout: Layout, layer: int, inputs: int, outputs: int, table: Tensor) -> tuple[Tensor, Tensor]:
+    """A layer's weights, shape (K, outputs, inputs), and biases, shape (K, outputs), in the tables."""
+    start = layout.start[layer]
+    if layer == len(layout.turned):  # the output's
+        return table[:, start : start + 1, :inputs], table[:, start + 1, :1]
+    return table[:, start : start + inputs, :outputs].transpose(1, 2), table[:, start + inputs, :outputs]

@@ -1,0 +1,85 @@
+"""Configurations to and from plain dictionaries, so that a run folder can rebuild its run."""
+
+import dataclasses
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+from deimos import plugins
+from deimos.goals import selectors
+from deimos.goals.selector import SelectorConfig
+from deimos.sim import envs
+from deimos.sim.env import EnvConfig
+
+_PLUGINS = {EnvConfig: envs, SelectorConfig: selectors}
+
+
+def to_dict(config: Any) -> dict:
+    """A dataclass as a dictionary of JSON types; a plugin's configuration names its plugin in ``kind``."""
+    if isinstance(config, EnvConfig | SelectorConfig):
+        return {"kind": kind(config)} | _fields(config)
+    return _fields(config)
+
+
+def _fields(config: Any) -> dict:
+    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return to_dict(value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and math.isinf(value):
+        return str(value)  # JSON has no infinity
+    return list(value) if isinstance(value, tuple) else value
+
+
+def kind(config: EnvConfig | SelectorConfig) -> str:
+    """Name of the plugin that a configuration belongs to.
+
+    Raises:
+        ValueError: If it belongs to none.
+    """
+    package = next(package for base, package in _PLUGINS.items() if isinstance(config, base))
+    for name in plugins.names(package):
+        if plugins.load(package, name).Config is type(config):
+            return name
+    raise ValueError(f"{type(config)} is not the Config of a plugin of {package.__name__}.")
+
+
+def from_dict(cls: type, data: dict) -> Any:
+    """Rebuild a dataclass from ``to_dict``.
+
+    Raises:
+        ValueError: If a field is unknown or a value is not allowed. A missing field takes its default.
+    """
+    data = dict(data)
+    if cls in _PLUGINS:
+        if "kind" not in data:
+            raise ValueError(f"A configuration of {_PLUGINS[cls].__name__} must name its 'kind', got {data}.")
+        cls = plugins.load(_PLUGINS[cls], data.pop("kind")).Config
+    hints = typing.get_type_hints(cls)
+    names = {field.name for field in dataclasses.fields(cls)}
+    if unknown := sorted(set(data) - names):
+        raise ValueError(
+            f"{cls.__module__}.{cls.__name__} has no {', '.join(unknown)}; it has: {', '.join(sorted(names))}."
+        )
+    return cls(**{name: _typed(hints[name], value) for name, value in data.items()})
+
+
+def _typed(hint: Any, value: Any) -> Any:
+    """``value`` as the type that ``hint`` asks for, where JSON cannot say it."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        if value is None:
+            return None
+        hint = next(part for part in typing.get_args(hint) if part is not type(None))
+    if hint in _PLUGINS or dataclasses.is_dataclass(hint):
+        return from_dict(hint, value)
+    if hint is Path:
+        return Path(value)
+    if hint is float:
+        return float(value)
+    return tuple(value) if isinstance(value, list) else value

@@ -1,0 +1,56 @@
+"""Ready configurations: what an environment is trained with unless somebody says otherwise.
+
+A module of ``deimos.sim.envs`` may hold ``PRESETS``: by name, the fields of ``TrainConfig`` that differ from its
+defaults. The one with the environment's own name is what ``env:NAME`` starts from. As on the command line,
+hyphens and underscores in a name are the same.
+"""
+
+from typing import Any
+
+from deimos import plugins
+from deimos.run.training import TrainConfig
+from deimos.sim import envs
+
+
+def _all() -> dict[str, tuple[str, dict[str, Any]]]:
+    """Environment and fields of every preset."""
+    found: dict[str, tuple[str, dict[str, Any]]] = {}
+    for env in plugins.names(envs):
+        module = plugins.load(envs, env)
+        own = {_spelled(env): {"env": module.Config()}} | getattr(module, "PRESETS", {})
+        found |= {_spelled(name): (env, fields) for name, fields in own.items()}
+    return found
+
+
+def names() -> list[str]:
+    """Names of all presets, sorted."""
+    return sorted(_all())
+
+
+def environment(name: str) -> str:
+    """Name of the environment that a preset is for.
+
+    Raises:
+        ValueError: If there is no such preset; the message lists those that there are.
+    """
+    return _get(name)[0]
+
+
+def preset(name: str) -> TrainConfig:
+    """The configuration of a preset.
+
+    Raises:
+        ValueError: If there is no such preset; the message lists those that there are.
+    """
+    return TrainConfig(**_get(name)[1])
+
+
+def _get(name: str) -> tuple[str, dict[str, Any]]:
+    found = _all()
+    if _spelled(name) not in found:
+        raise ValueError(f"There is no preset '{name}'; there are: {', '.join(sorted(found))}.")
+    return found[_spelled(name)]
+
+
+def _spelled(name: str) -> str:
+    return name.replace("_", "-")

@@ -1,0 +1,1 @@
+"""Simulated worlds: what an environment promises, and those that there are."""

@@ -1,0 +1,274 @@
+"""What every environment promises.
+
+The order of one step is part of the contract: physics; crash test; reward, against the goal that was
+in force; clocks; the observation that the step ended in, still with the old goal. ``step`` never
+resets a world and never changes a goal: ``deimos.run.loop`` does both, between two steps.
+"""
+
+import abc
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    import mujoco
+    import numpy as np
+
+
+@dataclass(frozen=True)
+class ObsField:
+    """A run of components of the observation."""
+
+    name: str
+    size: int
+    unit: str
+    scale: float | tuple[float, ...]
+    """The policy sees the physical value times this; one number for all components or one for each."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step gave back. All tensors are views that the next step overwrites."""
+
+    obs: Tensor
+    """Observations that the step ended in, float32, shape (num_envs, obs_dim)."""
+    reward: Tensor
+    """Rewards, at least 0, float32, shape (num_envs,)."""
+    terminated: Tensor
+    """True where the world crashed, bool, shape (num_envs,)."""
+    truncated: Tensor
+    """True where the episode was cut off without a crash, bool, shape (num_envs,)."""
+    goal_due: Tensor
+    """True where the goal has been in force for its whole period and the state is valid, bool, shape (num_envs,)."""
+    invalid: Tensor
+    """True where the state is not physical any more, bool, shape (num_envs,). Such a world is truncated too, unless
+    it crashed, or the run stops (see ``Env.may_go_on_invalid``)."""
+    count: Tensor
+    """Worlds with a goal due that are not done, and worlds that are done, int32, shape (2,)."""
+    tracking: Tensor | None = None
+    """How well each group of goal components is met, in [0, 1], float32, shape (num_envs, len(goal_groups));
+    ``None`` where there is one group and the reward itself says it."""
+
+
+class EnvConfig(abc.ABC):
+    """What the ``Config`` of an environment promises: a frozen dataclass in a file of ``deimos.sim.envs``."""
+
+    goal_period: int
+    """T: steps that a goal is in force."""
+
+    @abc.abstractmethod
+    def build(self, num_envs: int, device: torch.device, seed: int, env_offset: int = 0) -> "Env":
+        """Make the environment.
+
+        Args:
+            num_envs: Number of worlds, at least 1.
+            device: Where they are simulated.
+            seed: Seed of every draw, in [0, 2^32).
+            env_offset: Global number of world 0. Draws are addressed by global numbers, so two
+                environments of 1000 worlds, the second with an offset of 1000, equal one of 2000.
+        """
+
+    @abc.abstractmethod
+    def with_goal_period(self, goal_period: int) -> "EnvConfig":
+        """The same task with another T."""
+
+    @abc.abstractmethod
+    def for_evaluation(self) -> "EnvConfig":
+        """The same task with every randomisation switched off and all goal clocks in step."""
+
+
+class Env(abc.ABC):
+    """Many worlds, simulated in parallel, each pursuing a goal of its own; built with an episode begun in each."""
+
+    config: EnvConfig
+    num_envs: int
+    device: torch.device
+    layout: tuple[ObsField, ...]
+    """What stands where in the observation; the field named ``goal`` is the goal slot."""
+    action_dim: int
+    action_bound: float
+    """Actions are clipped to [-action_bound, action_bound]; may be infinite."""
+    dt: float
+    """Duration of a step [s]; 1 where the world has no seconds."""
+    goal_period: int
+    """T: steps that a goal is in force."""
+    time_limit: int
+    """Steps after which an episode is truncated; 0 for never."""
+    obs: Tensor
+    """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
+    may_go_on_invalid: bool = False
+    """Whether the run goes on where a world becomes invalid; else ``check`` stops it."""
+    goal_groups: tuple[slice, ...] = (slice(None),)
+    """Components of a goal that are met or missed together."""
+    errors: Mapping[str, Tensor] = MappingProxyType({})
+    """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
+    shape (num_envs,). Empty where ``Step.tracking`` says enough."""
+    episode_step: Tensor
+    """Steps since the last reset, int32, shape (num_envs,); a view."""
+    tensors: dict[str, Tensor]
+    """Everything that a bit-exact resume needs, by name; views, worlds along the first axis. ``episode_count`` and
+    ``goal_count`` are how many episodes each world has begun and how many goals it was given since: its draws'
+    addresses."""
+
+    @abc.abstractmethod
+    def step(self, action: Tensor) -> Step:
+        """Simulate one step of every world.
+
+        Args:
+            action: Actions, float32, shape (num_envs, action_dim).
+
+        Raises:
+            ValueError: If the shape is another.
+        """
+
+    @abc.abstractmethod
+    def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
+        """Start a new episode, with a uniform first goal, where ``mask`` is true.
+
+        Args:
+            mask: bool, shape (num_envs,).
+            goal_scale: Share of the goal range that first goals come from, shape (goal_dim,), in
+                (0, 1]; ``None`` for the whole range.
+        """
+
+    @abc.abstractmethod
+    def sample_goals(self, rows: Tensor, count: int, scale: Tensor | None = None) -> Tensor:
+        """Draw independent valid goals, uniform by this environment's definition.
+
+        Drawing again before ``set_goals`` gives the same goals.
+
+        Args:
+            rows: Worlds that need a goal, int64, shape (B,).
+            count: Goals per world, at least 1.
+            scale: Share of the goal range, shape (goal_dim,), in (0, 1]; ``None`` for the whole range.
+
+        Returns:
+            Goals as the policy sees them, shape (B, count, goal_dim); a view that the next call overwrites.
+        """
+
+    @abc.abstractmethod
+    def draw(self, rows: Tensor) -> Tensor:
+        """Four uniform numbers in [0, 1) per listed world for the choice of its next goal, shape (B, 4)."""
+
+    @abc.abstractmethod
+    def set_goals(self, rows: Tensor, goal: Tensor) -> None:
+        """Give the listed worlds a new goal, start its clock and refresh their observations.
+
+        Args:
+            rows: Worlds, int64, shape (B,), each at most once.
+            goal: Goals as the policy sees them, shape (B, goal_dim).
+        """
+
+    @abc.abstractmethod
+    def check(self) -> None:
+        """Raise ``SimulationError`` if an action was not finite or more worlds became invalid than may.
+
+        It reads the device. Call it after every step, or once in a while.
+        """
+
+    def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData] | None":
+        """One world as MuJoCo's model and data, for rendering; ``None`` where there is nothing to see."""
+        return None
+
+    def goal_point(self, world: int) -> "np.ndarray | None":
+        """Where the goal of one world is in its ``scene`` [m], shape (3,); ``None`` where a goal is no place."""
+        return None
+
+    @property
+    def has_seconds(self) -> bool:
+        """Whether ``dt`` is in seconds."""
+        return self.dt != 1
+
+    def strata(self) -> list[str]:
+        """What kind of world each one is, such as the ground that it stands on, for evaluation; empty for no kinds."""
+        return []
+
+    def report(self) -> dict[str, float]:
+        """What a log wants to know of the steps since the last call, the same keys every time; reads the device."""
+        return {}
+
+    @abc.abstractmethod
+    def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
+        """A scripted policy (obs -> action) that fixes 1 on the normalised score, if there is one."""
+
+    @property
+    def obs_dim(self) -> int:
+        """Components of the observation."""
+        return sum(field.size for field in self.layout)
+
+    @property
+    def goal_slice(self) -> slice:
+        """Where the goal sits in the observation."""
+        start = 0
+        for field in self.layout:
+            if field.name == "goal":
+                return slice(start, start + field.size)
+            start += field.size
+        raise ValueError("The layout has no field named 'goal'.")
+
+    @property
+    def goal_dim(self) -> int:
+        """Components of a goal."""
+        return self.goal_slice.stop - self.goal_slice.start
+
+    @property
+    def state_dim(self) -> int:
+        """Components of the observation that are not the goal."""
+        return self.obs_dim - self.goal_dim
+
+    @property
+    def goal(self) -> Tensor:
+        """The goals in force as the policies see them, shape (num_envs, goal_dim); a view."""
+        return self.obs[:, self.goal_slice]
+
+    def state(self, obs: Tensor) -> Tensor:
+        """The observation without its goal slot, shape (..., state_dim)."""
+        goal = self.goal_slice
+        if goal.stop == self.obs_dim:  # a goal at the end costs no copy
+            return obs[..., : goal.start]
+        return torch.cat([obs[..., : goal.start], obs[..., goal.stop :]], dim=-1)
+
+    def restart(self, goal_scale: Tensor | None = None) -> None:
+        """Begin every world's first episode again, as it was when the environment was built, its first goal apart.
+
+        Args:
+            goal_scale: Share of the goal range that first goals come from; see ``reset``.
+        """
+        for name in ("episode_count", "goal_count"):
+            self.tensors[name].zero_()
+        self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device), goal_scale)
+
+    def copy_worlds(self, source: Tensor, target: Tensor, origin: "Env | None" = None) -> None:
+        """Make worlds ``target`` exact clones of worlds ``source``, clocks and counts included.
+
+        A clone keeps its own global number, so what it draws later is its own.
+
+        Args:
+            source: Worlds to copy, int64, shape (n,).
+            target: Worlds to overwrite, int64, shape (n,), each at most once.
+            origin: The environment that ``source`` counts in; ``None`` for this one.
+        """
+        origin = self if origin is None else origin
+        for name, tensor in self.tensors.items():
+            tensor[target] = origin.tensors[name][source]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies of all tensors that a bit-exact resume needs."""
+        return {name: tensor.clone() for name, tensor in self.tensors.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from ``state_dict()``.
+
+        Raises:
+            ValueError: If ``state`` is that of another environment or another number of worlds.
+        """
+        expected = {name: tuple(tensor.shape) for name, tensor in self.tensors.items()}
+        found = {name: tuple(tensor.shape) for name, tensor in state.items()}
+        if expected != found:
+            raise ValueError(f"state must hold {expected}, got {found}; it is that of another environment.")
+        for name, tensor in self.tensors.items():
+            tensor.copy_(state[name])

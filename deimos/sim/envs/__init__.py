@@ -1,0 +1,1 @@
+"""One file, one environment: it holds a frozen dataclass ``Config`` (see ``deimos.sim.env.EnvConfig``)."""

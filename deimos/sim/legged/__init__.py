@@ -1,0 +1,1 @@
+"""Legged robots: the task, the engines that step them, the robots, the ground."""

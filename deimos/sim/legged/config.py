@@ -1,0 +1,109 @@
+"""How the task of a legged robot is set up; ``deimos.sim.legged.task`` is the task."""
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from deimos import terrain
+from deimos.checks import check_at_least, check_choice, check_positive, check_range
+from deimos.kernels.legged.rewards import RewardWeights
+from deimos.kernels.legged.state import LevelRule
+from deimos.sim.env import EnvConfig
+from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
+from deimos.terrain import Terrain
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocomotionConfig(EnvConfig):
+    """A legged robot on a terrain. Defaults are Legged Gym's but for those that say otherwise."""
+
+    terrain: str = "flat"
+    """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a saved terrain."""
+    goal_period: int = 500
+    """T: steps that a goal is in force, at least 1 and at most an episode."""
+    episode_steps: int = 1000
+    """Steps after which an episode is truncated, at least 1."""
+    levels: Literal["reward", "displacement", "frozen"] = "reward"
+    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far it got (Legged
+    Gym), or nothing."""
+    start_levels: int = 6
+    """Levels that first episodes are drawn from, at least 1."""
+    rewards: RewardWeights = field(default_factory=RewardWeights)
+    """Weights of the reward's terms."""
+    air_time_target: float = 0.3
+    """Time in the air from which on a step is rewarded [s], at least 0. Legged Gym has 0.5 s, for larger robots."""
+    friction: tuple[float, float] = (0.5, 1.25)
+    """Range of the feet's friction, drawn once per world; at least 0.05, below which contacts are ill-conditioned."""
+    payload: float = 1.0
+    """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0. Off in Legged
+    Gym, but for its ANYmal."""
+    push_interval: float = 15.0
+    """Time from push to push, each robot in a phase of its own [s], at least 0; 0 for none."""
+    push_speed: float = 1.0
+    """Bound of the horizontal velocity that a push sets [m/s], at least 0."""
+    noise: bool = True
+    """Whether observations are noisy."""
+    stagger: bool = True
+    """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
+    stiffness: float = 30.0
+    """Position gain of the legs' joints [N m/rad], positive. Legged Gym's A1, a lighter robot, has 20."""
+    damping: float = 0.8
+    """Velocity gain of the legs' joints [N m s/rad], positive. Legged Gym's A1 has 0.5."""
+    action_scale: float = 0.25
+    """What an action of one adds to a target angle [rad], positive."""
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    """The simulator's settings."""
+
+    def __post_init__(self) -> None:
+        for name in ("goal_period", "episode_steps", "start_levels"):
+            check_at_least(name, getattr(self, name), 1)
+        if self.goal_period > self.episode_steps:
+            raise ValueError(
+                f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
+            )
+        check_choice("levels", self.levels, [rule.name.lower() for rule in LevelRule])
+        for name in ("stiffness", "damping", "action_scale"):
+            check_positive(name, getattr(self, name), finite=True)
+        for name in ("air_time_target", "payload", "push_interval", "push_speed"):
+            check_range(name, getattr(self, name), 0, 1e6)
+        check_weights("rewards", self.rewards)
+        low, high = self.friction
+        if not 0.05 <= low <= high < math.inf:
+            raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
+
+    def with_goal_period(self, goal_period: int) -> "LocomotionConfig":
+        """See ``EnvConfig.with_goal_period``."""
+        return replace(self, goal_period=goal_period)
+
+    def for_evaluation(self) -> "LocomotionConfig":
+        """See ``EnvConfig.for_evaluation``. World i stands on level (i // columns) % levels of column i % columns."""
+        return replace(
+            self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
+        )
+
+    def load_terrain(self) -> Terrain | None:
+        """The terrain; ``None`` for flat ground.
+
+        Raises:
+            ValueError: If there is none of this name, or the file is not one.
+        """
+        if self.terrain == "flat":
+            return None
+        if self.terrain == "rough":
+            return terrain.rough()
+        if not Path(self.terrain).is_file():
+            raise ValueError(f"terrain must be flat, rough or the path of a saved terrain, got '{self.terrain}'.")
+        return terrain.load(self.terrain)
+
+
+def check_weights(name: str, weights: Any) -> None:
+    """Raise ``ValueError`` unless every weight of a reward is finite.
+
+    Args:
+        name: The field that holds them, for the message.
+        weights: A dataclass of numbers.
+    """
+    for term, weight in asdict(weights).items():
+        if not math.isfinite(weight):
+            raise ValueError(f"{name}.{term} must be finite, got {weight}.")

@@ -1,0 +1,1 @@
+"""Engines that step legged robots: one file, one engine."""

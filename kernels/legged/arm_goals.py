@@ -1,0 +1,307 @@
+"""Where the end effector of a legged robot's arm is, and where its goals are.
+
+The arm's joints follow those of the legs, and the last three components of a goal are the arm's: where the end
+effector should be, relative to an origin that is ``Arm.origin`` above the ground below the robot and
+turns with the base's yaw alone. They are its distance, pitch (up positive) and yaw, each mapped linearly to [-1, 1]::
+
+    distance = 0.30 m + 0.15 m g_0        in [0.15, 0.45] m
+    pitch    = 7.5 deg + 52.5 deg g_1     in [-45, 60] deg
+    yaw      = 108 deg g_2                in [-108, 108] deg
+
+and the wanted place is distance (cos pitch cos yaw, cos pitch sin yaw, sin pitch). The numbers of a goal do not
+change while it is in force. Goals inside the robot's own body, or less than ``Arm.clearance`` above the ground
+where the robot is when they are drawn, are not valid and are drawn again. On level ground the lowest are 0.17 m
+above it.
+
+The end effector comes from the joints' angles by forward kinematics, since the simulator's own lags them by a substep.
+"""
+
+import math
+
+import warp as wp
+
+from ..check import require, require_axes
+from ..random import Purpose, uniform4
+from ..rotations import heading, rotate, rotate_about, rotate_by_heading
+from .arm_rewards import vecA
+from .height_scan import require_heights, sample_height
+from .observation import base_quaternion
+from .rewards import LEG_JOINTS
+from .state import LocomotionParams, LocomotionState
+
+wp.set_module_options({"enable_backward": False})
+
+SHELL_LOW = (0.15, math.radians(-45), math.radians(-108))  # distance [m], pitch and yaw [rad] of the goals
+SHELL_HIGH = (0.45, math.radians(60), math.radians(108))
+_MIDDLE = wp.constant(wp.vec3(*((low + high) / 2 for low, high in zip(SHELL_LOW, SHELL_HIGH, strict=True))))
+_HALF = wp.constant(wp.vec3(*((high - low) / 2 for low, high in zip(SHELL_LOW, SHELL_HIGH, strict=True))))
+GOAL_COMPONENT = 3  # of a goal: where the arm's begin
+FOOTPRINT = (0.38, 0.25)  # [m] along and across a Go1's trunk: what counts as below the robot
+MAX_DRAWS = 64  # of a goal; on level ground one in eight is not valid, so all of them fail once in 10^57
+FIRST_REDRAW = 2  # block of the draws of a goal that redraws begin with; six components take two
+
+
+@wp.struct
+class Arm:
+    """The arm and what it is asked for."""
+
+    offset: wp.array[wp.vec3]  # (num_joints + 1,): of every joint, and of the end effector, in the frame before it [m]
+    axis: wp.array[wp.vec3]  # (num_joints,): of every joint
+    origin: wp.vec3  # of the goals, in the frame of the base's yaw, above the ground below the robot [m]
+    body_low: wp.vec3  # corners of what goals keep out of, relative to the origin [m]
+    body_high: wp.vec3
+    clearance: float  # of goals above the ground [m]
+    weight: vecA  # of the reward's terms
+    obs_start: int  # where the end effector starts in the observation
+
+
+@wp.func
+def end_effector(arm: Arm, qpos: wp.array2d[float], env: int) -> wp.vec3:
+    """The end effector relative to the base, in the base's frame [m]."""
+    last = arm.axis.shape[0]
+    point = arm.offset[last]
+    for k in range(last):
+        j = last - 1 - k
+        point = arm.offset[j] + rotate_about(point, arm.axis[j], qpos[env, 7 + wp.static(LEG_JOINTS) + j])
+    return point
+
+
+@wp.func
+def ground_below(params: LocomotionParams, heights: wp.array2d[float], direction: wp.vec2, x: float, y: float) -> float:
+    """Mean of the ground at 3 x 3 points below the trunk [m], so that a step does not count all at once."""
+    total = float(0.0)
+    for i in range(3):
+        for j in range(3):
+            along = wp.static(FOOTPRINT[0]) * 0.5 * float(i - 1)
+            across = wp.static(FOOTPRINT[1]) * 0.5 * float(j - 1)
+            offset = rotate_by_heading(direction, along, across)
+            total += sample_height(heights, params.cell, params.corner, x + offset[0], y + offset[1])
+    return total / 9.0
+
+
+@wp.func
+def place_of_end_effector(
+    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], qpos: wp.array2d[float], env: int
+) -> wp.vec3:
+    """The end effector relative to the goals' origin, in the frame of the base's yaw [m]."""
+    quat = base_quaternion(qpos, env)
+    direction = heading(quat)
+    offset = rotate(quat, end_effector(arm, qpos, env))
+    level = rotate_by_heading(wp.vec2(direction[0], -direction[1]), offset[0], offset[1])
+    ground = ground_below(params, heights, direction, qpos[env, 0], qpos[env, 1])
+    return wp.vec3(level[0], level[1], qpos[env, 2] - ground + offset[2]) - arm.origin
+
+
+@wp.func
+def place_of_goal(goal: wp.vec3) -> wp.vec3:
+    """Where the arm's part of a goal is, relative to the origin [m]."""
+    s = _MIDDLE + wp.cw_mul(goal, _HALF)
+    level = s[0] * wp.cos(s[1])
+    return wp.vec3(level * wp.cos(s[2]), level * wp.sin(s[2]), s[0] * wp.sin(s[1]))
+
+
+@wp.func
+def goal_of_place(place: wp.vec3) -> wp.vec3:
+    """The arm's part of the goal that is at ``place``; the inverse of ``place_of_goal``."""
+    level = wp.sqrt(place[0] * place[0] + place[1] * place[1])
+    s = wp.vec3(wp.length(place), wp.atan2(place[2], level), wp.atan2(place[1], place[0]))
+    return wp.cw_div(s - _MIDDLE, _HALF)
+
+
+@wp.func
+def is_clear(arm: Arm, goal: wp.vec3) -> wp.bool:
+    """Whether a goal is outside the robot's body."""
+    place = place_of_goal(goal)
+    for i in range(3):
+        if place[i] < arm.body_low[i] or place[i] > arm.body_high[i]:
+            return True
+    return False
+
+
+@wp.struct
+class Spot:
+    """Where a robot's goals are."""
+
+    origin: wp.vec3  # of the goals, in the world [m]
+    direction: wp.vec2  # of the base's yaw: cosine and sine
+
+
+@wp.func
+def find_spot(
+    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], qpos: wp.array2d[float], env: int
+) -> Spot:
+    """Where the goals of a robot are at this moment."""
+    spot = Spot()
+    spot.direction = heading(base_quaternion(qpos, env))
+    level = rotate_by_heading(spot.direction, arm.origin[0], arm.origin[1])
+    ground = ground_below(params, heights, spot.direction, qpos[env, 0], qpos[env, 1])
+    spot.origin = wp.vec3(qpos[env, 0] + level[0], qpos[env, 1] + level[1], ground + arm.origin[2])
+    return spot
+
+
+@wp.func
+def point_of_goal(spot: Spot, goal: wp.vec3) -> wp.vec3:
+    """Where the arm's part of a goal is in the world [m]."""
+    place = place_of_goal(goal)
+    level = rotate_by_heading(spot.direction, place[0], place[1])
+    return spot.origin + wp.vec3(level[0], level[1], place[2])
+
+
+@wp.func
+def is_valid(params: LocomotionParams, arm: Arm, heights: wp.array2d[float], spot: Spot, goal: wp.vec3) -> wp.bool:
+    """Whether a goal is outside the robot's body and clear of the ground."""
+    if not is_clear(arm, goal):
+        return False
+    point = point_of_goal(spot, goal)
+    return point[2] >= sample_height(heights, params.cell, params.corner, point[0], point[1]) + arm.clearance
+
+
+@wp.func
+def draw_again(
+    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], spot: Spot, purpose: int, world: int, count: int,
+    index: int, scale: wp.array[float], first: wp.vec3,
+) -> wp.vec3:  # fmt: skip
+    """``first`` if it is valid, else the first valid one of further draws from the same box, else the middle."""
+    goal = first
+    draws = int(1)
+    while not is_valid(params, arm, heights, spot, goal):
+        if draws == wp.static(MAX_DRAWS):
+            return wp.vec3(0.0)
+        u = uniform4(params.seed, purpose, world, count, index, wp.static(FIRST_REDRAW - 1) + draws)
+        for i in range(3):
+            goal[i] = (2.0 * u[i] - 1.0) * scale[wp.static(GOAL_COMPONENT) + i]
+        draws += 1
+    return goal
+
+
+@wp.func
+def goal_in_force(state: LocomotionState, env: int) -> wp.vec3:
+    """The arm's part of the goal."""
+    g = wp.static(GOAL_COMPONENT)
+    return wp.vec3(state.goal[env, g], state.goal[env, g + 1], state.goal[env, g + 2])
+
+
+@wp.kernel
+def _locate_goals(
+    # In
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array2d[float],
+    qpos: wp.array2d[float],
+    state: LocomotionState,
+    # Out
+    point: wp.array[wp.vec3],
+):
+    env = wp.tid()
+    point[env] = point_of_goal(find_spot(params, arm, heights, qpos, env), goal_in_force(state, env))
+
+
+def locate_goals(
+    params: LocomotionParams, arm: Arm, heights: wp.array, qpos: wp.array, state: LocomotionState, point: wp.array
+) -> None:
+    """Find where in the world the arms' goals are, for pictures.
+
+    Args:
+        params: What all worlds share.
+        arm: The arm.
+        heights: The height grid [m], float32, shape (nx, ny).
+        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
+        state: The worlds; only their goals are read.
+        point: Places [m], vec3, shape (num_envs,). Written.
+
+    Raises:
+        ValueError: If an array has another shape, dtype or device.
+    """
+    require("point", point, dtype=wp.vec3)
+    n = point.shape[0]
+    require_axes("qpos", qpos, 2)
+    require("qpos", qpos, dtype=wp.float32, shape=(n, qpos.shape[1]), like=point)
+    require_arm(arm, heights, qpos.shape[1] - 7, point)
+    require("state.goal", state.goal, dtype=wp.float32, shape=(n, GOAL_COMPONENT + 3), like=point)
+    wp.launch(
+        _locate_goals, dim=n, inputs=[params, arm, heights, qpos, state], outputs=[point], device=point.device
+    )  # fmt: skip
+
+
+@wp.kernel
+def _redraw_candidates(
+    # In
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array2d[float],
+    qpos: wp.array2d[float],
+    row: wp.array[int],
+    goal_count: wp.array[int],
+    scale: wp.array[float],
+    # In and out
+    candidate: wp.array3d[float],
+):
+    i, k = wp.tid()
+    env = row[i]
+    g = wp.static(GOAL_COMPONENT)
+    first = wp.vec3(candidate[i, k, g], candidate[i, k, g + 1], candidate[i, k, g + 2])
+    goal = draw_again(
+        params, arm, heights, find_spot(params, arm, heights, qpos, env), wp.static(int(Purpose.CANDIDATE)),
+        params.world_offset + env, goal_count[env], k, scale, first,
+    )  # fmt: skip
+    for c in range(3):
+        candidate[i, k, g + c] = goal[c]
+
+
+def redraw_candidates(
+    params: LocomotionParams,
+    arm: Arm,
+    heights: wp.array,
+    qpos: wp.array,
+    row: wp.array,
+    goal_count: wp.array,
+    scale: wp.array,
+    candidate: wp.array,
+    *,
+    record: bool = False,
+) -> wp.Launch | None:
+    """Put valid goals in the place of those of ``draw_candidates`` that are not.
+
+    The arm's part of such a candidate is drawn again from the same box until it is valid, which makes it uniform over
+    the valid goals. What comes out depends on (seed, world, the number of the goal, k) alone where the ground is level;
+    elsewhere also on where the robot is.
+
+    Args:
+        params: What all worlds share.
+        arm: The arm.
+        heights: The height grid [m], float32, shape (nx, ny).
+        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
+        row: Worlds that need a goal, int32, shape (n,), each in [0, num_envs).
+        goal_count: Goals that each world has received so far, int32, shape (num_envs,).
+        scale: Half side of the box along every component, float32, shape (goal_dim,).
+        candidate: Candidates, float32, shape (n, count, goal_dim). Updated.
+        record: Return the launch, to be replayed with ``launch()``, instead of making it.
+
+    Raises:
+        ValueError: If an array has another shape, dtype or device.
+    """
+    require("row", row, dtype=wp.int32)
+    require_axes("candidate", candidate, 3)
+    shape = (row.shape[0], candidate.shape[1], GOAL_COMPONENT + 3)
+    require("candidate", candidate, dtype=wp.float32, shape=shape, like=row)
+    require("goal_count", goal_count, dtype=wp.int32, shape=goal_count.shape, like=row)
+    require("scale", scale, dtype=wp.float32, shape=shape[2:], like=row)
+    require_axes("qpos", qpos, 2)
+    require("qpos", qpos, dtype=wp.float32, shape=(goal_count.shape[0], qpos.shape[1]), like=row)
+    require_arm(arm, heights, qpos.shape[1] - 7, row)
+    return wp.launch(
+        _redraw_candidates,
+        dim=shape[:2],
+        inputs=[params, arm, heights, qpos, row, goal_count, scale],
+        outputs=[candidate],
+        device=row.device,
+        record_cmd=record,
+    )
+
+
+def require_arm(arm: Arm, heights: wp.array, num_joints: int, like: wp.array) -> None:
+    """Raise ``ValueError`` unless ``arm`` has ``num_joints`` less the legs', and it and ``heights`` fit ``like``."""
+    joints = num_joints - LEG_JOINTS
+    require("arm.axis", arm.axis, dtype=wp.vec3, shape=(joints,), like=like)
+    require("arm.offset", arm.offset, dtype=wp.vec3, shape=(joints + 1,), like=like)
+    require_heights("heights", heights, like)

@@ -1,0 +1,1 @@
+"""The reproduction of the thesis: its claims, presets and plans, on top of ``deimos.study``."""
