@@ -35,7 +35,7 @@ class StructTable:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the arrays, in the struct's order."""
-        return tuple(name for name, var in self.struct.vars.items() if isinstance(var.type, wp.array))
+        return tuple(name for name, var in self.struct.vars.items() if wp.types.is_array(var.type))
 
     def dtype(self, name: str) -> type:
         """What an array holds."""
