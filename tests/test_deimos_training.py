@@ -18,7 +18,8 @@ import torch
 import deimos
 from deimos import plugins
 from deimos.app import cli
-from deimos.checks import SimulationError
+from deimos.checks import RunError, SimulationError
+from deimos.files import load_tensors
 from deimos.goals.fear import FearConfig
 from deimos.goals.methods import METHODS
 from deimos.goals.selector import SelectorConfig
@@ -28,7 +29,7 @@ from deimos.learn.rollout import Rollout
 from deimos.run import presets, training
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
-from deimos.run.folder import RunError, RunFolder, load_tensors
+from deimos.run.folder import RunFolder
 from deimos.run.training import TrainConfig
 from deimos.sim import envs
 from deimos.sim.env import EnvConfig

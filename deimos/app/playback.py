@@ -12,11 +12,12 @@ import numpy as np
 import torch
 import tyro
 
-from deimos.checks import check_at_least, check_positive
+from deimos.checks import RunError, check_at_least, check_positive
+from deimos.files import load_tensors
 from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.selectors import uniform
 from deimos.learn.policy import load_policy
-from deimos.run.folder import RunError, RunFolder, load_tensors
+from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.training import SCHEMA, TrainConfig, read_config
 from deimos.sim.env import Env

@@ -7,8 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from deimos.checks import RunError
+from deimos.files import load_tensors, save_tensors
 from deimos.nn.networks import Activation, Actor, weights_of
-from deimos.run.folder import RunError, load_tensors, save_tensors
 from deimos.sim.env import Env, ObsField
 
 SCHEMA = 1

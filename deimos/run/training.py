@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from deimos import __version__
-from deimos.checks import SimulationError, check_at_least, check_choice
+from deimos.checks import RunError, SimulationError, check_at_least, check_choice
+from deimos.files import load_tensors, save_tensors
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.learn.policy import load_policy, save_policy
@@ -24,7 +25,7 @@ from deimos.learn.rollout import Rollout
 from deimos.nn.matmul import keep_freed_memory, on_threads
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
-from deimos.run.folder import RunError, RunFolder, load_tensors, save_tensors
+from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
