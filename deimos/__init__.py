@@ -10,7 +10,7 @@ _OFFERED = {
     "Env": "deimos.sim.env",
     "GoalDirector": "deimos.goals.director",
     "GoalSelector": "deimos.goals.selector",
-    "TrainConfig": "deimos.run.config",
+    "TrainConfig": "deimos.run.trainer",
     "check_env": "deimos.sim.check_env",
     "evaluate": "deimos.run.api",
     "load_policy": "deimos.learn.policy",
