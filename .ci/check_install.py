@@ -1,5 +1,7 @@
 """Whether what is installed is one package, from which everything imports, and leaves a foreign ``kernels`` alone."""
 
+import base64
+import hashlib
 import importlib
 import importlib.metadata
 import pkgutil
@@ -30,13 +32,11 @@ for name in names:
 
 theirs = importlib.metadata.files("kernels") or []
 assert Path(kernels.__file__).resolve() == SITE / "kernels" / "__init__.py", kernels.__file__
-assert theirs and not {str(file) for file in ours} & {str(file) for file in theirs}
+assert theirs
+assert not {str(file) for file in ours} & {str(file) for file in theirs}
 for file in theirs:
     digest = file.hash
     if digest is not None and digest.mode == "sha256":
-        import base64
-        import hashlib
-
         found = base64.urlsafe_b64encode(hashlib.sha256(file.locate().read_bytes()).digest()).rstrip(b"=").decode()
         assert found == digest.value, file
 

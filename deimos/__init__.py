@@ -18,9 +18,7 @@ _OFFERED = {
 }
 """What the package offers, and the module that holds it."""
 
-__all__ = [
-    "Env", "GoalDirector", "GoalSelector", "TrainConfig", "__version__", "check_env", "evaluate", "load_policy", "train",
-]  # fmt: skip
+__all__ = ["__version__", *_OFFERED]
 
 # Installed, ``kernels`` and ``terrain`` lie inside this package; in a checkout they lie beside it.
 _HOME = Path(__file__).resolve().parent
