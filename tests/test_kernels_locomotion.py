@@ -94,7 +94,6 @@ class World:
         for name in FLAGS:
             setattr(self.out, name, wp.full(n, True, dtype=wp.bool, device=device))
         self.out.cause = wp.zeros(n, dtype=wp.int32, device=device)
-        self.out.count = wp.zeros(2, dtype=wp.int32, device=device)
         self.out.fault = wp.array([0, n, n], dtype=wp.int32, device=device)
         for name, value in (("pose", POSE), ("action_scale", np.full(J, 0.25)), ("low", LOW), ("high", HIGH)):
             setattr(self.joints, name, wp.array(value.astype(np.float32), dtype=wp.float32, device=device))
@@ -267,7 +266,6 @@ def test_clocks_and_ends(device):
     assert out["goal_due"].tolist() == [False, False, True, True, False, True]
     assert out["truncated"].tolist() == [False, False, True, False, True, False]
     assert out["terminated"].tolist() == [False] * 5 + [True]
-    assert out["count"].tolist() == [1, 3]
     assert out["fault"].tolist() == [0, n, n]
 
 
@@ -312,7 +310,6 @@ def test_invalid_worlds_are_cut_off_and_reach_nobody(device, fault):
     assert out["truncated"].tolist() == [False, False, True, False, False]
     assert sound["goal_due"].tolist() == [False, False, True, False, False]
     assert not out["goal_due"].any()
-    assert out["count"].tolist() == [0, 1]
     assert out["fault"].tolist() == [1, 2, 5]
     assert out["cause"][2] == bit
     assert out["reward"][2] == 0
@@ -334,7 +331,6 @@ def test_a_crash_counts_on_an_invalid_step_too(device):
     assert out["terminated"][0]
     assert not out["truncated"][0]
     assert out["invalid"][0]
-    assert out["count"].tolist() == [0, 1]
 
 
 def test_solver_limits_are_no_fault(device):

@@ -132,7 +132,6 @@ class LocomotionStep:
     truncated: wp.array[wp.bool]  # cut off without a crash: time limit, off the terrain, or invalid
     goal_due: wp.array[wp.bool]  # the goal has been in force for its whole period, and the state is valid
     invalid: wp.array[wp.bool]  # the state is not physical any more
-    count: wp.array[int]  # (2,): worlds with a goal due that are not done, worlds that are done
     fault: wp.array[int]  # (3,): invalid world-steps so far, lowest world among them, lowest world with a broken action
     cause: wp.array[int]  # bits of BROKEN on the last invalid step of this world
     value: wp.array[float]  # the value that was at fault then

@@ -3,7 +3,6 @@
 import warp as wp
 
 from ..check import require, require_axes
-from ..goals import count_events, goal_is_due, time_is_up
 from ..random import Purpose, uniform4
 from ..rotations import down_in_body
 from .contacts import peak_force
@@ -295,13 +294,13 @@ def _judge_step(
         age = state.episode_step[env] + 1
         state.goal_clock[env] = clock
         state.episode_step[env] = age
-        is_due = goal_is_due(clock, params.goal_period) and not broken
-        is_over = broken or time_is_up(age, params.time_limit) or is_off(params, sim.qpos[env, 0], sim.qpos[env, 1])
+        is_due = clock >= params.goal_period and not broken
+        time_is_up = params.time_limit > 0 and age >= params.time_limit
+        is_over = broken or time_is_up or is_off(params, sim.qpos[env, 0], sim.qpos[env, 1])
         out.terminated[env] = crashed
         out.truncated[env] = is_over and not crashed
         out.goal_due[env] = is_due
         out.invalid[env] = broken
-        count_events(is_due, crashed or is_over, out.count)
 
 
 def judge_step(
@@ -327,9 +326,9 @@ def judge_step(
         goal_scale: What the policy sees goals multiplied by, float32, shape (goal_dim,).
         sim: The simulator after its substeps.
         state: The worlds. Updated.
-        out: What the step gives back. Written, but for ``count`` (added to: zero it before), ``fault`` (added to; start
-            it at 0, num_envs, num_envs) and what is carried: terms from column ``NUM_COLUMNS`` on count in the
-            reward as they are, unless the world is invalid, and ``tracking`` beyond linear and yaw stays.
+        out: What the step gives back. Written, but for ``fault`` (added to; start it at 0, num_envs, num_envs) and
+            what is carried: terms from column ``NUM_COLUMNS`` on count in the reward as they are, unless the world is
+            invalid, and ``tracking`` beyond linear and yaw stays.
 
     Raises:
         ValueError: If an array has another shape, dtype or device.
@@ -371,7 +370,7 @@ def _require_step(out: LocomotionStep, action: wp.array) -> None:
     for name, shape, dtype in (
         ("reward", (n,), wp.float32), ("tracking", (n, max(2, out.tracking.shape[1])), wp.float32),
         ("term", (n, max(NUM_COLUMNS, out.term.shape[1])), wp.float32),
-        ("count", (2,), wp.int32), ("fault", (3,), wp.int32), ("cause", (n,), wp.int32), ("value", (n,), wp.float32),
+        ("fault", (3,), wp.int32), ("cause", (n,), wp.int32), ("value", (n,), wp.float32),
         *((flag, (n,), wp.bool) for flag in ("terminated", "truncated", "goal_due", "invalid")),
     ):  # fmt: skip
         require(f"out.{name}", getattr(out, name), dtype=dtype, shape=shape, like=action)

@@ -1,5 +1,6 @@
 """Quad+arm: a Go1 with a ReactorX-150 on its back, which walks and reaches at once (thesis, 4.1.2)."""
 
+from collections.abc import Callable
 from dataclasses import astuple, dataclass, field, replace
 
 import numpy as np
@@ -85,16 +86,15 @@ class QuadArm(Locomotion):
 
     def _reset_carried(self) -> None:
         reset_arms(
-            self._params, self._arm, self._ground.heights, self._mask.array, self._first_range.array, self._goal_scale,
+            self._params, self._arm, self._ground.heights, self._mask, self._first_range, self._goal_scale,
             self._sim.qpos, self.state_arrays, self.step_arrays.obs, self._error.array,
         )  # fmt: skip
 
-    def _finish_candidates(self, candidates: wp.array) -> list[wp.Launch]:
-        redraw = redraw_candidates(
+    def _record_valid_goals(self) -> Callable[[wp.array], wp.Launch]:
+        return lambda candidates: redraw_candidates(
             self._params, self._arm, self._ground.heights, self._sim.qpos, self._row.array,
             self.state_arrays.goal_count, self._candidate_scale.array, candidates, record=True,
         )  # fmt: skip
-        return [redraw]
 
     def goal_point(self, world: int) -> np.ndarray:
         """See ``Env.goal_point``."""

@@ -11,18 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 import warp as wp
-from torch import Tensor
 
 from deimos import terrain
-from deimos.checks import SimulationError
+from deimos.kernels.episodes import RESUMED, WORLDS
 from deimos.kernels.legged.height_scan import scan_points
 from deimos.kernels.legged.observation import finish_obs
-from deimos.kernels.legged.reset import reset_worlds, set_goals, update_levels
+from deimos.kernels.legged.reset import reset_worlds, update_levels
 from deimos.kernels.legged.rewards import LEG_JOINTS, vec12, vecT
 from deimos.kernels.legged.state import (
     BROKEN,
     COLUMNS,
-    COUNTERS,
     HEIGHT_SCALE,
     JOINT_SPEED_SCALE,
     NUM_FEET,
@@ -51,8 +49,6 @@ if TYPE_CHECKING:
 
 SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
 MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
-MAX_INVALID_SHARE = 1e-3  # of all world-steps; more of them stop the run
-WINDOW = 10_000  # world-steps that the share is of at least, however often it is looked at
 ACTION_BOUND = 100.0  # Legged Gym's: far beyond what a policy does, so that only nonsense is clipped
 SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
 EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
@@ -94,8 +90,6 @@ class Locomotion(WarpEnv):
     """Half width of the noise of every noisy field of the observation, in its unit."""
     columns: tuple[str, ...] = COLUMNS
     """What the reward is the sum of: those of ``deimos.kernels.legged.step``, then the terms of what is carried."""
-    _steps_in_window: int
-    _faults_known: int
 
     def __init__(
         self,
@@ -108,26 +102,23 @@ class Locomotion(WarpEnv):
         seed: int,
         env_offset: int = 0,
     ) -> None:
-        self.config = config
         self.robot = robot
-        self.num_envs = num_envs
-        self.device = device
-        self.action_dim = len(robot.pose)
-        self.action_bound = ACTION_BOUND
-        self.dt = config.physics.timestep * config.physics.substeps
-        self.goal_period = config.goal_period
-        self.time_limit = config.episode_steps
         self.points = scan_points()
-        self.layout = self._make_layout(goal_scale)
+        super().__init__(
+            config, num_envs, device, seed, env_offset, layout=self._make_layout(goal_scale), goal_range=goal_range,
+            action_dim=len(robot.pose), action_bound=ACTION_BOUND,
+            dt=config.physics.timestep * config.physics.substeps, time_limit=config.episode_steps,
+        )  # fmt: skip
         ground = config.load_terrain()
         self.terrain = ground or terrain.flat()
-        self._goal_scale = wp.array(goal_scale, dtype=wp.float32, device=warp_device(device))
-        self._allocate(goal_range, goal_scale, seed, env_offset)
+        self._goal_scale, self._mask, self._first_range = (
+            self.worlds.goal_scale, self.worlds.mask, self.worlds.first_range,
+        )  # fmt: skip
+        self._allocate()
         self.physics = self._build_physics(ground)
         self._params = self._make_params(ground)
         self._wire()
         self._capture()
-        self._reset_all()
 
     def _build_physics(self, ground: Terrain | None) -> Physics:
         """The simulator, with a friction and a payload for every world unless they are fixed."""
@@ -177,7 +168,7 @@ class Locomotion(WarpEnv):
 
     def _make_layout(self, goal_scale: tuple[float, ...]) -> tuple[ObsField, ...]:
         """Legged Gym's observation, with what is carried before the heights."""
-        joints = self.action_dim
+        joints = len(self.robot.pose)
         return (
             ObsField("linear_velocity", 3, "m/s", VELOCITY_SCALE),
             ObsField("angular_velocity", 3, "rad/s", RATE_SCALE),
@@ -190,34 +181,30 @@ class Locomotion(WarpEnv):
             ObsField("heights", len(self.points), "m", HEIGHT_SCALE),
         )
 
-    def _allocate(
-        self, goal_range: tuple[float, ...], goal_scale: tuple[float, ...], seed: int, env_offset: int
-    ) -> None:  # fmt: skip
-        n, joints, goal_dim, device = self.num_envs, self.action_dim, len(goal_range), self.device
-
-        def zeros(sizes: dict[str, tuple[int, ...]], dtype: type) -> dict[str, Shared]:
-            return {name: Shared.zeros(shape, dtype, device) for name, shape in sizes.items()}
-
-        rows = {"goal": goal_dim, "action": joints, "joint_speed": joints, "air_time": NUM_FEET}
-        state = zeros({name: (n, width) for name, width in rows.items()}, wp.float32)
-        state |= zeros(dict.fromkeys(COUNTERS, (n,)), wp.int32) | zeros({"tracked": (n,)}, wp.vec2)
-        out = zeros(
-            {"obs": (n, self.obs_dim), "term": (n, len(self.columns)), "reward": (n,), "value": (n,)}, wp.float32
-        )
-        out |= zeros({"tracking": (n, len(self.goal_groups))}, wp.float32)
-        out |= zeros(dict.fromkeys(("terminated", "truncated", "goal_due", "invalid"), (n,)), wp.bool)
-        out |= zeros({"count": (2,), "fault": (3,), "cause": (n,)}, wp.int32)
-        whole_range = torch.tensor(goal_range, device=device)
-        self._share(
-            LocomotionState(), state, LocomotionStep(), out, action=Shared.zeros((n, joints), wp.float32, device),
-            new_goal=Shared.zeros((n, goal_dim), wp.float32, device), first_range=whole_range,
-            seen_range=whole_range * torch.tensor(goal_scale, device=device), seed=seed, env_offset=env_offset,
-        )  # fmt: skip
-        self.term = self._out["term"]
+    def _allocate(self) -> None:
+        n, joints = self.num_envs, self.action_dim
+        self.state_arrays, self.step_arrays = LocomotionState(), LocomotionStep()
+        rows = {"action": joints, "joint_speed": joints, "air_time": NUM_FEET}
+        for name in LocomotionState.vars:
+            if name in RESUMED:
+                setattr(self.state_arrays, name, getattr(self.worlds, name))
+                continue
+            shape = (n, rows[name]) if name in rows else n
+            shared = Shared.zeros(shape, LocomotionState.vars[name].type.dtype, self.device)
+            setattr(self.state_arrays, name, shared.array)
+            self.tensors[name] = shared.tensor
+            self._memory.append(shared.tensor)
+        term = Shared.zeros((n, len(self.columns)), wp.float32, self.device)
+        self._value = Shared.zeros(n, wp.float32, self.device)
+        for name in LocomotionStep.vars:
+            if name in WORLDS.names:
+                setattr(self.step_arrays, name, getattr(self.worlds, name))
+        self.step_arrays.term, self.step_arrays.value = term.array, self._value.array
+        self._memory += (term.tensor, self._value.tensor)
+        self.term = term.tensor
         """What the last reward is the sum of, shape (num_envs, len(columns))."""
-        self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=device)
-        self._steps_reported = self.invalid_steps = 0
-        self._clear_faults()
+        self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=self.device)
+        self._steps_reported = 0
 
     def _wire(self) -> None:
         """Join the simulator's arrays and the robot's numbers to the kernels."""
@@ -240,20 +227,21 @@ class Locomotion(WarpEnv):
         self._noise = wp.array(noise, dtype=wp.float32, device=name)
 
     def _capture(self) -> None:
-        """Record the step and the reset, each as one graph."""
-        self._launch_step = Captured(self._run_step, self.device)
-        self._launch_reset = Captured(self._run_reset, self.device)
-        self._launch_goals = set_goals(
-            self._row.array, self._new_goal.array, self._goal_scale, self.state_arrays, self.step_arrays.obs,
-            record=True,
-        )  # fmt: skip
+        """Record the step and the reset, each as one graph, and begin the first episodes."""
+        self._step_graph = Captured(self._run_step, self.device)
+        self.begin(self._count_step, Captured(self._run_reset, self.device), valid_goals=self._record_valid_goals())
+        self.physics.buffer_use()  # what the recording needed says nothing about these worlds
+
+    def _record_valid_goals(self) -> Callable[[wp.array], wp.Launch] | None:
+        """What makes valid goals of candidates; ``None`` where all are."""
+        return None
 
     def _run_step(self) -> None:
         params, state, out, sim = self._params, self.state_arrays, self.step_arrays, self._sim
-        apply_actions(params, self._joints, self.action.array, state, sim, out.fault)
+        apply_actions(params, self._joints, self.worlds.action, state, sim, out.fault)
         self.physics.step()
         self._judge_carried()
-        judge_step(params, self._joints, self.action.array, self._goal_scale, sim, state, out)
+        judge_step(params, self._joints, self.worlds.action, self._goal_scale, sim, state, out)
         self._run_scan(out.invalid, wanted=False)
 
     def _run_scan(self, mask: wp.array, *, wanted: bool) -> None:
@@ -264,14 +252,14 @@ class Locomotion(WarpEnv):
 
     def _run_reset(self) -> None:
         params, state, out, sim, mask = (
-            self._params, self.state_arrays, self.step_arrays, self._sim, self._mask.array,
+            self._params, self.state_arrays, self.step_arrays, self._sim, self._mask,
         )  # fmt: skip
         update_levels(
             params, self._ground.origin, mask, out.terminated, out.truncated, out.invalid, sim.qpos, state
         )  # fmt: skip
         self.physics.reset(mask)
         reset_worlds(
-            params, self._joints, self._ground, mask, self._first_range.array, self._goal_scale, state, sim.qpos,
+            params, self._joints, self._ground, mask, self._first_range, self._goal_scale, state, sim.qpos,
             sim.qvel, out.obs,
         )  # fmt: skip
         self._reset_carried()
@@ -283,52 +271,16 @@ class Locomotion(WarpEnv):
     def _reset_carried(self) -> None:
         """Launch what else the worlds of ``_mask`` need to begin an episode."""
 
-    def _finish_candidates(self, candidates: wp.array) -> list[wp.Launch]:
-        return []
-
-    def _reset_all(self) -> None:
-        """Begin every world's first episode; what recording has done before is undone."""
-        for name, tensor in self.tensors.items():
-            if name not in self.physics.tensors:
-                tensor.zero_()
-        for tensor in self._out.values():
-            tensor.zero_()
-        self._clear_faults()
-        self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
-        self.physics.buffer_use()  # what the recording needed says nothing about these worlds
-
-    def launch_step(self) -> None:
-        """See ``WarpEnv.launch_step``."""
-        self._launch_step()
+    def _count_step(self) -> None:
+        """Simulate one step, and add up what the report says."""
+        self._step_graph()
         self._sums += self.term.sum(0)
         self._steps_reported += 1
-        self._steps_in_window += 1
 
-    def check(self) -> None:
-        """See ``Env.check``. An action that is not finite stops the run at once.
-
-        Single invalid worlds are reset and left out of learning. Too many of them stop the run: more than a share of
-        the world-steps since the window began, which is at least ``WINDOW`` of them and ends with the next check.
-        """
-        faults, world, broken_action = self._out["fault"].tolist()
-        self.invalid_steps += faults - self._faults_known
-        self._faults_known = faults
-        window = self._steps_in_window * self.num_envs
-        if broken_action < self.num_envs:
-            self._clear_faults()
-            raise SimulationError(f"World {broken_action}: its action is not finite.")
-        if faults > MAX_INVALID_SHARE * max(window, WINDOW):
-            self._clear_faults()
-            raise SimulationError(
-                f"World {world}: {self._describe_fault(world)}; {faults} of the last {window} world-steps were "
-                f"invalid, more than {100 * MAX_INVALID_SHARE:g} % of {max(window, WINDOW)}."
-            )
-        if window >= WINDOW:
-            self._clear_faults()
-
-    def _describe_fault(self, world: int) -> str:
-        """What was wrong with an invalid world when it last was."""
-        cause, value = BROKEN[int(self._out["cause"][world]).bit_length() - 1], float(self._out["value"][world])
+    def describe_fault(self, world: int) -> str:
+        """See ``WarpEnv.describe_fault``."""
+        cause = BROKEN[int(self._views["cause"][world]).bit_length() - 1]
+        value = float(self._value.tensor[world])
         if cause == "contacts":
             return f"it lost contacts ({self.physics.explain_loss(int(value))})"
         unit = " m/s or rad/s" if cause == "speed" else ""
@@ -365,12 +317,3 @@ class Locomotion(WarpEnv):
     def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData]":
         """See ``Env.scene``."""
         return self.physics.model, self.physics.to_mujoco(world)
-
-    def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
-        """See ``Env.reference_policy``. Nobody has written down how to walk."""
-        return None
-
-    def _clear_faults(self) -> None:
-        """Begin a new window."""
-        self._out["fault"].copy_(torch.tensor([0, self.num_envs, self.num_envs], dtype=torch.int32))
-        self._steps_in_window = self._faults_known = 0
