@@ -60,7 +60,8 @@ class LocomotionConfig(EnvConfig):
     """The simulator's settings."""
 
     def __post_init__(self) -> None:
-        for name in ("goal_period", "episode_steps", "start_levels"):
+        super().__post_init__()
+        for name in ("episode_steps", "start_levels"):
             check_at_least(name, getattr(self, name), 1)
         if self.goal_period > self.episode_steps:
             raise ValueError(
@@ -76,10 +77,6 @@ class LocomotionConfig(EnvConfig):
         low, high = self.friction
         if not 0.05 <= low <= high < math.inf:
             raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
-
-    def with_goal_period(self, goal_period: int) -> "LocomotionConfig":
-        """See ``EnvConfig.with_goal_period``."""
-        return replace(self, goal_period=goal_period)
 
     def for_evaluation(self) -> "LocomotionConfig":
         """See ``EnvConfig.for_evaluation``. World i stands on level (i // columns) % levels of column i % columns."""
