@@ -1,4 +1,4 @@
-"""What every environment shares about goals: their clocks and their uniform candidates."""
+"""Uniform candidates for goals."""
 
 from typing import Any
 
@@ -9,31 +9,6 @@ from .lanes import WORDS, lanes, threads
 from .random import Purpose, philox_lanes, unit
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def goal_is_due(goal_clock: int, goal_period: int) -> wp.bool:
-    """True when a goal has been in force for its whole period (T steps)."""
-    return goal_clock >= goal_period
-
-
-@wp.func
-def time_is_up(episode_step: int, time_limit: int) -> wp.bool:
-    """True when an episode has reached its time limit; a limit of 0 never comes."""
-    return time_limit > 0 and episode_step >= time_limit
-
-
-@wp.func
-def count_events(goal_due: wp.bool, done: wp.bool, count: wp.array[int]):
-    """Add one world's events to ``count``: [goal due and not done, done].
-
-    The host reads these two numbers once per step; they size everything that follows, so that
-    nothing else of the step has to wait for the device.
-    """
-    if done:
-        wp.atomic_add(count, 1, 1)
-    elif goal_due:
-        wp.atomic_add(count, 0, 1)
 
 
 @wp.kernel

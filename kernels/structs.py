@@ -52,15 +52,11 @@ class StructTable:
             raise ValueError(f"{self.struct.key}.{name} has the shape {shape}; {', '.join(missing)} must be given.")
         return tuple(sizes[size] if isinstance(size, str) else size for size in shape)
 
-    def zeros(self, device: str, **sizes: int) -> dict[str, wp.array]:
-        """Memory for every array, by name."""
-        return {name: wp.zeros(self.shape(name, **sizes), self.dtype(name), device=device) for name in self.names}
-
-    def build(self, arrays: Mapping[str, wp.array]) -> Any:
-        """A struct of these arrays."""
+    def allocate(self, device: str, **sizes: int) -> Any:
+        """A struct whose arrays are allocated, all zeros."""
         struct = self.struct()
         for name in self.names:
-            setattr(struct, name, arrays[name])
+            setattr(struct, name, wp.zeros(self.shape(name, **sizes), self.dtype(name), device=device))
         return struct
 
     def require(self, label: str, struct: Any, like: wp.array, **sizes: int) -> None:

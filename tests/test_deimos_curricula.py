@@ -34,7 +34,7 @@ class Ledger:
         due = torch.ones(10, dtype=torch.bool)
         for t in range(5):
             step = Step(
-                torch.zeros(10, 5), torch.zeros(10), no, no, due if t == 4 else no, no, torch.zeros(2),
+                torch.zeros(10, 5), torch.zeros(10), no, no, due if t == 4 else no, no,
                 tracking=torch.tensor(tracking).expand(10, -1),
             )  # fmt: skip
             kept.advance(step)

@@ -365,11 +365,11 @@ def test_levels_follow_the_tracking(torch_device, hills):
     t = env.tensors
     for i, (tracking, crashed, level, _) in enumerate(cases):
         t["tracked"][i] = torch.tensor([tracking * 40, 40.0])
-        env._out["terminated"][i] = crashed
-        env._out["truncated"][i] = not crashed
+        env._views["terminated"][i] = crashed
+        env._views["truncated"][i] = not crashed
         t["level"][i] = level
     t["tracked"][5], t["level"][5] = torch.tensor([40.0, 40.0]), 2
-    env._out["truncated"][5] = True
+    env._views["truncated"][5] = True
     env.reset(mask_of(env, *range(6)))
     assert t["level"][:5].tolist() == [case[3] for case in cases]
     assert 0 <= int(t["level"][5]) <= 2
@@ -382,9 +382,9 @@ def test_a_reset_in_the_middle_and_an_invalid_world_keep_their_level(torch_devic
     env = build(torch_device, num_envs=3, terrain=hills)
     env.tensors["level"][:] = 1
     env.tensors["tracked"][:] = torch.tensor([1.0, 40.0])
-    env._out["terminated"][:] = False
-    env._out["truncated"][:] = torch.tensor([False, True, True])
-    env._out["invalid"][:] = torch.tensor([False, True, False])
+    env._views["terminated"][:] = False
+    env._views["truncated"][:] = torch.tensor([False, True, True])
+    env._views["invalid"][:] = torch.tensor([False, True, False])
     env.reset(mask_of(env, 0, 1, 2))
     assert env.tensors["level"].tolist() == [1, 1, 0]
 
@@ -395,7 +395,7 @@ def test_who_passes_the_last_level_is_sent_anywhere(torch_device, hills):
     env = build(torch_device, num_envs=n, terrain=hills)
     env.tensors["level"][:] = 2
     env.tensors["tracked"][:] = torch.tensor([40.0, 40.0])
-    env._out["truncated"][:] = True
+    env._views["truncated"][:] = True
     env.reset(mask_of(env, *range(n)))
     counts = torch.bincount(env.tensors["level"].long(), minlength=3)
     assert (counts - n / 3).abs().max() < 5 * math.sqrt(n * 2 / 9)
@@ -424,9 +424,9 @@ def test_perfect_tracker_of_turning_goals(torch_device, rule):
     t["qpos"][:, :2] = torch.tensor(position, dtype=torch.float32)
     t["goal"][:] = torch.tensor(goal, dtype=torch.float32)
     t["tracked"][:] = torch.tensor([float(steps), float(steps)])
-    env._out["terminated"][:] = False
-    env._out["truncated"][:] = True
-    env._out["invalid"][:] = False
+    env._views["terminated"][:] = False
+    env._views["truncated"][:] = True
+    env._views["invalid"][:] = False
     env.reset(mask_of(env, *range(n)))
     down = int((t["level"] < 5).sum())
     if rule == "reward":
@@ -537,7 +537,7 @@ def test_a_goal_that_is_not_finite_breaks_its_world(torch_device):
     env.set_goals(rows_of(env, 3), goal)
     step = env.step(actions(6, torch_device))
     assert step.invalid.tolist() == [False, False, False, True, False, False]
-    assert env._describe_fault(3) == "its goal was nan"
+    assert env.describe_fault(3) == "its goal was nan"
     loop.advance(step)
     assert bool(env.obs.isfinite().all())
     assert not env.step(actions(6, torch_device)).invalid.any()

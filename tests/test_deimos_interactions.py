@@ -26,7 +26,6 @@ def make_step(num_envs, device, *, terminated=(), truncated=(), goal_due=(), rew
         return flags
 
     terminated, truncated, goal_due = mask(terminated), mask(truncated), mask(goal_due)
-    done = terminated | truncated
     return Step(
         obs=torch.zeros(num_envs, STATE_DIM + GOAL_DIM, device=device),
         reward=torch.as_tensor(reward, dtype=torch.float32, device=device).expand(num_envs).clone(),
@@ -34,7 +33,6 @@ def make_step(num_envs, device, *, terminated=(), truncated=(), goal_due=(), rew
         truncated=truncated,
         goal_due=goal_due,
         invalid=mask([]),
-        count=torch.stack([(goal_due & ~done).sum(), done.sum()]).int(),
     )
 
 

@@ -40,7 +40,7 @@ class Loop:
         crashed = torch.from_numpy(self.rng.random(NUM_ENVS) < 0.05)
         due = torch.from_numpy(self.clock >= PERIOD)
         zeros, no = torch.zeros(NUM_ENVS), torch.zeros(NUM_ENVS, dtype=torch.bool)
-        step = Step(torch.zeros(NUM_ENVS, 6), zeros, crashed, no, due, no, torch.zeros(2))
+        step = Step(torch.zeros(NUM_ENVS, 6), zeros, crashed, no, due, no)
         self.interactions.advance(step)
         self.interactions.resolve(step, torch.nonzero(due | crashed).squeeze(1))
         for env in torch.nonzero(due | crashed).flatten().tolist():
@@ -105,7 +105,7 @@ def test_an_interaction_longer_than_rollouts_is_summed_over_them():
     interactions.open(torch.zeros(1, dtype=torch.int64), one, one, one, torch.zeros(1), probe=~no)
     gains = torch.tensor([1.0, -3.0, 2.0, 0.5, -1.0, 4.0, 0.25, 0.0, 8.0, -2.0])
     for t in range(10):
-        step = Step(torch.zeros(1, 2), torch.zeros(1), no, no, torch.tensor([t == 9]), no, torch.zeros(2))
+        step = Step(torch.zeros(1, 2), torch.zeros(1), no, no, torch.tensor([t == 9]), no)
         interactions.advance(step)
         if t == 9:
             interactions.resolve(step, torch.zeros(1, dtype=torch.int64))

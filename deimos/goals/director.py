@@ -105,7 +105,7 @@ class GoalDirector:
         self._clock += 1
         due = self._clock >= self.goal_period
         reward = torch.zeros_like(self._clock, dtype=torch.float32) if tracking is None else tracking.float()
-        result = Step(state, reward, terminated, truncated, due, torch.zeros_like(done), self._clock[:2])
+        result = Step(state, reward, terminated, truncated, due, torch.zeros_like(done))
         self._interactions.advance(result)
         ended, chooses = due | done, due & ~done
         counts = torch.stack([ended.sum(), chooses.sum()]).tolist()  # the one synchronisation of the step

@@ -53,11 +53,12 @@ class GoalLoop:
         limit keeps its label. Worlds that are done get a first goal, not one of the selector's.
         """
         self.interactions.advance(step)
-        due_count, done_count = step.count.tolist()  # the one synchronisation of the step
+        done = step.terminated | step.truncated
+        due = step.goal_due & ~done
+        due_count, done_count = torch.stack([due.sum(), done.sum()]).tolist()  # the one synchronisation of the step
         if due_count + done_count == 0:
             return
-        done = step.terminated | step.truncated
-        due_rows = _rows(step.goal_due & ~done, due_count)
+        due_rows = _rows(due, due_count)
         self.interactions.resolve(step, torch.cat([due_rows, _rows(done, done_count)]))
         if due_count:
             self._propose(due_rows)

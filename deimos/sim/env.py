@@ -7,12 +7,14 @@ resets a world and never changes a goal: ``deimos.run.loop`` does both, between 
 
 import abc
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self, final
 
 import torch
 from torch import Tensor
+
+from deimos.checks import check_at_least
 
 if TYPE_CHECKING:
     import mujoco
@@ -47,18 +49,23 @@ class Step:
     invalid: Tensor
     """True where the state is not physical any more, bool, shape (num_envs,). Such a world is truncated too, unless
     it crashed, or the run stops (see ``Env.may_go_on_invalid``)."""
-    count: Tensor
-    """Worlds with a goal due that are not done, and worlds that are done, int32, shape (2,)."""
     tracking: Tensor | None = None
     """How well each group of goal components is met, in [0, 1], float32, shape (num_envs, len(goal_groups));
     ``None`` where there is one group and the reward itself says it."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class EnvConfig(abc.ABC):
-    """What the ``Config`` of an environment promises: a frozen dataclass in a file of ``deimos.sim.envs``."""
+    """What the ``Config`` of an environment promises: a frozen dataclass in a file of ``deimos.sim.envs`` or a plug-in.
 
-    goal_period: int
-    """T: steps that a goal is in force."""
+    A subclass that checks its own fields in ``__post_init__`` calls this class's too.
+    """
+
+    goal_period: int = 100
+    """T: steps that a goal is in force, at least 1."""
+
+    def __post_init__(self) -> None:
+        check_at_least("goal_period", self.goal_period, 1)
 
     @abc.abstractmethod
     def build(self, num_envs: int, device: torch.device, seed: int, env_offset: int = 0) -> "Env":
@@ -72,13 +79,14 @@ class EnvConfig(abc.ABC):
                 environments of 1000 worlds, the second with an offset of 1000, equal one of 2000.
         """
 
-    @abc.abstractmethod
-    def with_goal_period(self, goal_period: int) -> "EnvConfig":
+    @final
+    def with_goal_period(self, goal_period: int) -> Self:
         """The same task with another T."""
+        return replace(self, goal_period=goal_period)
 
-    @abc.abstractmethod
-    def for_evaluation(self) -> "EnvConfig":
+    def for_evaluation(self) -> Self:
         """The same task with every randomisation switched off and all goal clocks in step."""
+        return self
 
 
 class Env(abc.ABC):
@@ -191,9 +199,9 @@ class Env(abc.ABC):
         """What a log wants to know of the steps since the last call, the same keys every time; reads the device."""
         return {}
 
-    @abc.abstractmethod
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
-        """A scripted policy (obs -> action) that fixes 1 on the normalised score, if there is one."""
+        """A scripted policy (obs -> action) that fixes 1 on the normalised score; ``None`` where there is none."""
+        return None
 
     @property
     def obs_dim(self) -> int:

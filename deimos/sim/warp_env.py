@@ -1,95 +1,144 @@
-"""What environments on Warp kernels share: memory that torch sees too, recorded launches, the drawing of goals."""
+"""Environments on Warp kernels: memory that torch sees too, recorded launches, the drawing of goals."""
 
-import abc
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import torch
 import warp as wp
 from torch import Tensor
 
+from deimos.checks import SimulationError
+from deimos.kernels.episodes import RESUMED, WORLDS, make_relative, make_worlds, record, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
-from deimos.sim.env import Env, Step
-from deimos.sim.shared import Shared
+from deimos.kernels.structs import StructTable
+from deimos.sim.env import Env, EnvConfig, ObsField, Step
+from deimos.sim.shared import Shared, warp_device
+
+MAX_INVALID_SHARE = 1e-3  # of all world-steps; more of them stop the run
+WINDOW = 10_000  # world-steps that the share is of at least, however often it is looked at
 
 
 class WarpEnv(Env):
     """An environment on Warp kernels.
 
-    A subclass hands its arrays to ``_share``, records its launches, and then begins every world's first episode.
-    What it does in a step it says in ``launch_step``, and which goals are valid in ``_finish_candidates``.
+    A subclass calls this constructor, allocates its own state by ``allocate``, and at last calls ``begin`` with a
+    kernel for the step (physics, reward, crash, observation) and one for the reset; see ``deimos.kernels.episodes`` for
+    what these share, and docs/add_an_environment.md for a whole one.
+
+    Args:
+        config: The task.
+        num_envs: Number of worlds.
+        device: Where they are simulated.
+        seed: Seed of every draw.
+        env_offset: Global number of world 0.
+        layout: What stands where in the observation. Goals are shown times the scale of the field ``goal``.
+        goal_range: Half side of the box that goals are drawn from along every component, in physical units.
+        action_dim: Components of an action.
+        action_bound: The environment clips actions to [-action_bound, action_bound].
+        dt: Duration of a step [s]; 1 where the world has no seconds.
+        time_limit: Steps after which an episode is truncated; 0 for never.
+        stagger: Whether the goal clock of every world's first episode starts at a random step.
     """
 
-    action: Shared
-    """The actions of the step, for the kernels."""
-    state_arrays: Any
-    """The struct of the arrays that a resume needs."""
-    step_arrays: Any
-    """The struct of the arrays that a step gives back."""
-    _launch_reset: Callable[[], None]
-    """Begins an episode in the worlds of ``_mask``, with first goals from ``_first_range``."""
-    _launch_goals: wp.Launch
-    """Gives the worlds of ``_row`` the goals in ``_new_goal``, one thread for each."""
+    quantities: tuple[str, ...] = ("action",)
+    """What may be broken in an invalid world, by the bits of the cause that the step's kernel gives ``end_step``."""
 
-    @abc.abstractmethod
-    def launch_step(self) -> None:
-        """Simulate one step under the actions that are in ``action``, for benchmarks too."""
-
-    @abc.abstractmethod
-    def _finish_candidates(self, candidates: wp.array) -> list[wp.Launch]:
-        """Record what makes valid goals of candidates for the worlds of ``_row`` that are uniform in their box.
-
-        Args:
-            candidates: Goals as the policy sees them, float32, shape (num_envs, count, goal_dim).
-
-        Returns:
-            Launches of two axes, rows first; none where all candidates are valid goals.
-        """
+    def __init__(
+        self, config: EnvConfig, num_envs: int, device: torch.device, seed: int, env_offset: int, *,
+        layout: Sequence[ObsField], goal_range: Sequence[float], action_dim: int, action_bound: float = math.inf,
+        dt: float = 1.0, time_limit: int = 0, stagger: bool = False,
+    ) -> None:  # fmt: skip
+        self.config = config
+        self.num_envs, self.device = num_envs, device
+        self._seed, self._offset = seed, env_offset
+        self.layout, self.action_dim, self.action_bound = tuple(layout), action_dim, action_bound
+        self.dt, self.goal_period, self.time_limit = dt, config.goal_period, time_limit
+        goal = self.goal_slice
+        scale = next(field.scale for field in self.layout if field.name == "goal")
+        scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim
+        groups = len(self.goal_groups)
+        self.worlds = make_worlds(
+            num_envs, warp_device(device), obs_dim=self.obs_dim, action_dim=action_dim, goal_start=goal.start,
+            goal_scale=scales, goal_period=config.goal_period, time_limit=time_limit, stagger=stagger, seed=seed,
+            world_offset=env_offset, num_groups=groups if groups > 1 else 0,
+        )  # fmt: skip
+        """What all environments have for their worlds."""
+        views = {name: wp.to_torch(getattr(self.worlds, name)) for name in WORLDS.names}
+        self._views = views
+        self._memory = [views[name] for name in (*Step.__dataclass_fields__, *RESUMED)]
+        # Observations are kept, not computed anew: what a policy saw is part of a bit-exact resume.
+        self.tensors = {name: views[name] for name in RESUMED}
+        step = {name: views[name] for name in Step.__dataclass_fields__}
+        self._step = Step(**step | {"tracking": views["tracking"] if groups > 1 else None})
+        self.obs, self.episode_step = views["obs"], views["episode_step"]
+        self.action = Shared(self.worlds.action, views["action"])
+        self._whole_range = torch.tensor(goal_range, dtype=torch.float32, device=device)
+        seen = [half_side * scale for half_side, scale in zip(goal_range, scales, strict=True)]
+        self._seen_range = torch.tensor(seen, dtype=torch.float32, device=device)
+        self._row = Shared.zeros(num_envs, wp.int32, device)
+        self._draw = Shared.zeros(num_envs, wp.vec4, device)
+        self._new_goal = Shared.zeros((num_envs, self.goal_dim), wp.float32, device)
+        self._candidate_scale = Shared.zeros(self.goal_dim, wp.float32, device)
+        self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
+        self.invalid_steps = 0
+        """Invalid world-steps that ``check`` has found."""
+        self._steps_in_window = self._faults_known = 0
 
     @final
-    def _share(
-        self, state_arrays: Any, state: dict[str, Shared], step_arrays: Any, out: dict[str, Shared], *,
-        action: Shared, new_goal: Shared, first_range: Tensor, seen_range: Tensor, seed: int, env_offset: int,
-    ) -> None:  # fmt: skip
-        """Keep all memory of the environment; nothing is allocated or rebound later.
+    def allocate(self, table: StructTable, *, resume: bool = True, **sizes: int) -> Any:
+        """Allocate a struct of arrays, all zeros.
 
         Args:
-            state_arrays: The struct of ``state``, to be filled.
-            state: What a resume needs, by name; worlds along the first axis.
-            step_arrays: The struct of ``out``, to be filled.
-            out: What a step gives back, by name.
-            action: The actions, num_envs of them.
-            new_goal: Room for a goal for every world.
-            first_range: What ``_first_range`` holds where first goals come from the whole range, shape (goal_dim,).
-            seen_range: Half side of the box of goals as the policy sees them, shape (goal_dim,).
-            seed: Seed of every draw.
-            env_offset: Global number of world 0.
+            table: The struct and the shapes of its arrays, of which ``num_envs`` is known.
+            resume: Whether a bit-exact resume needs them; then their first axis must be the worlds.
+            sizes: The other sizes in the table.
+
+        Returns:
+            The struct, for the kernels; torch sees its arrays as ``tensors``.
         """
-        n, device = self.num_envs, self.device
-        for struct, arrays in ((state_arrays, state), (step_arrays, out)):
-            for name, shared in arrays.items():
-                setattr(struct, name, shared.array)
-        self.state_arrays, self.step_arrays, self.action = state_arrays, step_arrays, action
-        self._out = {name: shared.tensor for name, shared in out.items()}
-        self._step = Step(**{name: self._out[name] for name in Step.__dataclass_fields__ if name in out})
-        self.obs = self._out["obs"]
-        # Observations are kept, not computed anew: what a policy saw is part of a bit-exact resume.
-        self.tensors = {name: shared.tensor for name, shared in state.items()} | {"obs": self.obs}
-        self.episode_step = self.tensors["episode_step"]
-        self._seed, self._offset = seed, env_offset
-        self._mask = Shared.zeros(n, wp.bool, device)
-        self._row = Shared.zeros(n, wp.int32, device)
-        self._new_goal = new_goal
-        self._draw = Shared.zeros(n, wp.vec4, device)
-        self._whole_range, self._seen_range = first_range, seen_range
-        self._first_range = Shared.zeros(len(first_range), wp.float32, device)
-        self._candidate_scale = Shared.zeros(len(seen_range), wp.float32, device)
-        self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
+        struct = table.allocate(warp_device(self.device), num_envs=self.num_envs, **sizes)
+        views = {name: wp.to_torch(getattr(struct, name)) for name in table.names}
+        if taken := sorted(self.tensors.keys() & views.keys()):
+            raise ValueError(f"{table.struct.key} must not hold {', '.join(taken)}: every environment has its own.")
+        self._memory += views.values()
+        if resume:
+            self.tensors |= views
+        return struct
+
+    @final
+    def record(self, kernel: wp.Kernel, *inputs: object) -> Callable[[], None]:
+        """Record a kernel over all worlds, of the arguments ``worlds`` and ``inputs``.
+
+        Replaying a launch costs half of making it (18 us against 34 us on a CPU).
+        """
+        return record(kernel, self.worlds, *inputs).launch
+
+    @final
+    def begin(
+        self, step: Callable[[], None], reset: Callable[[], None], *,
+        valid_goals: Callable[[wp.array], wp.Launch] | None = None,
+    ) -> None:  # fmt: skip
+        """Begin every world's first episode: the last thing that a constructor does.
+
+        Args:
+            step: Simulates one step under the actions in ``action``.
+            reset: Begins an episode in the worlds of ``worlds.mask``.
+            valid_goals: Given candidate goals as the policy sees them, float32, shape (num_envs, count, goal_dim),
+                that are uniform in their box for the worlds of ``_row``: records what makes valid goals of them, by a
+                launch of two axes, rows first. ``None`` where all are valid.
+        """
+        self.launch_step, self._launch_reset, self._valid_goals = step, reset, valid_goals
+        self._launch_goals = set_goals(self._row.array, self._new_goal.array, self.worlds)
         self._launch_draw = draw_uniforms(
-            self._row.array, state_arrays.goal_count, self._draw.array, seed=seed, purpose=Purpose.GOAL,
-            world_offset=env_offset, record=True,
+            self._row.array, self.worlds.goal_count, self._draw.array, seed=self._seed, purpose=Purpose.GOAL,
+            world_offset=self._offset, record=True,
         )  # fmt: skip
+        for tensor in self._memory:
+            tensor.zero_()  # what recording has done is undone
+        self._clear_faults()
+        self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
 
     @final
     def step(self, action: Tensor) -> Step:
@@ -98,18 +147,15 @@ class WarpEnv(Env):
             expected = tuple(self.action.tensor.shape)
             raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
         self.action.tensor.copy_(action)
-        self._step.count.zero_()
         self.launch_step()
+        self._steps_in_window += 1
         return self._step
 
     @final
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""
-        self._mask.tensor.copy_(mask)
-        if goal_scale is None:
-            self._first_range.tensor.copy_(self._whole_range)
-        else:
-            torch.mul(self._whole_range, goal_scale, out=self._first_range.tensor)
+        self._views["mask"].copy_(mask)
+        torch.mul(self._whole_range, 1.0 if goal_scale is None else goal_scale, out=self._views["first_range"])
         self._launch_reset()
 
     @final
@@ -141,13 +187,54 @@ class WarpEnv(Env):
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
 
+    @final
+    def check(self) -> None:
+        """See ``Env.check``. An action that is not finite stops the run at once.
+
+        So does any invalid world, unless ``may_go_on_invalid``. Then single ones are reset and left out of learning,
+        and too many stop the run: more than a share of the world-steps since the window began, which is at least
+        ``WINDOW`` of them and ends with the next check.
+        """
+        faults, world, actor = self._views["fault"].tolist()
+        self.invalid_steps += faults - self._faults_known
+        self._faults_known = faults
+        window = self._steps_in_window * self.num_envs
+        message = None
+        if actor < self.num_envs:
+            message = f"World {actor}: its action is not finite."
+        elif faults > (MAX_INVALID_SHARE * max(window, WINDOW) if self.may_go_on_invalid else 0):
+            message = (
+                f"World {world}: {self.describe_fault(world)}; {faults} of the last {window} world-steps were invalid"
+            )
+            too_many = f", more than {100 * MAX_INVALID_SHARE:g} % of {max(window, WINDOW)}."
+            message += too_many if self.may_go_on_invalid else "."
+        if message or window >= WINDOW:
+            self._clear_faults()
+        if message:
+            raise SimulationError(message)
+
+    def describe_fault(self, world: int) -> str:
+        """What was wrong with an invalid world when it last was."""
+        cause = int(self._views["cause"][world])
+        broken = " and ".join(name for bit, name in enumerate(self.quantities) if cause & 1 << bit)
+        return f"its {broken or 'state'} is not finite"
+
+    def _clear_faults(self) -> None:
+        """Begin a new window."""
+        self._views["fault"].copy_(torch.tensor([0, self.num_envs, self.num_envs], dtype=torch.int32))
+        self._steps_in_window = self._faults_known = 0
+
     def _record_candidates(self, count: int) -> tuple[Shared, list[wp.Launch]]:
-        candidates = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device)
-        drawn = draw_candidates(
-            self._row.array, self.state_arrays.goal_count, self._candidate_scale.array, candidates.array,
-            seed=self._seed, world_offset=self._offset, record=True,
-        )  # fmt: skip
-        return candidates, [drawn, *self._finish_candidates(candidates.array)]
+        candidates, worlds = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device), self.worlds
+        launches = [draw_candidates(
+            self._row.array, worlds.goal_count, self._candidate_scale.array, candidates.array, seed=self._seed,
+            world_offset=self._offset, record=True,
+        )]  # fmt: skip
+        if worlds.origin.shape[0]:
+            launches.append(make_relative(self._row.array, worlds, candidates.array))
+        if self._valid_goals:
+            launches.append(self._valid_goals(candidates.array))
+        return candidates, launches
 
     def _set_rows(self, rows: Tensor) -> None:
         self._row.tensor[: len(rows)] = rows

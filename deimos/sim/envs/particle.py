@@ -9,22 +9,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from deimos.checks import SimulationError, check_at_least, check_choice, check_positive, check_range
-from deimos.kernels.particle import (
-    BROKEN,
-    OBS_DIM,
-    ParticleParams,
-    ParticleState,
-    ParticleStep,
-    Variant,
-    make_relative,
-    reset_particles,
-    set_goals,
-    step_particles,
-)
+from deimos.checks import check_at_least, check_choice, check_positive, check_range
+from deimos.kernels.particle import BROKEN, PARTICLES, ParticleParams, reset_particles, step_particles
 from deimos.kernels.particle_rewards import RewardShape
 from deimos.sim.env import EnvConfig, ObsField
-from deimos.sim.shared import Shared
 from deimos.sim.warp_env import WarpEnv
 
 LARGEST = 1e6  # [u] or [u/step]; beyond, float32 positions no longer tell one step from the next
@@ -37,8 +25,6 @@ class Config(EnvConfig):
 
     variant: Literal["absolute", "directional", "relative"] = "directional"
     """What a goal is: a position in space, a velocity, or the way from the particle to a position."""
-    goal_period: int = 100
-    """T: steps that a goal is in force, at least 1."""
     max_speed: float = 10.0
     """Bound of every component of the velocity [u/step], positive."""
     max_force: float = 1.0
@@ -62,10 +48,10 @@ class Config(EnvConfig):
     """Whether the policy sees numbers of order 1, or the physical values."""
 
     def __post_init__(self) -> None:
-        check_choice("variant", self.variant, [v.name.lower() for v in Variant])
+        super().__post_init__()
+        check_choice("variant", self.variant, ["absolute", "directional", "relative"])
         check_choice("reward", self.reward, [shape.name.lower() for shape in RewardShape])
         check_choice("obs_scale", self.obs_scale, ["unit", "raw"])
-        check_at_least("goal_period", self.goal_period, 1)
         check_at_least("time_limit", self.time_limit, 0)
         check_positive("max_speed", self.max_speed, finite=True)
         check_range("max_speed", self.max_speed, 0, LARGEST)
@@ -93,22 +79,17 @@ class Config(EnvConfig):
         """See ``EnvConfig.build``."""
         return Particle(self, num_envs, device, seed, env_offset)
 
-    def with_goal_period(self, goal_period: int) -> "Config":
-        """See ``EnvConfig.with_goal_period``."""
-        return replace(self, goal_period=goal_period)
-
     def for_evaluation(self) -> "Config":
         """See ``EnvConfig.for_evaluation``."""
         return replace(self, stagger_goals=False)
 
-    def params(self, seed: int, env_offset: int) -> ParticleParams:
+    def params(self) -> ParticleParams:
         """What the kernels need to know."""
         params = ParticleParams()
-        params.variant = int(Variant[self.variant.upper()])
+        params.velocity_goals = self.has_velocity_goals
         params.half_side = HALF_SIDE
         params.max_speed = self.max_speed
         params.max_force = self.max_force
-        params.goal_range = self.goal_half_side
         params.spawn_range = self.spawn_range
         unit = self.obs_scale == "unit"
         params.position_scale = 1.0 / HALF_SIDE if unit else 1.0
@@ -119,11 +100,6 @@ class Config(EnvConfig):
         # A crashing particle is at most one step outside the cube.
         reach = self.max_speed if self.has_velocity_goals else HALF_SIDE + self.max_speed
         params.largest_distance = math.sqrt(3.0) * (reach + self.goal_half_side)
-        params.goal_period = self.goal_period
-        params.time_limit = self.time_limit
-        params.stagger = self.stagger_goals
-        params.seed = seed
-        params.world_offset = env_offset
         return params
 
 
@@ -131,87 +107,31 @@ class Particle(WarpEnv):
     """Particle Gym; see ``Config``. Actions are forces [u/step^2]."""
 
     config: Config
+    quantities = BROKEN
 
-    def __init__(self, config: Config, num_envs: int, device: torch.device, seed: int, env_offset: int) -> None:
-        self.config = config
-        self.num_envs = num_envs
-        self.device = device
-        self.action_dim = 3
-        self.action_bound = config.max_force
-        self.dt = 1.0
-        self.goal_period = config.goal_period
-        self.time_limit = config.time_limit
-        self._params = params = config.params(seed, env_offset)
-        goal_unit, goal_scale = ("u/step", params.velocity_scale) if config.has_velocity_goals else (
-            "u", params.position_scale
+    def __init__(self, config: Config, num_envs: int, device: torch.device, seed: int, env_offset: int = 0) -> None:
+        params = config.params()
+        goal_unit, goal_scale = ("u", params.position_scale)
+        if config.has_velocity_goals:
+            goal_unit, goal_scale = ("u/step", params.velocity_scale)
+        super().__init__(
+            config, num_envs, device, seed, env_offset,
+            layout=(
+                ObsField("velocity", 3, "u/step", params.velocity_scale),
+                ObsField("position", 3, "u", params.position_scale),
+                ObsField("last_action", 3, "u/step^2", params.force_scale),
+                ObsField("goal", 3, goal_unit, goal_scale),
+            ),
+            goal_range=(config.goal_half_side,) * 3, action_dim=3, action_bound=config.max_force,
+            time_limit=config.time_limit, stagger=config.stagger_goals,
         )  # fmt: skip
-        self.layout = (
-            ObsField("velocity", 3, "u/step", params.velocity_scale),
-            ObsField("position", 3, "u", params.position_scale),
-            ObsField("last_action", 3, "u/step^2", params.force_scale),
-            ObsField("goal", 3, goal_unit, goal_scale),
+        state = self.allocate(PARTICLES)
+        if config.variant == "relative":
+            self.worlds.origin = wp.from_torch(self.tensors["position"])
+        self.begin(
+            step=step_particles(self.worlds, state, params).launch,
+            reset=reset_particles(self.worlds, state, params).launch,
         )
-        seen_range = torch.full((3,), config.goal_half_side * goal_scale, device=device)
-        self._allocate(seen_range, seed, env_offset)
-        self._record()
-        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
-
-    def _allocate(self, seen_range: Tensor, seed: int, env_offset: int) -> None:
-        n, device = self.num_envs, self.device
-        vectors = {name: Shared.zeros(n, wp.vec3, device) for name in ("position", "velocity", "force", "target")}
-        counters = {
-            name: Shared.zeros(n, wp.int32, device)
-            for name in ("goal_clock", "episode_step", "episode_count", "goal_count")
-        }
-        flags = {name: Shared.zeros(n, wp.bool, device) for name in ("terminated", "truncated", "goal_due", "invalid")}
-        out = {
-            "obs": Shared.zeros((n, OBS_DIM), wp.float32, device),
-            "reward": Shared.zeros(n, wp.float32, device),
-            **flags,
-            "count": Shared.zeros(2, wp.int32, device),
-            "fault": Shared.zeros(3, wp.int32, device),
-        }
-        self._share(
-            ParticleState(), vectors | counters, ParticleStep(), out, action=Shared.zeros(n, wp.vec3, device),
-            new_goal=Shared.zeros(n, wp.vec3, device), first_range=torch.ones(3, device=device),
-            seen_range=seen_range, seed=seed, env_offset=env_offset,
-        )  # fmt: skip
-        self._clear_faults()
-
-    def _record(self) -> None:
-        """Record the launches: replaying one costs half of making it (18 us against 34 us on a CPU).
-
-        A step is one kernel, so a graph around it would save nothing more.
-        """
-        params, state, out = self._params, self.state_arrays, self.step_arrays
-        reset = (params, self._mask.array, self._first_range.array, state, out.obs)
-        self._launch_step = step_particles(params, self.action.array, state, out, record=True)
-        self._launch_reset = reset_particles(*reset, record=True).launch
-        self._launch_goals = set_goals(params, self._row.array, self._new_goal.array, state, out.obs, record=True)
-
-    def launch_step(self) -> None:
-        """See ``WarpEnv.launch_step``."""
-        self._launch_step.launch()
-
-    def _finish_candidates(self, candidates: wp.array) -> list[wp.Launch]:
-        if self.config.variant != "relative":
-            return []
-        return [make_relative(self._params, self._row.array, self.state_arrays.position, candidates, record=True)]
-
-    def check(self) -> None:
-        """See ``Env.check``."""
-        faults, world, bits = self._out["fault"].tolist()
-        if faults == 0:
-            return
-        self._clear_faults()
-        broken = " and ".join(name for bit, name in enumerate(BROKEN) if bits & 1 << bit)
-        raise SimulationError(
-            f"World {world}: its {broken} is not finite; {faults} world-steps were affected since the last check."
-        )
-
-    def _clear_faults(self) -> None:
-        self._out["fault"].zero_()
-        self._out["fault"][1] = self.num_envs
 
     def reference_policy(self, brake: bool = True) -> Callable[[Tensor], Tensor]:
         """A controller that follows goals and brakes in time for the wall.
@@ -224,7 +144,7 @@ class Particle(WarpEnv):
         Args:
             brake: Whether it minds the wall; without, it is the blind follower.
         """
-        params, directional = self._params, self.config.has_velocity_goals
+        params, directional = self.config.params(), self.config.has_velocity_goals
         relative = self.config.variant == "relative"
         accel = 0.5 * params.max_force
 

@@ -1,4 +1,4 @@
-"""The ReactorX-150 of Interbotix, an arm of five joints, to be mounted on a quadruped's trunk.
+"""A Unitree Go1 with a ReactorX-150 of Interbotix, an arm of five joints, on its trunk.
 
 Where the numbers come from:
 
@@ -20,8 +20,8 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING
 
-from deimos.sim.legged.robots import ROBOT_BIT, TERRAIN_BIT, VISUAL_GROUP, Robot
-from deimos.sim.legged.robots.primitives import add_actuator, add_hard_geom, add_inertia, add_look
+from deimos.sim.legged.robots import ROBOT_BIT, TERRAIN_BIT, VISUAL_GROUP, Arm, Joint, Robot, Vector, go1
+from deimos.sim.legged.robots._primitives import add_actuators, add_collision, add_inertia, add_visual
 
 if TYPE_CHECKING:
     import mujoco
@@ -39,6 +39,8 @@ OFFSETS = (
 )  # [m]: of every joint from the frame before it, then of the end effector
 SHOULDER = (0.03, 0.0, 0.16157)  # [m], of the shoulder's axis in the trunk
 GRIPPER_RADIUS = 0.035  # [m], of what must not touch anything, about the end effector too
+# Corners of a Go1's trunk with head and hips [m], in the trunk: goals keep out of it, and of what is below it.
+BODY = ((-0.24, -0.15, -math.inf), (0.30, 0.15, 0.06))
 MASS = 1.772  # [kg]
 
 # Each is mass [kg], centre of mass [m], inertia about it (xx, yy, zz, xy, xz, yz) [kg m^2]: of the base, and of what
@@ -64,7 +66,7 @@ DRAG = (0.85, 0.85, 0.85, 0.22, 0.16)
 POSE = (0.0, -0.9, 0.9, 0.3, 0.0)  # [rad], half folded
 ACTION_SCALE = 0.5  # [rad]
 
-# The arm's hard parts, capsules along x in their frames: body, radius, from, to [m].
+# What of the arm collides, capsules along x in their frames: body, radius, from, to [m].
 CAPSULES = {"forearm": ("arm_forearm", 0.025, 0.0, 0.15), "gripper": ("arm_gripper", GRIPPER_RADIUS, -0.045, 0.09)}
 # What these alone touch: two capsules that fill trunk, head and hip motors, and a ball within the arm's base: radius,
 # from, to [m], in the trunk.
@@ -74,7 +76,6 @@ GUARDS = {
     "guard_base": (0.05, (0.02, 0.0, 0.107), None),
 }
 GUARD_BIT = 4  # of the contype of guards and of the conaffinity of the arm
-HOLD = 1e7  # [N s/m] and [N m s/rad]; under its robot's whole weight a trunk moves 0.3 mm in 20 s
 
 BLACK, GREY, STEEL = (0.08, 0.08, 0.09, 1.0), (0.22, 0.23, 0.25, 1.0), (0.62, 0.64, 0.67, 1.0)
 ALONG_Z, ALONG_Y, ALONG_X = (1.0, 0.0, 0.0, 0.0), (0.70711, 0.70711, 0.0, 0.0), (0.70711, 0.0, 0.70711, 0.0)
@@ -127,7 +128,14 @@ LOOK = {
 }
 
 
-def mount(robot: Robot, *, hold_trunk: bool = False) -> Robot:
+def build(
+    *, stiffness: float = go1.STIFFNESS, damping: float = go1.DAMPING, action_scale: float = go1.ACTION_SCALE
+) -> Robot:  # fmt: skip
+    """A Go1 with the arm in free space; the arguments are those of ``go1.build``, for the legs."""
+    return mount(go1.build(stiffness=stiffness, damping=damping, action_scale=action_scale))
+
+
+def mount(robot: Robot) -> Robot:
     """The robot with the arm on its trunk; joints and actuators of the arm come after its own.
 
     Forearm and gripper touch the trunk, and the terrain, where touching counts as it does for the base: it is a crash.
@@ -135,32 +143,44 @@ def mount(robot: Robot, *, hold_trunk: bool = False) -> Robot:
 
     Args:
         robot: The Go1 to mount the arm on. Its ``spec`` is changed in place.
-        hold_trunk: Hold the base wherever it is put, with legs that touch nothing, and start it at its standing
-            height; for tests of the arm alone.
     """
     spec = robot.spec
     trunk = spec.worldbody.first_body()
     _add_links(trunk)
-    _add_hard_geoms(spec, trunk)
-    for i, joint in enumerate(JOINTS):
-        add_actuator(spec, joint, stiffness=STIFFNESS[i], damping=DAMPING[i], max_torque=MAX_TORQUE[i])
-    robot = dataclasses.replace(
-        robot,
-        pose=robot.pose + POSE,
-        action_scale=robot.action_scale + (ACTION_SCALE,) * len(JOINTS),
-        parts=((*robot.parts[0], *CAPSULES), *robot.parts[1:]),
+    _add_collisions(spec, trunk)
+    joints = tuple(
+        Joint(
+            name=name,
+            pose=POSE[i],
+            action_scale=ACTION_SCALE,
+            range=_limits(i),
+            stiffness=STIFFNESS[i],
+            damping=DAMPING[i],
+            max_torque=MAX_TORQUE[i],
+        )
+        for i, name in enumerate(JOINTS)
     )
-    return _hold(robot) if hold_trunk else robot
+    add_actuators(spec, joints)
+    mounted = (MOUNT[0] + OFFSETS[0][0], MOUNT[1] + OFFSETS[0][1], MOUNT[2] + OFFSETS[0][2])
+    arm = Arm(
+        offsets=(mounted, *OFFSETS[1:]),
+        axes=tuple(_axis(i) for i in range(len(JOINTS))),
+        shoulder=SHOULDER,
+        body=BODY,
+        radius=GRIPPER_RADIUS,
+    )
+    parts = ((*robot.parts[0], *CAPSULES), *robot.parts[1:])
+    return dataclasses.replace(robot, joints=robot.joints + joints, parts=parts, arm=arm)
 
 
-def _hold(robot: Robot) -> Robot:
-    """Damp the free joint until the base stands still; unlike a weld it holds every world where that world was put."""
-    robot.spec.worldbody.first_body().first_joint().damping = (HOLD, 0.0, 0.0)
-    for part in robot.parts[1:]:
-        for name in part:
-            geom = robot.spec.geom(name)
-            geom.contype = geom.conaffinity = 0
-    return dataclasses.replace(robot, spawn_height=robot.standing_height)
+def _limits(i: int) -> tuple[float, float]:
+    """Range of a joint [rad]."""
+    return math.radians(RANGE[i][0]), math.radians(RANGE[i][1])
+
+
+def _axis(i: int) -> Vector:
+    """Axis of a joint."""
+    return {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[AXES[i]]
 
 
 def _add_links(trunk: "mujoco.MjsBody") -> None:
@@ -173,8 +193,8 @@ def _add_links(trunk: "mujoco.MjsBody") -> None:
         add_inertia(body, *LINKS[i])
         body.add_joint(
             name=joint,
-            axis=[float(axis == AXES[i]) for axis in "xyz"],
-            range=[math.radians(limit) for limit in RANGE[i]],
+            axis=_axis(i),
+            range=_limits(i),
             limited=True,
             armature=ARMATURE[i],
             damping=(DRAG[i], 0.0, 0.0),
@@ -183,18 +203,18 @@ def _add_links(trunk: "mujoco.MjsBody") -> None:
     body.add_site(name="end_effector", pos=OFFSETS[-1], group=VISUAL_GROUP)
 
 
-def _add_hard_geoms(spec: "mujoco.MjSpec", trunk: "mujoco.MjsBody") -> None:
+def _add_collisions(spec: "mujoco.MjSpec", trunk: "mujoco.MjsBody") -> None:
     """Add the arm's two capsules, and the guards in the trunk that they touch."""
     for name, (body, radius, rear, front) in CAPSULES.items():
         ends = (rear, 0.0, 0.0), (front, 0.0, 0.0)
-        add_hard_geom(
+        add_collision(
             spec.body(body), name, radius, *ends, contype=ROBOT_BIT, conaffinity=TERRAIN_BIT | GUARD_BIT
         )  # fmt: skip
     for name, (radius, start, end) in GUARDS.items():
-        add_hard_geom(trunk, name, radius, start, end, contype=GUARD_BIT, conaffinity=0)
+        add_collision(trunk, name, radius, start, end, contype=GUARD_BIT, conaffinity=0)
 
 
 def _dress(body: "mujoco.MjsBody") -> None:
     """Add what a body looks like."""
     for shape, size, pos, quat, rgba in LOOK[body.name]:
-        add_look(body, shape, size, pos, rgba, quat=quat)
+        add_visual(body, shape, size, pos, rgba, quat=quat)
