@@ -19,9 +19,8 @@ from deimos.checks import RunError, SimulationError, check_at_least, check_choic
 from deimos.files import load_tensors, save_tensors
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
-from deimos.learn.policy import load_policy, save_policy
+from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.learn.ppo import PPO, PPOConfig
-from deimos.learn.rollout import Rollout
 from deimos.nn.matmul import keep_freed_memory, on_threads
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
@@ -123,11 +122,8 @@ class Trainer:
         self.env = config.env.build(config.num_envs, device, config.seed)
         total_steps = config.iterations * config.ppo.num_steps
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
-        self.ppo = PPO(config.ppo, self.env, config.seed)
-        self.rollout = Rollout(
-            self.env, config.ppo.num_steps, discount=config.ppo.discount, gae_lambda=config.ppo.gae_lambda,
-            reward_scale=config.ppo.reward_scale,
-        )  # fmt: skip
+        self.ppo = PPO(config.ppo, config.num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed)
+        self.rollout = self.ppo.new_rollout()
         self.iteration = 0
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
         """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""
@@ -149,8 +145,12 @@ class Trainer:
             clock.lap("policy")
             step = env.step(rollout.action[t])
             clock.lap("env")
-            rollout.record(t, step, loop.weight)
-            loop.advance(step)
+            changes = loop.resolve(step)
+            rollout.record(
+                t, obs=step.obs, reward=step.reward, terminated=step.terminated, truncated=step.truncated,
+                invalid=step.invalid, weight=loop.weight, cut_off=changes.cut_off,
+            )  # fmt: skip
+            loop.renew(step, changes)
             clock.lap("goals")
         rollout.obs[-1] = env.obs
 
@@ -408,8 +408,9 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
         RunError: If they cannot be written; the ones of before are whole.
     """
     save_tensors(folder.path / "checkpoint.pt", {"schema": SCHEMA, **trainer.state_dict()})
-    ppo = trainer.config.ppo
-    save_policy(folder.path / "policy.pt", trainer.ppo.actor, ppo.hidden, ppo.activation, trainer.env)
+    ppo, env = trainer.config.ppo, trainer.env
+    policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
+    save_policy(folder.path / "policy.pt", policy)
 
 
 def train(
