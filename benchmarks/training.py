@@ -11,15 +11,15 @@ from typing import Any
 import torch
 from rich.table import Table
 
+from benchmarks.flops import operations, selector_operations
 from benchmarks.timing import in_turn, ratio, wide_console
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import vds
-from deimos.nn.networks import operations
 from deimos.run.training import TrainConfig, Trainer
 
 METHODS_TIMED: dict[str, SelectorConfig] = {
-    name: METHODS[name] for name in ("uniform", "p25", "rnd", "learnability", "plr", "grid", "vds", "vds-auxiliary")
+    name: method(name) for name in ("uniform", "p25", "rnd", "learnability", "plr", "grid", "vds", "vds-auxiliary")
 } | {"vds, own shares": vds.Config(data="share", epochs=3)}
 """What is timed: a method of each kind, and VDS with the price of each of its options."""
 OFTEN = 4  # times as many rounds for methods that differ from Uniform by less than a round does from the next
@@ -118,7 +118,8 @@ def extra_operations(trainer: Trainer) -> float:
     selector = trainer.loop.selector
     decisions = transitions / trainer.env.goal_period
     spared = 3.0 * operations(ppo.critic) * transitions * ppo.config.epochs if selector.critic() is not None else 0.0
-    return selector.operations(decisions, transitions) - spared
+    env = trainer.env
+    return selector_operations(selector, decisions, transitions, env.num_envs, env.goal_dim) - spared
 
 
 def machine(device: torch.device) -> dict[str, float]:

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from deimos.nn.stateful import Stateful
+
 TEMPERATURES = (0.1, 10.0)  # range of a temperature; outside, the scores are not logits of anything
 BINS = 15
 
 
-class Calibration:
+class Calibration(Stateful):
     """Turns logits of a class-balanced classifier into probabilities.
 
     Class weights n / (2 n_class) multiply the odds that a classifier learns by (1 - pi) / pi, with pi the
@@ -25,6 +27,8 @@ class Calibration:
         .. [1] Elkan, *The Foundations of Cost-Sensitive Learning*, IJCAI 2001, theorem 2.
         .. [2] Guo et al., *On Calibration of Modern Neural Networks*, ICML 2017, section 4.2. arXiv:1706.04599
     """
+
+    saved = ("prior", "temperature")
 
     def __init__(self) -> None:
         self.prior = 0.0
@@ -70,14 +74,6 @@ class Calibration:
             inverse = (inverse - slope / curvature).clamp(min=0.5 * inverse, max=2.0 * inverse)
         low, high = TEMPERATURES
         self.temperature = min(max(1.0 / inverse.item(), low), high)
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {"prior": self.prior, "temperature": self.temperature}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``."""
-        self.prior, self.temperature = state["prior"], state["temperature"]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import abc
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -12,9 +12,7 @@ from deimos.goals import picks
 from deimos.goals.calibration import Calibration, judge
 from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
-from deimos.learn.rollout import Rollout
-from deimos.nn.networks import operations
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +39,13 @@ class FearSelector(GoalSelector):
     """Learns fear online and leaves the choice to ``choose``. Until it has seen both classes it is uniform."""
 
     config: FearSelectorConfig
+    saved: ClassVar[tuple[str, ...]] = ("fear", "calibration", "_learnt_at")
 
     def __init__(self, config: FearSelectorConfig, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
-        self._num_envs = spaces.num_envs
         self._learnt_at = 0  # step of the last call of learn
-        self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed, spaces.fuse)
+        self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
         self.calibration = Calibration()
 
     @abc.abstractmethod
@@ -79,7 +77,7 @@ class FearSelector(GoalSelector):
         """Logits of the fear network for all candidates; see ``Fear.score``."""
         return self.fear.score(self._seen(state), goal, candidates)
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time judges it first."""
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at
@@ -107,29 +105,12 @@ class FearSelector(GoalSelector):
             self.calibration.set_share(self.fear.share)
         return row
 
-    def operations(self, decisions: float, transitions: int) -> float:
-        """See ``GoalSelector.operations``."""
-        window = 2 * self._num_envs  # interactions: the resolved ones of 2 T steps, about one per world and T
-        fit = 3.0 * operations(self.fear.network) * window * self.config.fear.epochs
-        return self.fear.operations(decisions, self.num_candidates) + fit
-
     def _seen(self, state: Tensor) -> Tensor:
         return torch.zeros_like(state) if self.config.control == "state-blind" else state
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
         self.fear.check()
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        calibration = self.calibration.state_dict()
-        return {"fear": self.fear.state_dict(), "calibration": calibration, "learnt_at": self._learnt_at}
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.fear.load_state_dict(state["fear"])
-        self.calibration.load_state_dict(state["calibration"])
-        self._learnt_at = state["learnt_at"]
 
 
 def fear_selector(selector: GoalSelector) -> FearSelector | None:

@@ -3,39 +3,14 @@
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions
-from deimos.learn.rollout import Rollout
-
-if TYPE_CHECKING:  # it needs PPO, which needs this module
-    from deimos.nn.ensemble import Stack, StackKernels
-
-
-@dataclass(frozen=True)
-class Whitening:
-    """What a network sees of a candidate: clip((x - mean) * factor, -bound, bound). Tensors may change, not move."""
-
-    mean: Tensor
-    """Shape (goal_dim,)."""
-    factor: Tensor
-    """Shape (goal_dim,)."""
-    bound: float
-    """Above 0."""
-
-
-class Fuse(Protocol):
-    """Makes ``scores(context, candidates)``, shape (B, N), of a network; ``None`` where it cannot: ``fused.fuse``."""
-
-    def __call__(
-        self, net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None
-    ) -> Callable[[Tensor, Tensor], Tensor] | None:
-        """See ``fused.fuse``."""
-        ...
+from deimos.nn.stateful import Stateful
 
 
 @dataclass(frozen=True)
@@ -58,10 +33,6 @@ class Spaces:
     """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
     total_steps: int = 0
     """Steps of the whole training; 0 where nobody knows."""
-    fuse: Fuse | None = None
-    """Who scores candidates in one kernel, where the worlds have kernels (``fused.fuse``); ``None`` for torch alone."""
-    fuse_critics: "Callable[[Stack], StackKernels | None] | None" = None
-    """Who has kernels for an ensemble (``fused_critics.fuse_critics``); ``None`` for torch alone."""
 
     def state_then_goal(self, obs: Tensor) -> Tensor:
         """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""
@@ -108,11 +79,32 @@ def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
     return Proposal(picks.take(candidates, pick), torch.full_like(draw, torch.nan))
 
 
-class Critic(Protocol):
-    """A value function that somebody else trains."""
+class Transitions(Protocol):
+    """What selectors may learn from the learner's transitions; shapes are (num_steps, num_envs), but for ``obs``."""
 
-    def value(self, obs: Tensor) -> Tensor:
-        """Values, in units of scaled rewards, of observations of shape (..., obs_dim)."""
+    num_steps: int
+    """Steps of every world since the last call of ``learn``."""
+    obs: Tensor
+    """Observations that the steps started from, and those after the last, shape (num_steps + 1, num_envs, obs_dim)."""
+    reward: Tensor
+    """Rewards as the environment gives them."""
+    terminated: Tensor
+    """True where the world crashed, bool."""
+    truncated: Tensor
+    """True where the episode was cut off without a crash, bool."""
+    weight: Tensor
+    """Weight of the transition in everything learnt: 0 leaves it out."""
+    advantage: Tensor
+    """The learner's advantages in units of scaled rewards."""
+    reward_scale: float
+    """What the learner multiplies rewards by before it values them."""
+    discount: float
+    """gamma of the learner, in [0, 1]."""
+    gae_lambda: float
+    """lambda of the learner's advantages, in [0, 1]."""
+
+    def cut_off(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Steps and worlds that were truncated, int64, shape (m,) each, and their last observations, (m, obs_dim)."""
         ...
 
 
@@ -129,8 +121,8 @@ class SelectorConfig(abc.ABC):
         """
 
 
-class GoalSelector(abc.ABC):
-    """Chooses the goals of a training run."""
+class GoalSelector(Stateful, abc.ABC):
+    """Chooses the goals of a training run; ``saved`` names what a resume needs."""
 
     num_candidates: int = 1
     """Candidates that it wants to choose from at every decision."""
@@ -158,11 +150,14 @@ class GoalSelector(abc.ABC):
                 in the choice comes from here, so that it is the same in any batch.
         """
 
-    def critic(self) -> "Critic | None":
-        """The value function that the learner shall use instead of its own, if this selector supplies one."""
+    def critic(self) -> Callable[[Tensor], Tensor] | None:
+        """The value function that the learner shall use instead of its own, if this selector supplies one.
+
+        It takes observations of shape (..., obs_dim) and returns values in units of scaled rewards, shape (...).
+        """
         return None
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Learn from what happened, once per rollout.
 
         Args:
@@ -175,24 +170,8 @@ class GoalSelector(abc.ABC):
         """
         return {}
 
-    def operations(self, decisions: float, transitions: int) -> float:
-        """Multiplications and additions of its matrix products in an iteration: what it cannot cost less than.
-
-        Args:
-            decisions: Goals that it chooses in an iteration.
-            transitions: Transitions of an iteration.
-        """
-        return sum(part.operations(decisions, transitions) for part in self.parts)
-
-    def check(self) -> None:  # noqa: B027 (a selector without weights has nothing to check)
+    def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite."""
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {}
-
-    def load_state_dict(self, state: dict) -> None:  # noqa: B027 (nor anything to load)
-        """Go on from ``state_dict()``."""
 
 
 class Delegate(GoalSelector):
@@ -226,22 +205,14 @@ class Delegate(GoalSelector):
         """See ``GoalSelector.propose``."""
         return self.current.propose(rows, state, goal, candidates, draws)
 
-    def critic(self) -> "Critic | None":
+    def critic(self) -> Callable[[Tensor], Tensor] | None:
         """See ``GoalSelector.critic``."""
         return self.current.critic()
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``GoalSelector.learn``."""
         return self.current.learn(interactions, rollout)
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
         self.current.check()
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return self.current.state_dict()
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.current.load_state_dict(state)

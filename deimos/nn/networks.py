@@ -23,11 +23,6 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int, activation: Activation
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
 
-def operations(net: nn.Module) -> int:
-    """Multiplications and additions of the linear layers of a network for one row, forward."""
-    return sum(2 * layer.weight.numel() for layer in net.modules() if isinstance(layer, nn.Linear))
-
-
 def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]:
     """Lay the parameters and the gradients of every module end to end in memory.
 
@@ -61,7 +56,7 @@ def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]
 
 
 def weights_of(net: nn.Module) -> dict[str, Tensor]:
-    """A copy of a network's ``state_dict``: later lessons leave it alone, and a file of it holds nothing else.
+    """A copy of a network's ``state_dict``: later updates leave it alone, and a file of it holds nothing else.
 
     Parameters that ``flatten_parameters`` has laid out are views, and a view is saved with all that it is a view of.
     """
@@ -77,7 +72,7 @@ def rows_in_cache(widest: int) -> int:
     """Rows whose activations take 3 MiB in a layer of ``widest`` units.
 
     A CPU works through larger batches in such pieces: they stay in its caches and far below the blocks of memory
-    that the C library gives back to the system (see ``products.keep_freed_memory``).
+    that the C library gives back to the system (see ``matmul.keep_freed_memory``).
     """
     return max(256, 3 * 2**20 // (4 * widest))
 
@@ -149,12 +144,6 @@ class ManyCandidates:
         widest = max(layer.in_features for layer in self._others)
         rows = workspace * 2**20 // (8 * widest)  # a layer's input and output
         self._rows = min(rows, rows_in_cache(widest)) if weight.device.type == "cpu" else rows
-
-    def operations(self, contexts: float, count: int) -> float:
-        """Multiplications and additions of the products for ``count`` candidates in each of ``contexts``."""
-        shared, own = 2 * self._of_context.numel(), 2 * self._of_candidate.numel()
-        rest = sum(2 * layer.weight.numel() for layer in self._others)
-        return contexts * (shared + count * (own + rest))
 
     def contexts_at_once(self, count: int) -> int:
         """Contexts, each with ``count`` candidates, whose activations fit the workspace; at least 1."""

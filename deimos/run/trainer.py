@@ -11,7 +11,6 @@ from deimos.checks import RunError, SimulationError, check_at_least, check_choic
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.learn.ppo import PPO, PPOConfig
-from deimos.learn.rollout import Rollout
 from deimos.nn.matmul import keep_freed_memory, on_threads
 from deimos.run.config import kind, to_dict
 from deimos.run.evaluation import EvalConfig
@@ -92,11 +91,8 @@ class Trainer:
         self.env = config.env.build(config.num_envs, device, config.seed)
         total_steps = config.iterations * config.ppo.num_steps
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
-        self.ppo = PPO(config.ppo, self.env, config.seed)
-        self.rollout = Rollout(
-            self.env, config.ppo.num_steps, discount=config.ppo.discount, gae_lambda=config.ppo.gae_lambda,
-            reward_scale=config.ppo.reward_scale,
-        )  # fmt: skip
+        self.ppo = PPO(config.ppo, config.num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed)
+        self.rollout = self.ppo.new_rollout()
         self.iteration = 0
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
         """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""
@@ -118,8 +114,12 @@ class Trainer:
             clock.lap("policy")
             step = env.step(rollout.action[t])
             clock.lap("env")
-            rollout.record(t, step, loop.weight)
-            loop.advance(step)
+            changes = loop.resolve(step)
+            rollout.record(
+                t, obs=step.obs, reward=step.reward, terminated=step.terminated, truncated=step.truncated,
+                invalid=step.invalid, weight=loop.weight, cut_off=changes.cut_off,
+            )  # fmt: skip
+            loop.renew(step, changes)
             clock.lap("goals")
         rollout.obs[-1] = env.obs
 

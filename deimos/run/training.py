@@ -15,7 +15,7 @@ import torch
 from deimos import __version__
 from deimos.checks import RunError
 from deimos.files import load_tensors, save_tensors
-from deimos.learn.policy import load_policy, save_policy
+from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
@@ -199,8 +199,9 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
         RunError: If they cannot be written; the ones of before are whole.
     """
     save_tensors(folder.path / "checkpoint.pt", {"schema": SCHEMA, **trainer.state_dict()})
-    ppo = trainer.config.ppo
-    save_policy(folder.path / "policy.pt", trainer.ppo.actor, ppo.hidden, ppo.activation, trainer.env)
+    ppo, env = trainer.config.ppo, trainer.env
+    policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
+    save_policy(folder.path / "policy.pt", policy)
 
 
 def train(

@@ -15,21 +15,11 @@ import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least
+from deimos.nn.layout import ObsField, goal_slice
 
 if TYPE_CHECKING:
     import mujoco
     import numpy as np
-
-
-@dataclass(frozen=True)
-class ObsField:
-    """A run of components of the observation."""
-
-    name: str
-    size: int
-    unit: str
-    scale: float | tuple[float, ...]
-    """The policy sees the physical value times this; one number for all components or one for each."""
 
 
 @dataclass(frozen=True)
@@ -211,12 +201,7 @@ class Env(abc.ABC):
     @property
     def goal_slice(self) -> slice:
         """Where the goal sits in the observation."""
-        start = 0
-        for field in self.layout:
-            if field.name == "goal":
-                return slice(start, start + field.size)
-            start += field.size
-        raise ValueError("The layout has no field named 'goal'.")
+        return goal_slice(self.layout)
 
     @property
     def goal_dim(self) -> int:

@@ -78,7 +78,7 @@ def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
     fields = to_dict(config)
     hints = typing.get_type_hints(type(config))
     names = [value for name, value in fields.items() if hints.get(name) is str and value in METHODS]
-    named = {name: _spelled_out(METHODS[name], (*known, name)) for name in names if name not in known}
+    named = {name: _spelled_out(method(name), (*known, name)) for name in names if name not in known}
     return fields | ({"methods": named} if named else {})
 
 

@@ -1,0 +1,28 @@
+"""What stands where in an observation: environments lay it out, policies carry it with them."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ObsField:
+    """A run of components of the observation."""
+
+    name: str
+    size: int
+    unit: str
+    scale: float | tuple[float, ...]
+    """The policy sees the physical value times this; one number for all components or one for each."""
+
+
+def goal_slice(layout: tuple[ObsField, ...]) -> slice:
+    """Where the field named ``goal`` stands in the observation.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    start = 0
+    for field in layout:
+        if field.name == "goal":
+            return slice(start, start + field.size)
+        start += field.size
+    raise ValueError("The layout has no field named 'goal'.")
