@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .files import write_whole
+from deimos.files import write_whole
+
 from .grid import Terrain
 
 if TYPE_CHECKING:

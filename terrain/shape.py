@@ -1,12 +1,13 @@
 """What every shape of ground promises."""
 
 import abc
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .checks import check_positive, check_range
+from deimos.checks import check_positive, check_range
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -30,8 +31,8 @@ class TileShape(abc.ABC):
     """Side of the level middle [m], positive and smaller than the tile."""
 
     def __post_init__(self) -> None:
-        check_positive("tile", self.tile)
-        check_positive("platform", self.platform)
+        check_positive("tile", self.tile, finite=True)
+        check_positive("platform", self.platform, finite=True)
         if self.platform >= self.tile:
             raise ValueError(f"platform must be smaller than tile = {self.tile:g} m, got {self.platform:g} m.")
 
@@ -77,3 +78,11 @@ def at(ramp: Ramp, difficulty: float) -> float:
     """Value of a ramp at a difficulty in [0, 1]."""
     easiest, hardest = ramp
     return (1.0 - difficulty) * easiest + difficulty * hardest
+
+
+def check_ramp(name: str, value: Ramp, least: float = 0.0) -> None:
+    """Raise ``ValueError`` unless ``value`` is a pair of finite numbers of at least ``least``."""
+    if len(value) != 2 or not all(least <= end < math.inf for end in value):
+        raise ValueError(
+            f"{name} must be two finite numbers of at least {least:g}, at difficulty 0 and at 1, got {value}."
+        )

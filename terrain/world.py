@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from deimos.kernels.ray_cast import LARGEST
 
+from deimos.checks import check_at_least, check_positive, check_range
+
 from . import catalog
-from .checks import cells, check_at_least, check_positive, check_range
-from .grid import Terrain
+from .grid import Terrain, cells
 from .heightfield import rasterise
 from .mesh import from_quads, join
 from .shape import TileShape
@@ -64,7 +65,7 @@ class Grid:
         check_at_least("levels", self.levels, 1)
         check_at_least("columns", self.columns, 1)
         check_at_least("seed", self.seed, 0)
-        check_positive("tile", self.tile)
+        check_positive("tile", self.tile, finite=True)
         check_range("border", self.border, 0, 1e6)
         check_range("easiest", self.easiest, 0, 1)
         check_range("hardest", self.hardest, 0, 1)
@@ -73,7 +74,7 @@ class Grid:
         if not self.shapes:
             raise ValueError("shapes must have at least one entry.")
         for part in self.shapes:
-            check_positive("share", part.share)
+            check_positive("share", part.share, finite=True)
         for shape in self.column_shapes:
             highest = max(shape.step(self.easiest), shape.step(self.hardest))
             if highest > self.max_step + 1e-9:

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_at_least, check_positive, check_ramp
+from deimos.checks import check_at_least, check_positive
+
 from ..mesh import terraces
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -33,7 +34,7 @@ class Shape(TileShape):
         super().__post_init__()
         check_ramp("height", self.height)
         check_at_least("count", self.count, 0)
-        check_positive("raster", self.raster)
+        check_positive("raster", self.raster, finite=True)
         shortest, longest = self.sides
         room = self.tile - 2 * self.raster
         if not 0 < shortest <= longest <= room:

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
+from deimos.checks import check_positive
+
 from ..mesh import rings
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -25,7 +26,7 @@ class Shape(TileShape):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_ramp("width", self.width)
-        check_positive("depth", self.depth)
+        check_positive("depth", self.depth, finite=True)
         if self.platform + 2 * max(self.width) >= self.tile:
             raise ValueError(
                 f"tile must be larger than platform + 2 width = {self.platform + 2 * max(self.width):g} m, "

@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_ramp
 from ..mesh import rings
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

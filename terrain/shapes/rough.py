@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp, check_range
+from deimos.checks import check_positive, check_range
+
 from ..mesh import sheet
 from ..noise import draw_noise
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -31,7 +32,7 @@ class Shape(TileShape):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_ramp("amplitude", self.amplitude)
-        check_positive("quantum", self.quantum)
+        check_positive("quantum", self.quantum, finite=True)
         check_range("spacing", self.spacing, 0.01, self.tile / 4)
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":

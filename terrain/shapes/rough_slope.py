@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp, check_range
+from deimos.checks import check_positive, check_range
+
 from ..mesh import sheet
 from ..noise import draw_noise, interpolate
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -35,9 +36,9 @@ class Shape(TileShape):
         super().__post_init__()
         check_ramp("gradient", self.gradient)
         check_ramp("amplitude", self.amplitude)
-        check_positive("quantum", self.quantum)
+        check_positive("quantum", self.quantum, finite=True)
         check_range("spacing", self.spacing, 0.01, self.tile / 4)
-        check_positive("room", self.room)
+        check_positive("room", self.room, finite=True)
         if self.room > self.platform:
             raise ValueError(f"room must be at most platform = {self.platform:g} m, got {self.room:g} m.")
 

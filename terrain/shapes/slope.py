@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ..checks import check_ramp
 from ..mesh import from_triangles
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

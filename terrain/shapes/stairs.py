@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
+from deimos.checks import check_positive
+
 from ..mesh import rings
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -34,7 +35,7 @@ class Shape(TileShape):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_ramp("height", self.height)
-        check_positive("tread", self.tread)
+        check_positive("tread", self.tread, finite=True)
 
     @property
     def num_steps(self) -> int:

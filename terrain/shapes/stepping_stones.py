@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
+from deimos.checks import check_positive
+
 from ..mesh import blocks, join, rings
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -31,8 +32,8 @@ class Shape(TileShape):
         super().__post_init__()
         for name in ("side", "gap"):
             check_ramp(name, getattr(self, name), least=0.01)
-        check_positive("depth", self.depth)
-        check_positive("rim", self.rim)
+        check_positive("depth", self.depth, finite=True)
+        check_positive("rim", self.rim, finite=True)
         if self.platform + 2 * self.rim + 4 * max(self.gap) >= self.tile:
             raise ValueError(
                 f"tile must be larger than platform + 2 rim + 4 gap = "

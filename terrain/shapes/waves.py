@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_at_least, check_positive, check_ramp, check_range
+from deimos.checks import check_at_least, check_positive, check_range
+
 from ..mesh import sheet
-from ..shape import Ramp, TileShape, at
+from ..shape import Ramp, TileShape, at, check_ramp
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -32,7 +33,7 @@ class Shape(TileShape):
         super().__post_init__()
         check_ramp("height", self.height)
         check_at_least("count", self.count, 1)
-        check_positive("fade", self.fade)
+        check_positive("fade", self.fade, finite=True)
         check_range("spacing", self.spacing, 0.01, self.tile / self.count / 8)
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
