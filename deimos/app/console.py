@@ -69,14 +69,16 @@ def _refuse(event: Any) -> None:
         case "InstantiationFailure":
             raise RunError(f"{name}: {event.message}" if name else event.message)
         case "InvalidChoice":
-            raise RunError(f"{name} cannot be '{event.value}'; it can be: {', '.join(map(repr, event.choices))}.")
+            raise RunError(f"There is no '{event.value}' for {name}; there are: {', '.join(map(repr, event.choices))}.")
         case "BadValue":
             raise RunError(f"Missing value for argument '{name}'.")
         case "UnrecognizedArgs":
             raise RunError(f"Unrecognized options: {' '.join(event.tokens)}.")
         case "MissingArgs":
-            missing = [(found.arg.display_name(), found.arg.field.helptext) for found in event.missing_arguments]
-            raise RunError(f"Missing from {event.prog}: {'; '.join(f'{name} ({text})' for name, text in missing)}")
+            arguments = [found.arg for found in event.missing_arguments]
+            about = [(each.display_name(), each.field.helptext) for each in arguments]
+            missing = [f"{name} ({text() if callable(text) else text})" for name, text in about]
+            raise RunError(f"Missing from {event.prog}: {', '.join(missing)}")
 
 
 @contextlib.contextmanager
