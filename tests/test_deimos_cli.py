@@ -371,6 +371,48 @@ def test_true_process_says_one_line(copied, arguments):
     assert contents(copied.parent) == before
 
 
+SIM = ("warp", "tyro", "rich", "tensorboard", "matplotlib", "PIL", "mujoco", "mujoco_warp", "trimesh", "scipy")
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["--version"], ["train"], ["evaluate", "run"], ["terrain"]])
+def test_base_install_names_its_extra(here, capsys, arguments):
+    """With torch and NumPy alone, help and version are there, and the commands say in one line what to install."""
+    code = f"import sys; sys.modules.update(dict.fromkeys({SIM})); from deimos.app import cli; "
+    command = [sys.executable, "-c", code + f"sys.exit(cli.main({arguments}))"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if arguments[:1] in ([], ["--help"], ["--version"]):
+        assert cli.main(arguments) == 0
+        assert (done.returncode, done.stdout, done.stderr) == (0, *capsys.readouterr())
+    else:
+        assert (done.returncode, done.stdout) == (2, "")
+        line = r"deimos: This needs \w+, which is not installed: pip install 'deimos-rl\[sim\]'\n"
+        assert re.fullmatch(line, done.stderr), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "package"),
+    [
+        (["terrain", "shape", "flat"], "trimesh"),
+        (["play", "run", "--video", "x.mp4"], "mujoco"),
+        (["train", "env:quad", "--num-envs", "1"], "mujoco"),
+    ],
+)
+def test_legged_robots_name_their_extra(here, capfd, monkeypatch, arguments, package):
+    """Where MuJoCo or trimesh is not installed, the one line names the extra of the legged robots."""
+    monkeypatch.setitem(sys.modules, package, None)
+    line = f"deimos: This needs {package}, which is not installed: pip install 'deimos-rl[legged]'\n"
+    assert refused(arguments, capfd) == line
+
+
+def test_other_versions_of_tyro_speak_for_themselves(monkeypatch, capfd):
+    """Where tyro tells nothing of what is wrong, its own words stay, with the same exit code."""
+    monkeypatch.setitem(sys.modules, "tyro._errors", None)
+    assert cli.main(["terrain", "grid", "--levels", "three"]) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "'three'" in err
+
+
 def test_version(capsys):
     """``deimos --version`` prints the version and nothing else."""
     assert cli.main(["--version"]) == 0

@@ -194,7 +194,7 @@ def test_interrupt_leaves_a_checkpoint_to_resume_from(undisturbed, tmp_path):
     assert "Traceback" not in stderr
     done = checkpoint(path)["iteration"]
     assert 3 <= done == len(rows(path)) < CONFIG.iterations
-    assert stderr.splitlines()[-1] == f"Stopped after iteration {done}; go on with --resume {path}"
+    assert stderr.splitlines()[-1] == f"Stopped after iteration {done}; resume with --resume {path}"
     resume(path)
     assert_same_run(path, undisturbed)
 
@@ -213,7 +213,7 @@ def test_smaller_budget_is_refused(undisturbed, capsys):
     """A resumed run takes no smaller budget, and the refusal changes nothing."""
     before = files(undisturbed)
     assert cli.main(["train", "--resume", str(undisturbed), "--env-steps", "479"]) == 2
-    assert "takes only a larger budget: it had 480 steps, got 479" in capsys.readouterr().err
+    assert "--env-steps must exceed the 480 already set, got 479" in capsys.readouterr().err
     assert files(undisturbed) == before
 
 

@@ -1,5 +1,9 @@
 """The generator: what it writes, what it says, and what it refuses."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -242,3 +246,26 @@ def test_help_is_there(capsys, arguments):
     """Every command explains itself and ends with exit code 0."""
     assert run(*arguments) == 0
     assert len(capsys.readouterr().out) > 100
+
+
+def test_module_is_the_command(tmp_path):
+    """``python -m terrain`` in a checkout is ``deimos terrain``, and loads no file but __init__ under two names."""
+    home = Path(export.__file__).resolve().parent.parent
+    code = """
+import collections, pathlib, runpy, sys
+sys.argv = ["terrain", "shape", "flat", "--cell", "0.5", "--out", sys.argv[1]]
+try:
+    runpy.run_module("terrain", run_name="__main__")
+except SystemExit as stop:
+    assert stop.code == 0
+names = collections.defaultdict(list)
+for name, module in sys.modules.items():
+    names[getattr(module, "__file__", None)].append(name)
+terrain = {file: found for file, found in names.items() if "deimos.terrain.world" in found or "terrain" in found}
+assert sorted(map(sorted, terrain.values())) == [["deimos.terrain", "terrain"], ["deimos.terrain.world"]], terrain
+assert not [name for name in sys.modules if name.startswith(("terrain.", "kernels"))]
+"""
+    command = [sys.executable, "-c", code, str(tmp_path / "flat.npz")]
+    done = subprocess.run(command, cwd=home, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert terrain.load(tmp_path / "flat.npz").shapes == ("flat",)
