@@ -1,7 +1,6 @@
 """A mesh becomes a height grid: one exact vertical ray for every sample."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -9,14 +8,13 @@ from deimos.kernels.ray_cast import LARGEST, SNAP, cast_rays
 
 from deimos.checks import check_positive
 
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from .mesh import Mesh
 
 STRIP = 2**20  # samples per launch, about 0.2 s on a CPU
 
 
 def rasterise(
-    mesh: "Trimesh",
+    mesh: Mesh,
     corner: tuple[float, float],
     cell: float,
     shape: tuple[int, int],

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from deimos.kernels.ray_cast import LARGEST
@@ -13,11 +12,8 @@ from deimos.checks import check_at_least, check_positive, check_range
 from . import catalog
 from .grid import Terrain, cells
 from .heightfield import rasterise
-from .mesh import from_quads, join
+from .mesh import Mesh, from_quads, join
 from .shape import TileShape
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is done, in [0, 1]."""
@@ -128,7 +124,7 @@ def build(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) 
     return build_with_mesh(grid, device=device, progress=progress)[0]
 
 
-def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> "tuple[Terrain, Trimesh]":
+def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> tuple[Terrain, Mesh]:
     """Make a world and the mesh that it is the height grid of.
 
     The same grid gives the same bytes, on any number of threads.
@@ -155,7 +151,7 @@ def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | Non
     return terrain, mesh
 
 
-def build_mesh(grid: Grid, progress: Progress | None = None) -> "Trimesh":
+def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
     """The mesh of a world [m]: all tiles and the border.
 
     Every tile has a generator of its own, seeded by (seed, level, column): none depends on another.
@@ -200,7 +196,7 @@ def _free_memory() -> int:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def _border(grid: Grid) -> "Trimesh":
+def _border(grid: Grid) -> Mesh:
     outer = -np.asarray(grid.corner)
     inner = outer - grid.border
     ring = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)

@@ -184,7 +184,7 @@ def test_force_overwrites_and_nothing_else_does(folder, capsys):
         ("shape flat --steps 3", "Unrecognized options: --steps"),
         ("shape flat --seed one", "seed"),
         ("shape flat --seed -1", "seed must be at least 0, got -1"),
-        ("shape waves --count 0", "count must be at least 1, got 0"),
+        ("shape waves --count 0", "waves: count must be at least 1, got 0"),
         ("grid --file no.toml", "no.toml could not be read or written (No such file or directory)"),
         ("grid --file here.npz", "here.npz: "),
         ("grid --file a.toml --preset go1", "file excludes preset and shapes"),

@@ -53,6 +53,9 @@ class TileOptions(Outputs):
     max_step: float = float("inf")
     """Highest step that is allowed [m]."""
 
+    def __post_init__(self) -> None:
+        """Leave the checks to the shape and the grid that are made of it."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GridOptions(Outputs):
