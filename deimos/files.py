@@ -44,9 +44,10 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-        with contextlib.suppress(OSError):  # nor can anything be deleted on a read-only disk
-            temporary.unlink(missing_ok=True)
         raise RunError(f"{path} could not be written ({first_line(error)}); what was there is untouched.") from error
+    finally:  # an interrupt too must not leave half a file
+        with contextlib.suppress(OSError):  # nothing can be deleted on a read-only disk
+            temporary.unlink(missing_ok=True)
 
 
 def load_tensors(path: Path, what: str, schema: int) -> dict:

@@ -69,7 +69,7 @@ def train(*arguments, original=training.train):
 
 training.CHECKPOINT_SECONDS = float(sys.argv[1])
 training.train = train
-sys.exit(cli.train(sys.argv[3:]))
+sys.exit(cli.main(["train", *sys.argv[3:]]))
 """
 
 
@@ -88,7 +88,7 @@ def go_on(trainer, folder, iterations=None):
 
 def resume(path):
     """Go on with a run to its end, by the command line."""
-    assert cli.train(["--resume", str(path)]) == 0
+    assert cli.main(["train", "--resume", str(path)]) == 0
 
 
 def rows(path):
@@ -150,7 +150,7 @@ def send_when(process, number, ready):
 def undisturbed(tmp_path_factory):
     """Folder of a run that nothing disturbed, made by the command line."""
     path = tmp_path_factory.mktemp("training") / "undisturbed"
-    assert cli.train([*FLAGS, "--out", str(path)]) == 0
+    assert cli.main(["train", *FLAGS, "--out", str(path)]) == 0
     return path
 
 
@@ -194,7 +194,7 @@ def test_interrupt_leaves_a_checkpoint_to_resume_from(undisturbed, tmp_path):
     assert "Traceback" not in stderr
     done = checkpoint(path)["iteration"]
     assert 3 <= done == len(rows(path)) < CONFIG.iterations
-    assert stderr.splitlines()[-1] == f"Stopped after iteration {done}; go on with --resume {path}"
+    assert stderr.splitlines()[-1] == f"Stopped after iteration {done}; resume with --resume {path}"
     resume(path)
     assert_same_run(path, undisturbed)
 
@@ -204,7 +204,7 @@ def test_larger_budget_equals_one_from_the_start(undisturbed, tmp_path):
     path = tmp_path / "run"
     run(replace(CONFIG, env_steps=200), path)
     assert len(rows(path)) == 9  # 200 steps are eight rollouts and a bit
-    assert cli.train(["--resume", str(path), "--env-steps", "480"]) == 0
+    assert cli.main(["train", "--resume", str(path), "--env-steps", "480"]) == 0
     assert_same_run(path, undisturbed)
     assert training.read_config(RunFolder.open(path)) == CONFIG
 
@@ -212,8 +212,8 @@ def test_larger_budget_equals_one_from_the_start(undisturbed, tmp_path):
 def test_smaller_budget_is_refused(undisturbed, capsys):
     """A resumed run takes no smaller budget, and the refusal changes nothing."""
     before = files(undisturbed)
-    assert cli.train(["--resume", str(undisturbed), "--env-steps", "479"]) == 2
-    assert "takes only a larger budget: it had 480 steps, got 479" in capsys.readouterr().err
+    assert cli.main(["train", "--resume", str(undisturbed), "--env-steps", "479"]) == 2
+    assert "--env-steps must exceed the 480 already set, got 479" in capsys.readouterr().err
     assert files(undisturbed) == before
 
 
@@ -311,7 +311,7 @@ def test_nan_is_one_line_on_the_command_line(tmp_path, monkeypatch, capfd):
         collect(trainer)
 
     monkeypatch.setattr(training.Trainer, "collect", poisoned)
-    assert cli.train([*FLAGS, "--out", str(tmp_path / "run")]) == 2
+    assert cli.main(["train", *FLAGS, "--out", str(tmp_path / "run")]) == 2
     last = capfd.readouterr().err.splitlines()[-1]
     assert re.match(r"deimos: Iteration 2: World 5: its .*position.* is not finite", last)
 

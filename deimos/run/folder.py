@@ -1,6 +1,7 @@
 """A run's folder: what is written where, so that it survives a kill at any moment."""
 
 import csv
+import io
 import json
 import math
 from pathlib import Path
@@ -26,9 +27,8 @@ class RunFolder:
         try:
             path.mkdir(parents=True)
         except FileExistsError as error:
-            raise RunError(
-                f"{path} exists and is not overwritten; choose another --out, or go on with --resume."
-            ) from error
+            reason = f"{path} exists and is not overwritten; choose another --out, or continue with --resume."
+            raise RunError(reason) from error
         except OSError as error:
             raise RunError(f"The run folder {path} cannot be made ({error.strerror}).") from error
         return cls(path)
@@ -73,18 +73,20 @@ class RunFolder:
             return [row for row in csv.DictReader(file) if None not in row.values()]
 
     def cut_csv(self, name: str, iteration: int) -> None:
-        """Drop the rows after an iteration: a resumed run writes them again."""
+        """Drop the rows after an iteration: a resumed run writes them again.
+
+        Raises:
+            RunError: If it cannot be written.
+        """
         rows = [row for row in self.read_csv(name) if int(row["iteration"]) <= iteration]
-        path = self.path / name
         if not rows:
-            path.unlink(missing_ok=True)
+            (self.path / name).unlink(missing_ok=True)
             return
-        temporary = path.with_name(path.name + ".partial")
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
-        temporary.replace(path)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+        write_whole(self.path / name, lambda file: file.write(text.getvalue().encode()))
 
     def append_csv(self, name: str, row: dict[str, float]) -> None:
         """Add a row, and a header where there is none yet; NaN becomes an empty cell.

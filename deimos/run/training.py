@@ -164,9 +164,7 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
     config = read_config(folder)
     if env_steps is not None:
         if env_steps < config.env_steps:
-            raise RunError(
-                f"A resumed run takes only a larger budget: it had {config.env_steps} steps, got {env_steps}."
-            )
+            raise RunError(f"--env-steps must exceed the {config.env_steps} already set, got {env_steps}.")
         config = replace(config, env_steps=env_steps)
     if device is not None:
         config = replace(config, device="cuda" if resolve_device(device).type == "cuda" else "cpu")

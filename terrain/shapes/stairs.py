@@ -2,16 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
-from ..mesh import rings
+from ..mesh import Mesh, rings
 from ..shape import Ramp, TileShape, at
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +27,6 @@ class Shape(TileShape):
     tread: float = 0.3
     """Depth of a step [m], positive."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ramp("height", self.height)
-        check_positive("tread", self.tread)
-
     @property
     def num_steps(self) -> int:
         """Steps between the edge of the tile and its middle."""
@@ -45,7 +36,7 @@ class Shape(TileShape):
         """Height of every step [m]."""
         return at(self.height, difficulty)
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         k = np.arange(self.num_steps + 1)
         rise = k * self.step(difficulty)

@@ -1,16 +1,11 @@
 """Stepping stones."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
-from ..mesh import blocks, join, rings
-from ..shape import Ramp, TileShape, at
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from ..mesh import Mesh, blocks, join, rings
+from ..shape import Ramp, TileShape, at, check_ramp
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,15 +26,13 @@ class Shape(TileShape):
         super().__post_init__()
         for name in ("side", "gap"):
             check_ramp(name, getattr(self, name), least=0.01)
-        check_positive("depth", self.depth)
-        check_positive("rim", self.rim)
         if self.platform + 2 * self.rim + 4 * max(self.gap) >= self.tile:
             raise ValueError(
                 f"tile must be larger than platform + 2 rim + 4 gap = "
                 f"{self.platform + 2 * self.rim + 4 * max(self.gap):g} m, got {self.tile:g} m."
             )
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         gap = at(self.gap, difficulty)
         bed = self.tile / 2 - self.rim  # half side of what the stones stand in

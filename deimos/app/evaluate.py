@@ -1,0 +1,182 @@
+"""``deimos evaluate``: the policy of a run under Naive and the Adversary, or its fear network against what happened."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+import tyro
+
+from deimos.app import console, figures
+from deimos.checks import RunError, check_at_least
+from deimos.learn.policy import load_policy
+from deimos.run import audit, evaluation, training
+from deimos.run.config import kind
+from deimos.run.folder import RunFolder
+from deimos.sim.shared import one_stream
+
+if TYPE_CHECKING:
+    from deimos.sim.env import EnvConfig
+
+_CHANGES = ("worlds", "steps", "seed", "oracle_worlds")
+_EVALUATION = (
+    ("score (0 does nothing, 1 reference)", "score", ".3f"),
+    ("reward per transition", "reward", ".4f"),
+    ("crashes", "crashes", "d"),
+    ("crashes per 1000 transitions", "crashes_per_1000", ".3f"),
+    ("crashes per robot-minute", "crashes_per_minute", ".3f"),
+    ("crashes per interaction", "crash_rate", ".4f"),
+    ("interactions", "interactions", "d"),
+    ("crashes under first goals", "first_goal_crashes", "d"),
+    ("Adversary's AUROC", "adversary_auroc", ".3f"),
+    ("Adversary's interactions", "adversary_interactions", "d"),
+    ("crashes among them", "adversary_crashes", "d"),
+)
+_AUDIT = (
+    ("AUROC within contexts", "auroc", ".3f"),
+    ("95 % interval, low", "low", ".3f"),
+    ("95 % interval, high", "high", ".3f"),
+    ("contexts with both outcomes", "contexts", "d"),
+    ("contexts tried", "tried", "d"),
+    ("crash rate", "crash_rate", ".3f"),
+    ("after iteration", "iteration", "d"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Evaluate the policy of a run against Naive and against a freshly trained Adversary."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    worlds: int | None = None
+    """Parallel worlds. By default as the run was set up."""
+    steps: int | None = None
+    """Steps of every world. By default as the run was set up."""
+    seed: int | None = None
+    """Seed of the worlds and their goals. By default as the run was set up."""
+    goal_period: int | None = None
+    """T: steps that a goal is active. By default as in training."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to simulate; auto takes the GPU where there is one."""
+    oracle_worlds: int | None = None
+    """Worlds that meet the oracle Adversary too; 200 is plenty. By default as the run was set up."""
+    calibration: int = 0
+    """Instead of the policy, evaluate the fear network's probabilities on this many interactions, and draw
+    calibration.png. 0 disables it."""
+    contexts: int = 0
+    """Instead of the policy, audit the fear network on this many contexts: its AUROC within each,
+    against the exact outcomes of cloned worlds. 0 disables it."""
+
+    def __post_init__(self) -> None:
+        asked = [name for name in ("contexts", "calibration") if getattr(self, name)]
+        for name in ("contexts", "calibration"):
+            check_at_least(name, getattr(self, name), 0)
+        given = [name for name in (*_CHANGES, "goal_period") if getattr(self, name) is not None]
+        if asked and given + asked[1:]:
+            raise ValueError(
+                f"{asked[0]} evaluates the fear network of the run as it was trained and cannot be combined with "
+                f"{', '.join(given + asked[1:])}."
+            )
+
+
+def main(arguments: list[str], program: str) -> None:
+    """Run ``deimos evaluate``."""
+    options: EvaluateOptions = console.parse(EvaluateOptions, arguments, program)
+    folder = RunFolder.open(options.run)
+    config = training.read_config(folder)
+    torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
+    console.quiet_warp()
+    device = training.resolve_device(options.device)
+    if options.contexts or options.calibration:
+        with one_stream(device):
+            _evaluate_fear(training.load(folder, replace(config, device=options.device)), folder, options)
+        return
+    changes = {name: getattr(options, name) for name in _CHANGES}
+    try:
+        eval_config = replace(config.eval, **{name: value for name, value in changes.items() if value is not None})
+        period = config.env.goal_period if options.goal_period is None else options.goal_period
+        env_config = config.env.with_goal_period(period)
+        if eval_config.steps < 2 * period:
+            raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
+    except ValueError as error:
+        raise RunError(str(error)) from error
+    with one_stream(device):
+        rows = evaluate_policy(folder, env_config, eval_config, device)
+    figures.draw_summary(folder, title(config), rows)
+    print(folder.path)
+
+
+def title(config: training.TrainConfig) -> str:
+    """What stands above the figures of a run."""
+    return f"{kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
+
+
+def evaluate_policy(
+    folder: RunFolder, env_config: "EnvConfig", eval_config: evaluation.EvalConfig, device: torch.device
+) -> list[dict]:
+    """Evaluate the folder's policy; its rows replace those with the same key in ``evaluation.json`` and are printed."""
+    policy = load_policy(folder.path, str(device))
+    old = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+    with console.stage_bar("evaluating: ") as progress:
+        rows = evaluation.evaluate(policy.scaled, env_config, eval_config, device, progress)
+    rows = [row | {"weights": evaluation.weights_hash(policy.actor)} for row in rows]
+    key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
+    fresh = {tuple(row[name] for name in key) for row in rows}
+    kept = [row for row in old if tuple(row.get(name) for name in key) not in fresh]
+    _print_evaluation(rows)
+    folder.write_json("evaluation.json", kept + rows)
+    return rows
+
+
+def _evaluate_fear(trainer: training.Trainer, folder: RunFolder, options: EvaluateOptions) -> None:
+    """Audit the fear network within contexts, or its probabilities."""
+    if options.contexts:
+        found = audit.audit_fear(trainer, options.contexts)
+        folder.write_json("audit.json", found)
+        lines = [(label, _cell(found[name], form)) for label, name, form in _AUDIT]
+        _print_table("Fear network against exact outcomes", [], lines)
+        return
+    judged = audit.audit_calibration(trainer, options.calibration)
+    qualities = {name: quality for name, (_, _, quality) in judged.items()}
+    folder.write_json("calibration.json", qualities)
+    lines = [
+        (name.replace("_", " "), *[_cell(each[name], ".0f" if name == "interactions" else ".4f")
+                                   for each in qualities.values()])
+        for name in next(iter(qualities.values()))
+    ]  # fmt: skip
+    _print_table("Fear network's probabilities", ["goals", *qualities], lines)
+    print(figures.draw_calibration(folder, {name: (p, crashed) for name, (p, crashed, _) in judged.items()}))
+
+
+def _print_evaluation(rows: list[dict]) -> None:
+    """Print Naive beside Adversary."""
+    lines = [(label, *[_cell(row.get(name), form) for row in rows]) for label, name, form in _EVALUATION]
+    lines = [line for line in lines if set(line[1:]) != {"-"}]
+    for name in rows[0].get("errors", {}):
+        lines.append((f"median error, {name}", *[_cell(row["errors"][name], ".3f") for row in rows]))
+    groups = len(rows[0]["tracking"])
+    for i in range(groups if groups > 1 else 0):  # a single one is the reward
+        lines.append((f"tracking of goal group {i}", *[_cell(row["tracking"][i], ".3f") for row in rows]))
+    _print_table("Evaluation", ["", *[row["goals"].capitalize() for row in rows]], lines)
+    if any(row.get("weak_adversary") for row in rows):
+        print("weak Adversary: inconclusive; it has seen too few crashes, or its AUROC is too low")
+
+
+def _print_table(name: str, header: list[str], lines: Sequence[tuple[str, ...]]) -> None:
+    """Print labels at the left and numbers at the right."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=name, title_justify="left", show_header=bool(header))
+    for number, label in enumerate(header or lines[0]):
+        table.add_column(label if header else "", justify="right" if number else "left")
+    for line in lines:
+        table.add_row(*line)
+    Console().print(table)
+
+
+def _cell(value: Any, form: str) -> str:
+    return "-" if value is None or (isinstance(value, float) and math.isnan(value)) else format(value, form)
