@@ -2,22 +2,16 @@
 
 import copy
 import math
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from deimos.goals.methods import METHODS
 from deimos.run.folder import RunError
-from deimos.study.presets import DIRECTORS
-from deimos.study.results import check_one_population, curves, results
+from deimos.study.results import Results, Row
 from deimos.study.stats import Array
-
-DIRECTOR_METHODS = ("coop", *DIRECTORS, "antagonist")
-ENVIRONMENTS = ("absolute", "relative", "directional", "quad", "quad_arm")
-"""The thesis's, in its order."""
 
 
 @dataclass(frozen=True)
@@ -45,39 +39,48 @@ class Curve:
     """Mean reward per transition, shape (k,)."""
     crashes: Array
     """Crashes per 1000 transitions, shape (k,)."""
-    selected_share: Array
+    selected_fraction: Array
     """Share of the worlds whose goal the selector chose, shape (k,)."""
 
 
 class Data:
-    """All rows of a study folder. Rows of a weak adversary are counted, and left out of every sample."""
+    """The results of a study. Rows of a weak adversary are counted, and left out of every sample.
 
-    def __init__(self, rows: list[dict[str, Any]], lines: list[dict[str, Any]]) -> None:
-        check_one_population(rows, lines)
-        self.rows = rows
-        self.weak = [row for row in rows if row["weak_adversary"]]
-        self._samples: dict[tuple[Where, str], dict[int, dict[str, Any]]] = {}
-        for row in rows:
+    Args:
+        results: Rows and training curves.
+        order: Environments and methods in the order in which tables and figures show them; others follow, by name.
+
+    Raises:
+        RunError: If they are no one study; see ``Results.check``.
+    """
+
+    def __init__(self, results: Results, order: Sequence[str] = ()) -> None:
+        results.check()
+        self.rows = results.rows
+        self.weak = [row for row in self.rows if row["weak_adversary"]]
+        self._order = order
+        self._samples: dict[tuple[Where, str], dict[int, Row]] = {}
+        for row in self.rows:
             if not row["weak_adversary"]:
                 where = Where(row["environment"], row["goals"], row["goal_period"])
                 self._samples.setdefault((where, row["method"]), {})[row["seed"]] = row
         self._curves: dict[tuple[str, str], dict[int, Curve]] = {}
-        for line in lines:
-            columns = (np.array(line[name]) for name in ("env_steps", "reward", "crashes_per_1000", "selected_share"))
-            self._curves.setdefault((line["environment"], line["method"]), {})[line["seed"]] = Curve(*columns)
+        for line in results.curves:
+            names = ("env_steps", "reward", "crashes_per_1000", "selected_fraction")
+            curve = Curve(*(np.array(line[name]) for name in names))
+            self._curves.setdefault((line["environment"], line["method"]), {})[line["seed"]] = curve
 
     @classmethod
-    def read(cls, folder: Path) -> "Data":
-        """Read the tables of a study folder.
+    def read(cls, folder: Path, order: Sequence[str] = ()) -> "Data":
+        """Read the results of a folder.
 
         Raises:
-            RunError: If there are no results, a table has another schema, the cells of an environment were run with
-                different settings or those of a method with different selectors, or a policy stands there twice.
+            RunError: If there are none, a file is broken or of another schema, or they are no one study.
         """
-        rows = results(folder).read()
-        if not rows:
+        results = Results.read(folder)
+        if not results.rows:
             raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
-        return cls(rows, curves(folder).read())
+        return cls(results, order)
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
@@ -90,9 +93,8 @@ class Data:
 
     @property
     def environments(self) -> list[str]:
-        """Their names: the thesis's in its order, then the others."""
-        found = {row["environment"] for row in self.rows}
-        return [name for name in ENVIRONMENTS if name in found] + sorted(found - set(ENVIRONMENTS))
+        """Their names, in order."""
+        return self._sorted({row["environment"] for row in self.rows})
 
     def periods(self, environment: str) -> list[int]:
         """The T that an environment's policies were evaluated at."""
@@ -103,10 +105,14 @@ class Data:
         return [Where(environment, goals, period) for period in self.periods(environment)]
 
     def methods(self, environment: str) -> list[str]:
-        """Methods that an environment has results of: the Directors by rising p, then the others."""
-        found = {row["method"] for row in self.rows if row["environment"] == environment}
-        order = [*DIRECTOR_METHODS, *(name for name in METHODS if name not in DIRECTOR_METHODS)]
-        return [name for name in order if name in found] + sorted(found - set(order))
+        """Methods that an environment has results of, in order."""
+        return self._sorted({row["method"] for row in self.rows if row["environment"] == environment})
+
+    def _sorted(self, names: Collection[str]) -> list[str]:
+        """Names in order; the numbers in those that have no place in it count as numbers."""
+        known = [name for name in self._order if name in names]
+        parts = {name: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", name)] for name in names}
+        return known + sorted(set(names) - set(known), key=parts.__getitem__)
 
     def seeds(self, where: Where, methods: Sequence[str]) -> list[int]:
         """Seeds that all of some methods have a row of."""
@@ -143,7 +149,7 @@ class Data:
         return [found[seed] for seed in sorted(found)]
 
 
-def _metric(row: dict[str, Any], name: str) -> float:
+def _metric(row: Row, name: str) -> float:
     if name == "log_crashes":
         return math.log1p(row["crashes"])
     column, _, part = name.partition(":")

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from deimos.study.data import Data, Where
-from deimos.study.stats import Interval, holm
+from deimos.study.stats import Interval
+from reproduction.significance import holm
 
 ALPHA = 0.05
 VERDICTS = ("supported", "contradicted", "undecided", "underpowered", "not testable")

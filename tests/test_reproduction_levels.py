@@ -1,6 +1,6 @@
 """The level of the verdicts: how often a true claim is contradicted and a false one supported, simulated.
 
-``POPULATIONS=1000 pytest -s tests/test_deimos_study_levels.py`` simulates more and prints the rates.
+``POPULATIONS=1000 pytest -s tests/test_reproduction_levels.py`` simulates more and prints the rates.
 """
 
 import math
@@ -9,12 +9,13 @@ import os
 import numpy as np
 import pytest
 
-from deimos.study import claims, stats
-from deimos.study.claim_custom import ACHIEVED, NEARLY_NONE
-from deimos.study.claim_list import CLAIMS
+from deimos.study import stats
 from deimos.study.data import Data
-from deimos.study.presets import PARTICLE_METHODS
-from deimos.study.results import RESULT_COLUMNS
+from deimos.study.results import RESULT_COLUMNS, Results
+from reproduction import claims
+from reproduction.claim_custom import NEARLY_NONE
+from reproduction.claim_list import CLAIMS
+from reproduction.thesis import ACHIEVED, PARTICLE_METHODS
 
 POPULATIONS = int(os.environ.get("POPULATIONS", "80"))
 SEEDS, STEPS, ALPHA = 10, 2000, 0.05
@@ -41,7 +42,7 @@ def study(
                     "crashes": rng.poisson(max(rate, 0.0)) if counted else rate, "steps": STEPS, "worlds": worlds,
                     "reward": rng.normal() + (reward or {}).get(name, 0.0),
                 })  # fmt: skip
-    return Data(rows, [])
+    return Data(Results(rows))
 
 
 def rates(monkeypatch, claim, verdicts=("supported", "contradicted"), only="", resamples=2, **populations):

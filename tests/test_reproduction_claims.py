@@ -7,13 +7,14 @@ import pytest
 from scipy import stats as scipy_stats
 
 from deimos.run.folder import RunError
-from deimos.study import claim_custom, claim_tests, claims, stats
-from deimos.study.claim_list import ALL, CLAIMS
-from deimos.study.claims import Claim, Finding
+from deimos.study import stats
 from deimos.study.data import Data, Where
-from deimos.study.presets import LEGGED_METHODS, PARTICLE_METHODS
-from deimos.study.results import RESULT_COLUMNS
+from deimos.study.results import RESULT_COLUMNS, Results
 from deimos.study.stats import Interval
+from reproduction import claim_custom, claim_tests, claims, thesis
+from reproduction.claim_list import CLAIMS
+from reproduction.claims import Claim, Finding
+from reproduction.thesis import ENVIRONMENTS, LEGGED_METHODS, PARTICLE_METHODS
 
 POINTS = 40
 BY_ID = {claim.id: claim for claim in CLAIMS}
@@ -24,7 +25,7 @@ def level(environment, method, goals, period):
     return 5.0 + 2.0 * (goals == "adversary")
 
 
-def population(seeds=10, environments=ALL, level=level, spread=0.5, methods=None):
+def population(seeds=10, environments=ENVIRONMENTS, level=level, spread=0.5, methods=None):
     """Rows and curves of every method everywhere, with log crashes that are normal around a level."""
     rng = np.random.default_rng(0)
     blank = {str: None, tuple: (), dict: {}}
@@ -52,9 +53,9 @@ def population(seeds=10, environments=ALL, level=level, spread=0.5, methods=None
                 crashes = 5 * np.exp(-np.arange(POINTS) / 20 + rng.normal(0, 0.2, POINTS))
                 lines.append(key | {
                     "env_steps": tuple(24.0 * np.arange(1, POINTS + 1)), "reward": (0.7,) * POINTS,
-                    "crashes_per_1000": tuple(crashes), "selected_share": tuple(rng.normal(0.98, 0.001, POINTS)),
+                    "crashes_per_1000": tuple(crashes), "selected_fraction": tuple(rng.normal(0.98, 0.001, POINTS)),
                 })  # fmt: skip
-    return rows, lines
+    return Results(rows, lines)
 
 
 @pytest.fixture(autouse=True)
@@ -66,7 +67,7 @@ def few_resamples(monkeypatch):
 @pytest.fixture(scope="module")
 def alike():
     """Twenty seeds of everything, where no method differs from another."""
-    return Data(*population(20))
+    return Data(population(20))
 
 
 def finding(p_for, p_against, detectable=0.7, required=True):
@@ -81,7 +82,7 @@ def test_all_claims_are_there():
     """There are 32, numbered in order, each with its words, its environments and its test."""
     assert [claim.id for claim in CLAIMS] == [f"C{i}" for i in range(1, 33)]
     for claim in CLAIMS:
-        assert set(claim.environments) <= set(ALL)
+        assert set(claim.environments) <= set(ENVIRONMENTS)
         assert claim.text.endswith(".")
         assert claim.test
 
@@ -99,7 +100,7 @@ def test_complete_data_give_every_planned_test(alike, claim):
 
 def test_only_some_methods_are_left():
     """Data of the thesis's methods are those that a study without the others would have, curves and claims too."""
-    with_more = Data(*population(4, ["relative"], methods=[*PARTICLE_METHODS, "learnability"]))
+    with_more = Data(population(4, ["relative"], methods=[*PARTICLE_METHODS, "learnability"]))
     left = with_more.only(PARTICLE_METHODS)
     assert "learnability" in with_more.methods("relative")
     assert set(left.methods("relative")) == set(PARTICLE_METHODS)
@@ -112,7 +113,7 @@ def test_only_some_methods_are_left():
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
 def test_no_data_is_not_testable(claim):
     """Where no environment of a claim was run, it is not testable, and says where data are missing."""
-    outcome = claims.test(claim, Data(*population(3, ["elsewhere"])))
+    outcome = claims.test(claim, Data(population(3, ["elsewhere"])))
     assert (outcome.verdict, outcome.judged, outcome.missing) == ("not testable", [], claim.environments)
 
 
@@ -187,7 +188,7 @@ def test_planted_effects_are_found():
             return 5.0 + 2 * (method == "rnd")
         return {"p25": 5.0, "uniform": 7.0, "vds": 7.0, "p10": 6.5, "p50": 6.5}.get(method, 8.0)
 
-    data = Data(*population(20, ["directional", "absolute"], right, 0.3))
+    data = Data(population(20, ["directional", "absolute"], right, 0.3))
     attacked = claims.test(BY_ID["C7"], data)
     by_method = {each.finding.what.split(":")[0]: each.verdict for each in attacked.judged}
     assert by_method["p25"] != "supported"  # it crashes no more under attack here
@@ -197,15 +198,16 @@ def test_planted_effects_are_found():
     assert crashes == ["supported"] * 7
     assert claims.test(BY_ID["C1"], data).verdict != "supported"  # all train alike
     assert [each.verdict for each in claims.test(BY_ID["C11"], data).judged] == []
-    swapped = Data(*population(20, ["directional"], lambda e, m, g, t: 7.0 if m == "p25" else 5.0, 0.3))
+    swapped = Data(population(20, ["directional"], lambda e, m, g, t: 7.0 if m == "p25" else 5.0, 0.3))
     assert claims.test(BY_ID["C15"], swapped).verdict == "contradicted"
 
 
 def test_weak_adversaries_stay_out():
     """A row that is marked weak is in no sample, but counted."""
-    rows, lines = population(5, ["directional"], methods=["uniform"])
+    results = population(5, ["directional"], methods=["uniform"])
+    rows = results.rows
     rows[1]["weak_adversary"] = True
-    data = Data(rows, lines)
+    data = Data(results)
     assert data.weak == [rows[1]]
     assert len(data.sample(Where("directional", "adversary", 100), "uniform", "crashes")) == 4
     assert data.seeds(Where("directional", "adversary", 100), ["uniform"]) == [1, 2, 3, 4]
@@ -216,7 +218,12 @@ def test_weak_adversaries_stay_out():
 def test_best_p_needs_twenty_seeds():
     """With fewer than twenty seeds the headline cannot be split and is not testable."""
     for seeds, verdict in ((19, {"not testable"}), (20, set(claims.VERDICTS) - {"not testable"})):
-        assert claims.test(BY_ID["C28"], Data(*population(seeds, ["relative"]))).verdict in verdict
+        assert claims.test(BY_ID["C28"], Data(population(seeds, ["relative"]))).verdict in verdict
+
+
+def table_of(results, number):
+    """Rows of evaluations, or training curves."""
+    return (results.rows, results.curves)[number]
 
 
 @pytest.mark.parametrize("table", [0, 1])
@@ -227,18 +234,19 @@ def test_what_cannot_be_compared_is_not_mixed(table):
         ("selector", r"'coop' stands for 2 different selectors in environment 'relative' \(coop, other\)"),
     ):
         tables = population(3, ["relative"])
-        tables[table][0][column] = "other"
+        table_of(tables, table)[0][column] = "other"
         with pytest.raises(RunError, match=message):
-            Data(*tables)
+            Data(tables)
 
 
 @pytest.mark.parametrize(("table", "ending"), [(0, ", goals naive, goal_period 100"), (1, "")])
 def test_policy_counts_once(table, ending):
     """A second row of the same policy is refused: it does not take the place of the first."""
     tables = population(3, ["relative"])
-    tables[table].append(tables[table][0] | {"hash": "another"})
+    rows = table_of(tables, table)
+    rows.append(rows[0] | {"hash": "another"})
     with pytest.raises(RunError, match=f"two rows of environment relative, method coop, seed 0{ending};"):
-        Data(*tables)
+        Data(tables)
 
 
 def test_paired_test_is_wilcoxons():
@@ -272,10 +280,11 @@ def test_one_sample_test_is_students():
 
 def test_policies_are_the_unit_of_nearly_no_crashes():
     """Of five policies one crashes 1000 times in 4 10^6 steps and one 4 times: three of five are below the limit."""
-    rows, lines = population(5, ["relative"], methods=["vds"])
+    results = population(5, ["relative"], methods=["vds"])
+    rows = results.rows
     for row, crashes in zip([row for row in rows if row["goals"] == "naive"], (0, 3, 4, 1000, 3), strict=True):
         row["crashes"] = crashes
-    (found,) = claim_custom.nearly_none(Data(rows, lines), "relative")
+    (found,) = claim_custom.nearly_none(Data(results), "relative")
     assert found.interval.estimate == 0.6
     assert (found.interval.low, found.interval.high) == pytest.approx((0.1466, 0.9473), abs=1e-4)
     assert found.p_for == pytest.approx(16 / 32)  # 3, 4 or 5 heads of 5
@@ -287,10 +296,11 @@ def test_policies_are_the_unit_of_nearly_no_crashes():
 @pytest.mark.parametrize(("worlds", "tested"), [(200, False), (690, False), (700, True), (1500, True)])
 def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, tested):
     """Where a policy at the limit is most probably without a crash, C11 has no data; else those without one count."""
-    rows, lines = population(4, ["relative"], methods=["vds"])
+    results = population(4, ["relative"], methods=["vds"])
+    rows = results.rows
     for row in rows:
         row |= {"crashes": row["seed"] % 2, "worlds": worlds, "steps": 1000}  # 1 is below 1.5, and yet too many
-    outcome = claims.test(BY_ID["C11"], Data(rows, lines))
+    outcome = claims.test(BY_ID["C11"], Data(results))
     assert [each.finding.interval.estimate for each in outcome.judged] == [0.5] * tested
     assert outcome.missing == (() if tested else ("relative",))
     assert (outcome.verdict == "not testable") != tested
@@ -298,15 +308,16 @@ def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, tested):
 
 def test_mean_ranks_are_of_whole_policies():
     """Ranks are meaned over the evaluations that all methods have; a policy that lacks one of them does not count."""
-    rows, lines = population(4, ["relative"], methods=["rnd", "vds"])
+    results = population(4, ["relative"], methods=["rnd", "vds"])
+    rows = results.rows
     for row in rows:
         row["crashes"] = 10 * row["seed"] + (row["method"] == "rnd") + 100 * (row["goals"] == "adversary")
     rows[1]["weak_adversary"] = True  # rnd's first policy
-    theirs, own = claim_custom._mean_ranks(Data(rows, lines), "relative", "rnd", "vds")
+    theirs, own = claim_custom._mean_ranks(Data(results), "relative", "rnd", "vds")
     assert (own.tolist(), theirs.tolist()) == ([1, 2, 4, 6], [3, 5, 7])
     for row in rows:
         row["weak_adversary"] = row["goals"] == "adversary" and row["method"] == "rnd"
-    theirs, own = claim_custom._mean_ranks(Data(rows, lines), "relative", "rnd", "vds")
+    theirs, own = claim_custom._mean_ranks(Data(results), "relative", "rnd", "vds")
     assert (own.tolist(), theirs.tolist()) == ([1, 3, 5, 7], [2, 4, 6, 8])
 
 
@@ -314,7 +325,7 @@ def test_vertex_of_a_known_parabola():
     """Log crashes on an exact parabola have their vertex where it is."""
     samples = {
         name: np.full(4, 3.0 + 0.002 * (place - 62.0) ** 2)
-        for name, place in claim_custom.ACHIEVED.items()
+        for name, place in thesis.ACHIEVED.items()
         if name != "uniform"
     }
     interval, slopes, places = claim_custom.vertex(samples, 50)
@@ -322,8 +333,8 @@ def test_vertex_of_a_known_parabola():
     assert places == pytest.approx(62.0)
     assert slopes[0] == pytest.approx(50 * 0.004 * (0.5 - 62))
     assert slopes[1] == pytest.approx(50 * 0.004 * (99.5 - 62))
-    assert claim_custom.ACHIEVED["p25"] == 62.5
-    assert claim_custom.ACHIEVED["p90"] == 95.0
+    assert thesis.ACHIEVED["p25"] == 62.5
+    assert thesis.ACHIEVED["p90"] == 95.0
 
 
 @pytest.mark.parametrize(("shape", "p_for", "p_against", "verdict"), [
@@ -335,12 +346,12 @@ def test_vertex_of_a_known_parabola():
 def test_lowest_point_is_inside_a_planted_hump_only(monkeypatch, shape, p_for, p_against, verdict):
     """Populations on a curve give the p-values of slopes that have their sign in every resample."""
     monkeypatch.setattr(stats, "RESAMPLES", 1000)
-    place = {name: (x - 50) / 50 for name, x in claim_custom.ACHIEVED.items()}
+    place = {name: (x - 50) / 50 for name, x in thesis.ACHIEVED.items()}
 
     def level(environment, method, goals, period):
         return 8.0 + 2.0 * shape(place.get(method, 0.0))
 
-    data = Data(*population(4, ["directional"], level, 0.01))
+    data = Data(population(4, ["directional"], level, 0.01))
     inside = [f for f in claim_custom.hump(data, "directional") if f.what == "the lowest point lies inside"]
     assert [(f.p_for, f.p_against) for f in inside] == [(pytest.approx(p_for), pytest.approx(p_against))] * 2
     assert claims.test(BY_ID["C25"], data).verdict == verdict
@@ -374,7 +385,7 @@ def test_energy_distance_is_its_definition():
 
 def test_claim_in_part():
     """A claim whose tests could be made only for some methods holds only in part."""
-    data = Data(*population(10, ["directional"], methods=["uniform", "p25", "coop"]))
+    data = Data(population(10, ["directional"], methods=["uniform", "p25", "coop"]))
     outcome = claims.test(BY_ID["C14"], data)
     assert 0 < outcome.made < BY_ID["C14"].planned
     assert outcome.in_part

@@ -7,23 +7,19 @@ from itertools import pairwise
 import numpy as np
 from scipy import stats as scipy_stats
 
-from deimos.study import claim_tests as tests
 from deimos.study import stats
-from deimos.study.claims import Finding
-from deimos.study.data import DIRECTOR_METHODS, Curve, Data, Where
-from deimos.study.presets import DIRECTORS
+from deimos.study.data import Curve, Data, Where
 from deimos.study.stats import Array, Interval
+from reproduction import claim_tests as tests
+from reproduction import significance
+from reproduction.claims import Finding
+from reproduction.thesis import ACHIEVED, DIRECTOR_METHODS, DIRECTORS
 
 Findings = Callable[[Data, str], list[Finding]]
 CRASHES = "log_crashes"
 PERMUTATIONS = 2000
 SPLIT_SEEDS = 20  # fewer cannot be split into a half that chooses and a half that tests
 NEARLY_NONE = 1e-6  # crashes per step
-
-ACHIEVED = {
-    "coop": 0.5, "uniform": 50.0, **{f"p{p}": (100 + p) / 2 for p in (10, 25, 50, 75, 90)}, "antagonist": 99.5,
-}  # fmt: skip
-"""Percentile of fear that a method's goals have on average among the candidates: p25 draws from the upper 75 %."""
 
 
 def _samples(data: Data, where: Where, methods: Sequence[str], metric: str = CRASHES) -> dict[str, Array]:
@@ -201,12 +197,15 @@ def vertex(samples: dict[str, Array], resamples: int = stats.RESAMPLES) -> tuple
         offset = np.divide(c[..., 1], 2 * c[..., 0], out=np.zeros_like(c[..., 1]), where=c[..., 0] != 0)
         return np.clip(50.0 - 50.0 * offset, -1000.0, 1000.0)
 
-    values = _parabola(*stats.resample(list(samples.values()), resamples, 0), x=x)
-    places = place(values)
+    def resampled(number: Callable[[Array], Array]) -> Array:
+        groups = list(samples.values())
+        return stats.distribution(groups, lambda *s: number(_parabola(*s, x=x)), resamples=resamples)
+
+    places = resampled(place)
     low, high = np.quantile(places, [0.025, 0.975])
     own = float(place(_parabola(*samples.values(), x=x)))
     ends = [(ACHIEVED[name] - 50.0) / 50.0 for name in ("coop", "antagonist")]
-    slopes = np.stack([2 * end * values[:, 0] + values[:, 1] for end in ends])
+    slopes = np.stack([resampled(lambda c, end=end: 2 * end * c[..., 0] + c[..., 1]) for end in ends])
     return Interval(own, float(low), float(high)), slopes, places
 
 
@@ -339,13 +338,13 @@ def headline(directors: Sequence[str], baselines: Sequence[str]) -> Findings:
 
 
 def _not_inferior(what: str, where: Where, x: Array, y: Array, margin: float) -> list[Finding]:
-    found = stats.equivalence(x, y, margin)
+    found = significance.equivalence(x, y, margin)
     lower = scipy_stats.ttest_ind(x - margin, y, equal_var=False, alternative="less").pvalue
     upper = scipy_stats.ttest_ind(x - margin, y, equal_var=False, alternative="greater").pvalue
     return [Finding(
         what=what, where=where, effect="difference in mean log crashes, 90 %",
         interval=Interval(found.difference, found.low, found.high), p_for=float(lower), p_against=float(upper),
-        detectable=lambda alpha: stats.detectable_margin(x, y, alpha), wanted=margin, n=(len(x), len(y)),
+        detectable=lambda alpha: significance.detectable_margin(x, y, alpha), wanted=margin, n=(len(x), len(y)),
     )]  # fmt: skip
 
 
@@ -405,7 +404,7 @@ def share_falls(directors: Sequence[str]) -> Findings:
 
     def findings(data: Data, environment: str) -> list[Finding]:
         found = {
-            float(name[1:]): tests.of_curves(data, environment, name, lambda c: float(c.selected_share.mean()))
+            float(name[1:]): tests.of_curves(data, environment, name, lambda c: float(c.selected_fraction.mean()))
             for name in directors
         }
         found = {p: x for p, x in found.items() if len(x) >= tests.LEAST}

@@ -4,16 +4,13 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
-from deimos.study import claim_custom as custom
-from deimos.study import claim_tests as tests
-from deimos.study.claim_tests import more, same, wider
-from deimos.study.claims import Claim, Finding
 from deimos.study.data import Data, Where
-from deimos.study.presets import DIRECTORS
+from reproduction import claim_custom as custom
+from reproduction import claim_tests as tests
+from reproduction.claim_tests import more, same, wider
+from reproduction.claims import Claim, Finding
+from reproduction.thesis import DIRECTORS, ENVIRONMENTS, LEGGED, PARTICLE
 
-PARTICLE = ("absolute", "relative", "directional")
-LEGGED = ("quad", "quad_arm")
-ALL = PARTICLE + LEGGED
 BASELINES = ("uniform", "rnd", "vds", "cl")
 CRASHES, REWARD = "log_crashes", "reward"
 GOALS = ("naive", "adversary")
@@ -232,22 +229,22 @@ CLAIMS: tuple[Claim, ...] = (
         "rank sums, every p against every baseline but VDS",
         _all(*[_pairs(more, goals, CRASHES, _cross(["uniform", "rnd", "cl"], DIRECTORS)) for goals in GOALS]),
         planned=60),
-    Claim("C24", "The training's goals matter little under Naive and a lot under the Adversary.", ALL,
+    Claim("C24", "The training's goals matter little under Naive and a lot under the Adversary.", ENVIRONMENTS,
         "share of the variance of log crashes between methods, Adversary minus Naive, bootstrap", custom.influence,
         planned=7),
-    Claim("C25", "Over p, safety is a hump: best inside, worst at Coop and Antagonist.", ALL,
+    Claim("C25", "Over p, safety is a hump: best inside, worst at Coop and Antagonist.", ENVIRONMENTS,
         "quadratic fit of log crashes on the achieved percentile: curvature above 0, falling at Coop's end and rising "
         "at Antagonist's, bootstrap",
         custom.hump,
         note=f"Of the vertex: {_REPLACED[0].lower()}{_REPLACED[1:]}",
         planned=28),
-    Claim("C26", "Coop and Antagonist produce similar populations.", ALL,
+    Claim("C26", "Coop and Antagonist produce similar populations.", ENVIRONMENTS,
         "equivalence of crashes within a factor of 2 and of rewards within 5 %; the energy distance's permutation "
         "test can only contradict",
         _all(*[_pairs(same, goals, metric, [("coop", "antagonist")]) for goals in GOALS
                for metric in (CRASHES, REWARD)], custom.energy("coop", "antagonist")),
         planned=28),
-    Claim("C27", "VDS is the best baseline over all environments; Uniform ties it in Particle Gym.", ALL,
+    Claim("C27", "VDS is the best baseline over all environments; Uniform ties it in Particle Gym.", ENVIRONMENTS,
         "rank sums on the policies' mean ranks over goals and T, each other baseline against VDS; in Particle Gym, "
         "in place of that against Uniform, equivalence within a factor of 2",
         _all(_in(LEGGED, custom.best_baseline("vds", ("uniform", "rnd", "cl"))),
@@ -256,7 +253,7 @@ CLAIMS: tuple[Claim, ...] = (
         note=f"Of the ranks: {_REPLACED[0].lower()}{_REPLACED[1:]}",
         planned=15),
     Claim("C28", "Headline: the best DEIMOS (legged: VDS+p75) is at least as safe as the best baseline, with "
-        "less spread.", ALL,
+        "less spread.", ENVIRONMENTS,
         "the best on one half of the seeds, tested on the other: one-sided non-inferiority within a factor of 2 in "
         "mean log crashes, Brown and Forsythe; from 20 seeds on", custom.headline(DIRECTORS, BASELINES),
         planned=28),
@@ -265,16 +262,16 @@ CLAIMS: tuple[Claim, ...] = (
         custom.halfway,
         planned=2),
     Claim("C30", "Under attack, policies trained by DEIMOS lose less reward and gain fewer crashes than "
-        "baselines'.", ALL,
+        "baselines'.", ENVIRONMENTS,
         "rank sums on Adversary minus Naive, the thesis's best p (p25 in Particle Gym, VDS+p75 legged) against "
         "every baseline", custom.resistance(BASELINES),
         note="Not repeated with a goal generator as attacker.",
         planned=50),
-    Claim("C31", "Speed: Uniform > RND, DEIMOS > VDS; VDS is slowest everywhere.", ALL,
+    Claim("C31", "Speed: Uniform > RND, DEIMOS > VDS; VDS is slowest everywhere.", ENVIRONMENTS,
         "rank sums on the median frames per second of every training", custom.speed(DIRECTORS),
         note="Workers that share a machine slow each other; only ratios within one machine mean something.",
         planned=65),
-    Claim("C32", "The Director's share and the diversity of goals fall with p.", ALL,
+    Claim("C32", "The Director's share and the diversity of goals fall with p.", ENVIRONMENTS,
         "Spearman's correlation of p with the mean share of goals that the Director chose, bootstrap",
         custom.share_falls(DIRECTORS),
         note="The diversity of the chosen goals is not recorded, so only the share is tested.",

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy import stats as scipy_stats
 
 from deimos.study import stats
-from deimos.study.claims import Finding
 from deimos.study.data import Curve, Data, Where
 from deimos.study.stats import Array, Interval
+from reproduction import significance
+from reproduction.claims import Finding
 
 LEAST = 3  # policies in a sample, below which nothing is tested
 PROBABILITY = 0.75  # smallest P(X > Y) of interest
@@ -30,7 +31,7 @@ def compare(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
     if min(len(x), len(y)) < LEAST:
         return []
     interval = stats.probability_of_improvement([(x, y)], resamples=stats.RESAMPLES)
-    p = stats.mann_whitney(x, y)
+    p = significance.mann_whitney(x, y)
     return [Finding(
         what=what, where=where, effect="P(x > y)", interval=interval,
         p_for=p if interval.estimate > 0.5 else 1.0, p_against=p if interval.estimate < 0.5 else 1.0,
@@ -50,11 +51,11 @@ def alike(what: str, where: Where | str, x: Array, y: Array, margin: float) -> l
     """The means of two samples differ by less than a margin: two one-sided tests."""
     if min(len(x), len(y)) < LEAST or not margin > 0:
         return []
-    found = stats.equivalence(x, y, margin)
+    found = significance.equivalence(x, y, margin)
     return [Finding(
         what=what, where=where, effect=f"difference, 90 %, within {margin:.2g}",
         interval=Interval(found.difference, found.low, found.high), p_for=found.p_same, p_against=found.p_other,
-        detectable=lambda alpha: stats.detectable_margin(x, y, alpha), wanted=margin, n=(len(x), len(y)),
+        detectable=lambda alpha: significance.detectable_margin(x, y, alpha), wanted=margin, n=(len(x), len(y)),
     )]  # fmt: skip
 
 
@@ -68,11 +69,11 @@ def spread(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
     """One sample varies more than another: Brown and Forsythe's test; the interval of the ratio only describes."""
     if min(len(x), len(y)) < LEAST:
         return []
-    log_ratio = stats.bootstrap([x, y], stats.log_iqr_ratio, resamples=stats.RESAMPLES)
+    log_ratio = stats.bootstrap([x, y], significance.log_iqr_ratio, resamples=stats.RESAMPLES)
     with np.errstate(over="ignore"):
         interval = Interval(*np.exp([log_ratio.estimate, log_ratio.low, log_ratio.high]).tolist())
     distance = [np.abs(z - np.median(z)).mean() for z in (x, y)]
-    p = stats.brown_forsythe(x, y)
+    p = significance.brown_forsythe(x, y)
     return [Finding(
         what=what, where=where, effect="ratio of IQRs", interval=interval,
         p_for=p if distance[0] > distance[1] else 1.0, p_against=p if distance[0] < distance[1] else 1.0,
@@ -86,15 +87,15 @@ def positive(what: str, where: Where | str, effect: str, x: Array, wanted: float
     if len(x) < LEAST:
         return []
     interval = stats.bootstrap_t(x, resamples=stats.RESAMPLES)
-    error = x.std(ddof=1) / math.sqrt(len(x))
-    if error == 0.0:
+    if np.ptp(x) == 0.0:
         p_for, p_against = float(x.mean() <= at), float(x.mean() >= at)
     else:
-        t = (x.mean() - at) / error
-        p_for, p_against = (float(min(1.0, 2 * scipy_stats.t.sf(side * t, len(x) - 1))) for side in (1, -1))
+        p_for, p_against = (
+            float(min(1.0, 2 * scipy_stats.ttest_1samp(x, at, alternative=way).pvalue)) for way in ("greater", "less")
+        )
     return [Finding(
         what=what, where=where, effect=effect, interval=interval, p_for=p_for, p_against=p_against,
-        detectable=lambda alpha: stats.detectable_mean(x, alpha), wanted=wanted, n=(len(x),),
+        detectable=lambda alpha: significance.detectable_mean(x, alpha), wanted=wanted, n=(len(x),),
     )]  # fmt: skip
 
 
@@ -121,9 +122,9 @@ def higher(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
     above = float((x > y.max()).sum() - (y > x.max()).sum())
     return [Finding(
         what=what, where=where, effect="policies above all of the other's (negative: the other's)",
-        interval=Interval(above, math.nan, math.nan), p_for=stats.rosenbaum(x, y), p_against=stats.rosenbaum(y, x),
-        detectable=lambda alpha: stats.detectable_reach(len(x), len(y), alpha), wanted=PROBABILITY,
-        n=(len(x), len(y)),
+        interval=Interval(above, math.nan, math.nan), p_for=significance.rosenbaum(x, y),
+        p_against=significance.rosenbaum(y, x), wanted=PROBABILITY, n=(len(x), len(y)),
+        detectable=lambda alpha: significance.detectable_reach(len(x), len(y), alpha),
     )]  # fmt: skip
 
 
@@ -136,7 +137,7 @@ def mostly(what: str, where: Where | str, holds: NDArray[np.bool_]) -> list[Find
     return [Finding(
         what=what, where=where, effect="share of policies", interval=Interval(count / n, interval.low, interval.high),
         p_for=float(scipy_stats.binom.sf(count - 1, n, 0.5)), p_against=float(scipy_stats.binom.cdf(count, n, 0.5)),
-        detectable=lambda alpha: 0.5 + stats.detectable_sign(n, alpha), wanted=PROBABILITY, n=(n,),
+        detectable=lambda alpha: 0.5 + significance.detectable_sign(n, alpha), wanted=PROBABILITY, n=(n,),
     )]  # fmt: skip
 
 
@@ -146,7 +147,7 @@ def resampled(
     """A statistic of several samples is positive: its bootstrap distribution."""
     if min((len(x) for x in samples), default=0) < LEAST:
         return []
-    values = statistic(*stats.resample(samples, stats.RESAMPLES, 0))
+    values = stats.distribution(samples, statistic, resamples=stats.RESAMPLES)
     low, high = np.quantile(values, [0.025, 0.975])
     p_for, p_against = above_zero(values)
     return [Finding(
@@ -223,4 +224,4 @@ def _detectable_shift(difference: Array, alpha: float) -> float:
     """
     if 2.0 ** (1 - np.count_nonzero(difference)) >= alpha:
         return math.inf
-    return stats.detectable_mean(difference, alpha) / math.sqrt(0.864)
+    return significance.detectable_mean(difference, alpha) / math.sqrt(0.864)
