@@ -1,49 +1,63 @@
-"""Multiplications and additions of the matrix products of networks: what their cost cannot fall below."""
+"""Floating-point operations of matrix products, from the sizes of networks: what an iteration cannot cost less than."""
 
-from torch import nn
+from collections.abc import Sequence
+from itertools import pairwise
 
-from deimos.goals.fear_selector import FearSelector
-from deimos.goals.selector import GoalSelector
-from deimos.goals.selectors.rnd import RND
-from deimos.goals.selectors.vds import VDS
+from deimos.goals.fear import FearConfig
+from deimos.goals.selector import SelectorConfig
+from deimos.goals.selectors import rnd, vds
+from deimos.learn.ppo import PPOConfig
+from deimos.sim.env import Env
 
-
-def operations(net: nn.Module) -> int:
-    """Operations of the linear layers of a network for one row, forward."""
-    return sum(2 * layer.weight.numel() for layer in net.modules() if isinstance(layer, nn.Linear))
-
-
-def scoring(net: nn.Module, goal_dim: int, count: int) -> int:
-    """Operations of scoring ``count`` candidates for one context, whose share of the first layer is computed once."""
-    first = next(layer for layer in net.modules() if isinstance(layer, nn.Linear))
-    own = 2 * first.out_features * goal_dim
-    return 2 * first.weight.numel() - own + count * (own + operations(net) - 2 * first.weight.numel())
+TRAINING = 3  # passes that learning from a row takes: forward, by the weights, by the inputs
 
 
-def selector_operations(
-    selector: GoalSelector, decisions: float, transitions: int, num_envs: int, goal_dim: int
-) -> float:
-    """Operations of a selector in an iteration.
+def forward(inputs: int, hidden: Sequence[int], outputs: int) -> float:
+    """Operations of a multilayer perceptron for one row."""
+    sizes = [inputs, *hidden, outputs]
+    return 2.0 * sum(a * b for a, b in pairwise(sizes))
 
-    Args:
-        selector: One of ours; others, and those without networks, count as nothing.
-        decisions: Goals that it chooses in an iteration.
-        transitions: Transitions of an iteration.
-        num_envs: Number of worlds.
-        goal_dim: Components of a goal.
+
+def scoring(context: int, goal: int, hidden: Sequence[int], outputs: int, count: int) -> float:
+    """Operations of a network for ``count`` candidate goals of one context, whose first layer's share is made once."""
+    each = forward(context + goal, hidden, outputs) - 2.0 * context * hidden[0]
+    return 2.0 * context * hidden[0] + count * each
+
+
+def of_learner(ppo: PPOConfig, env: Env) -> float:
+    """Operations of PPO's update in an iteration."""
+    actor = forward(env.obs_dim, ppo.hidden, env.action_dim)
+    return TRAINING * (actor + forward(env.obs_dim, ppo.hidden, 1)) * _transitions(ppo, env) * ppo.epochs
+
+
+def of_selector(selector: SelectorConfig, ppo: PPOConfig, env: Env) -> float:
+    """Operations that a goal selector adds to an iteration; negative where it takes the critic's work away.
+
+    Selectors without networks add none.
     """
-    count = selector.num_candidates
-    if isinstance(selector, FearSelector):
-        net, config = selector.fear.network, selector.config.fear
-        window = 2 * num_envs  # interactions: the resolved ones of 2 T steps, about one per world and T
-        return decisions * scoring(net, goal_dim, count) + 3.0 * operations(net) * window * config.epochs
-    if isinstance(selector, RND):
-        fit = (operations(selector.target) + 3 * operations(selector.predictor)) * selector.config.epochs
-        nets = (selector.target, selector.predictor)
-        return decisions * (sum(scoring(net, goal_dim, count) for net in nets) + fit)
-    if isinstance(selector, VDS):
-        net, config = selector.stack.nets[0], selector.config
-        rows = transitions * (config.critics if config.data == "all" else 1)
-        learning = rows * operations(net) * (1 + 3 * config.epochs)  # values, then the passes
-        return learning + decisions * count * config.critics * operations(net)
-    return sum(selector_operations(part, decisions, transitions, num_envs, goal_dim) for part in selector.parts)
+    state, goal, transitions = env.state_dim, env.goal_dim, _transitions(ppo, env)
+    decisions = transitions / env.goal_period
+    context = state + goal
+    fear = getattr(selector, "fear", None)
+    if isinstance(fear, FearConfig):
+        window = 2 * env.num_envs  # interactions: the resolved ones of 2 T steps, about one per world and T
+        fit = TRAINING * forward(context + goal, fear.hidden, 1) * window * fear.epochs
+        candidates: int = getattr(selector, "candidates")  # noqa: B009 (every selector with fear has them)
+        return decisions * scoring(context, goal, fear.hidden, 1, candidates) + fit
+    if isinstance(selector, rnd.Config):
+        nets = [forward(context + goal, (units,), selector.features) for units in (selector.target, selector.predictor)]
+        both = (selector.target + selector.predictor,)  # scored together, as one network of that width
+        score = scoring(context, goal, both, selector.features, selector.candidates)
+        return decisions * (score + (nets[0] + TRAINING * nets[1]) * selector.epochs)
+    if isinstance(selector, vds.Config):
+        critic = forward(state + goal, selector.hidden, 1)
+        rows = transitions * (selector.critics if selector.data == "all" else 1)
+        learning = rows * critic * (1 + TRAINING * selector.epochs)  # values, then the passes
+        chosen = decisions * selector.candidates * selector.critics * critic
+        own = TRAINING * forward(env.obs_dim, ppo.hidden, 1) * transitions * ppo.epochs
+        return learning + chosen - (own if selector.role == "replace" else 0.0)
+    return 0.0
+
+
+def _transitions(ppo: PPOConfig, env: Env) -> int:
+    return ppo.num_steps * env.num_envs

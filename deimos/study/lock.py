@@ -44,36 +44,42 @@ def hold(path: Path, what: str, *, patience: float = 0.0, one_machine: bool = Fa
     Raises:
         RunError: If another process holds it, or another machine may do so, or the file cannot be locked.
     """
-    end = time.monotonic() + patience
-    try:
-        with path.open("a+") as file:
-            while not _is_taken(file):
-                if time.monotonic() >= end:
-                    raise RunError(f"{what} is being worked on by {_holder(file)[1]}.")
-                time.sleep(POLL_SECONDS)
-            machine, holder = _holder(file)
-            if one_machine and machine not in ("", socket.gethostname()):
-                raise RunError(
-                    f"{what} was last worked on by {holder}, and whether that has ended cannot be seen from here; "
-                    f"once it has, delete {path}."
-                )
+    with _opened(path) as file:
+        while not _is_taken(file, path):
+            if patience <= 0.0:
+                raise RunError(f"{what} is being worked on by {_holder(file)[1]}.")
+            time.sleep(POLL_SECONDS)
+            patience -= POLL_SECONDS
+        machine, holder = _holder(file)
+        if one_machine and machine not in ("", socket.gethostname()):
+            raise RunError(
+                f"{what} was last worked on by {holder}, and whether that has ended cannot be seen from here; once it "
+                f"has, delete {path}."
+            )
+        file.truncate(0)
+        file.write(json.dumps({"machine": socket.gethostname(), "process": os.getpid()}))
+        file.flush()
+        try:
+            yield
+        finally:
             file.truncate(0)
-            file.write(json.dumps({"machine": socket.gethostname(), "process": os.getpid()}))
-            file.flush()
-            try:
-                yield
-            finally:
-                file.truncate(0)
+
+
+def _opened(path: Path) -> IO[str]:
+    try:
+        return path.open("a+")
     except OSError as error:
-        raise RunError(f"{path} cannot be locked ({error.strerror}).") from error
+        raise RunError(f"{path} cannot be opened ({error.strerror}).") from error
 
 
-def _is_taken(file: IO[str]) -> bool:
+def _is_taken(file: IO[str], path: Path) -> bool:
     """Take the lock of a file unless another process has it; returns whether it was taken."""
     try:
         _lock(file)
     except (BlockingIOError, PermissionError):  # of POSIX and of Windows
         return False
+    except OSError as error:
+        raise RunError(f"{path} cannot be locked ({error.strerror}).") from error
     return True
 
 

@@ -20,7 +20,7 @@ from deimos.run.training import TrainConfig
 from deimos.sim.env import EnvConfig
 
 SCHEMA = 1  # of cell.json
-_KEYS = {"about", "base", "seeds", "methods", "train", "environment"}
+_KEYS = {"base", "seeds", "methods", "train", "environment"}
 _ENVIRONMENT_KEYS = {"name", "preset", "env", "methods", "train", "goal_periods"}
 _GRID = {"env", "method", "selector", "seed", "evaluation"}  # of TrainConfig: the grid's, not the settings'
 
