@@ -47,7 +47,7 @@ def test_merge_needs_a_source(tmp_path):
 RUN_ERRORS = {
     "no study": ({}, "study holds no study; begin one with --preset or --file"),
     "unknown preset": ({"preset": "huge"}, "There is no preset 'huge'; there are: absolute"),
-    "unknown method": ({"preset": "small", "methods": ["p33"]}, "There is no method 'p33'"),
+    "unknown method": ({"preset": "small", "methods": ["q33"]}, "There is no method 'q33'"),
     "doubled seed": ({"preset": "small", "seeds": "0,0"}, "Every seed must be given once; doubled: 0"),
     "foreign environment": (
         {"preset": "small", "environments": ["quad"]},
