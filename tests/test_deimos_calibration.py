@@ -26,7 +26,7 @@ def known_interactions(count):
     data = Resolved(
         env=torch.arange(count), state=state, goal=goal, next_goal=next_goal, score=numbers, reward=numbers,
         tracking=numbers.unsqueeze(1), probe=integers.bool(), note=integers, crashed=outcomes(probability),
-        issued=integers, resolved=integers,
+        issued=integers, resolved=integers, horizon=integers + 1,
     )  # fmt: skip
     return data, probability
 

@@ -1,14 +1,16 @@
 """Matrix products by the faster library, and scores of candidates by one kernel: neither changes a result."""
 
 import copy
+import sys
 
 import pytest
 import torch
 from torch import nn
 
-from deimos.goals.selector import Whitening
+from deimos.nn import fusion
 from deimos.nn import matmul as products
 from deimos.nn.fused import fuse
+from deimos.nn.fusion import Whitening, fused_scores
 from deimos.nn.matmul import add_product_, fast_linear, onednn
 from deimos.nn.networks import ManyCandidates, mlp
 
@@ -95,6 +97,43 @@ def test_fused_scores_are_the_networks(torch_device, outputs):
                 parameter += 0.01 * torch.randn_like(parameter)
         factor *= 0.9
     assert all(torch.equal(scores, copied) for scores, copied in kept), "a later call overwrote earlier scores"
+
+
+@pytest.mark.parametrize("missing", ["none", "operator", "switch"])
+def test_private_operators_may_be_missing(monkeypatch, missing):
+    """Where PyTorch has no operator of oneDNN, another one, or no switch of precision, its plain products do it."""
+    if missing == "operator":
+        monkeypatch.setattr(torch.ops.mkldnn, "_linear_pointwise", _refuse)
+    if missing == "switch":
+        monkeypatch.setattr(products, "_MATMUL", None)
+    products._onednn_linear.cache_clear()
+    products._exact_through_onednn.cache_clear()
+    torch.manual_seed(0)
+    x, weight, total = torch.randn(6000, 64), torch.randn(64, 64), torch.zeros(64, 64)
+    try:
+        assert (products._onednn_linear() is None) == (missing == "operator")
+        found = fast_linear(x, weight, None, nn.ReLU())
+        add_product_(total, found, x)
+    finally:
+        products._onednn_linear.cache_clear()
+        products._exact_through_onednn.cache_clear()
+    expected = nn.functional.linear(x.double(), weight.double()).relu()
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(total.double(), expected.t() @ x.double(), rtol=1e-3, atol=1e-2)
+
+
+def _refuse(*arguments):
+    raise RuntimeError("another signature")
+
+
+def test_fused_scores_need_warp(monkeypatch):
+    """Without Warp no network has a kernel, and nothing is imported to find that out."""
+    net = mlp(9, (64,), 1, "relu")
+    assert fused_scores(net, 3) is not None
+    monkeypatch.setattr(fusion, "find_spec", lambda name: None)
+    monkeypatch.delitem(sys.modules, "deimos.nn.fused")
+    assert fused_scores(net, 3) is None
+    assert "deimos.nn.fused" not in sys.modules
 
 
 def test_fused_scores_take_any_view():

@@ -133,7 +133,7 @@ def test_digests_know_what_a_method_stands_for(name, monkeypatch):
     """Another configuration behind a method's name is another selector and cell, also where a schedule names it."""
     cell = plan.Cell(environment="x", config=TrainConfig(method=name, threads=1), goal_periods=(100,))
     before = cell.selector, cell.digest, cell.setting
-    monkeypatch.setitem(METHODS, "p75", dataclasses.replace(METHODS["p75"], percentile=74))
+    monkeypatch.setitem(METHODS, "p75", ("director", {"percentile": 74}))
     cell = dataclasses.replace(cell)
     assert [new == old for new, old in zip((cell.selector, cell.digest, cell.setting), before, strict=True)] == [
         False, False, True,
@@ -152,7 +152,7 @@ def test_cell_survives_its_file(tmp_path):
 
 ERRORS = {
     # what is said in the file, and the one line that refuses it
-    TOML.replace('"uniform", "p25"', '"uniform", "nope"'): "There is no method 'nope'",
+    TOML.replace('"uniform", "p25"', '"uniform", "q33"'): "There is no method 'q33'; there are: uniform, coop",
     TOML.replace('"uniform", "p25"', '"uniform", "uniform"'): "Every method must be given once; doubled: uniform",
     TOML.replace("[3, 5]", "[3, 3]"): "Every seed must be given once; doubled: 3",
     TOML.replace("[3, 5]", "0"): "seeds must be a number of seeds or a list of them, got 0",

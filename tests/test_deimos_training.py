@@ -21,7 +21,7 @@ from deimos.app import cli
 from deimos.checks import RunError, SimulationError
 from deimos.files import load_tensors
 from deimos.goals.fear import FearConfig
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import METHODS, method
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import director, uniform
 from deimos.learn.ppo import PPOConfig
@@ -491,7 +491,7 @@ def test_init_from_refuses_another_size(undisturbed, tmp_path):
 
 CONFIGS = {
     **{f"method {name}": TrainConfig(method=name) for name in METHODS},
-    **{f"selector of {name}": TrainConfig(selector=selector) for name, selector in METHODS.items()},
+    **{f"selector of {name}": TrainConfig(selector=method(name)) for name in METHODS},
     "default": TrainConfig(),
     "all else": TrainConfig(
         env=particle.Config(
@@ -624,8 +624,7 @@ def test_missing_or_foreign_policy_is_refused(tmp_path):
 
 def test_what_led_to_an_invalid_state_is_left_out():
     """Every transition of a world since its last reset gets weight 0 when the world breaks, and no other one."""
-    env = particle.Config(time_limit=50).build(3, torch.device("cpu"), 0)
-    rollout = Rollout(env, 5)
+    rollout = Rollout(5, 3, 12, 3, torch.device("cpu"))
     rollout.terminated[1, 0] = True  # world 0 is reset after step 1 and breaks at step 3
     rollout.invalid[3, 0] = rollout.truncated[3, 0] = True
     rollout.invalid[0, 1] = rollout.truncated[0, 1] = True  # world 1 breaks at once
