@@ -8,6 +8,7 @@ import pytest
 import torch
 import warp as wp
 from deimos.kernels.legged.height_scan import scan_points
+from deimos.kernels.legged.reset import update_levels
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import COLUMNS
 from deimos.kernels.random import Purpose
@@ -21,6 +22,7 @@ from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import Step
 from deimos.sim.envs import quad_arm
 from deimos.sim.envs.quad import Config
+from deimos.sim.legged import robots
 from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
 
 U = 2.0**-24
@@ -28,7 +30,7 @@ POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)
 TASKS = {"quad": Config, "quad-arm": quad_arm.Config}
 
 both = pytest.mark.parametrize("task", TASKS)
-"""Whatever the robot carries, it keeps what an environment promises."""
+"""With an arm or without, a robot keeps what an environment promises."""
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +97,7 @@ def test_observation_is_legged_gyms(torch_device):
     assert env.goal_slice == slice(9, 12)
     assert env.dt == pytest.approx(0.02)
     noise = [0.2] * 3 + [0.05] * 3 + [0.05] * 3 + [0.0] * 3 + [0.01] * 12 + [0.075] * 12 + [0.0] * 12 + [0.5] * 187
-    np.testing.assert_allclose(env._noise.numpy(), noise, rtol=1e-6)
+    np.testing.assert_allclose(env.legged.sensing.noise.numpy(), noise, rtol=1e-6)
 
 
 def test_observation_matches_numpy(torch_device, hills):
@@ -349,7 +351,7 @@ def test_noise_is_uniform_and_keyed(torch_device):
     for _ in range(2):
         difference = noisy.step(action).obs - quiet.step(action).obs
         differences.append(difference.cpu().numpy())
-    bound = noisy._noise.numpy()
+    bound = noisy.legged.sensing.noise.numpy()
     for difference in differences:
         assert np.all(np.abs(difference) <= bound + 1e-5)
         assert np.all(np.abs(difference[:, bound == 0]) == 0)
@@ -410,9 +412,7 @@ def test_perfect_tracker_of_turning_goals(torch_device, rule):
     assert ground.tile == 8.0
     env = build(torch_device, num_envs=n, levels=rule, episode_steps=steps, goal_period=500, start_levels=1)
     # A world of ten levels, all of them flat: what the robots do is written, not simulated.
-    origins = np.zeros((10, 1, 3), np.float32)
-    env._ground.origin = wp.array(origins, dtype=wp.vec3, device=str(env._ground.heights.device))
-    env._capture()
+    env.legged.ground.origin = wp.zeros((10, 1), dtype=wp.vec3, device=env.worlds.mask.device)
     t = env.tensors
     t["level"][:] = 5
     position, yaw = np.zeros((n, 2)), np.zeros(n)
@@ -427,7 +427,8 @@ def test_perfect_tracker_of_turning_goals(torch_device, rule):
     env._views["terminated"][:] = False
     env._views["truncated"][:] = True
     env._views["invalid"][:] = False
-    env.reset(mask_of(env, *range(n)))
+    env._views["mask"][:] = True
+    update_levels(env.legged)
     down = int((t["level"] < 5).sum())
     if rule == "reward":
         assert t["level"].tolist() == [6] * n
@@ -544,11 +545,13 @@ def test_a_goal_that_is_not_finite_breaks_its_world(torch_device):
 
 
 def test_buffers_too_small_say_how_large_they_had_to_be(torch_device):
-    """The message names the bit, the buffer, its size, what was needed and the flag, and no buffer that had room."""
+    """The message names the bit, the buffer, its size, what was needed and the flag, and no other buffer."""
     env = build(torch_device, physics=PhysicsConfig(rows=8))
     for _ in range(20):
         env.step(actions(6, torch_device))
-    message = r"lost contacts \(NEFC: up to \d+ constraint rows .* were needed, with room for 8; raise physics.rows\)"
+    message = (
+        r"lost contacts \(NEFC: up to \d+ constraint rows .* were needed, the buffer holds 8; raise physics.rows\)"
+    )
     with pytest.raises(SimulationError, match=message):
         env.check()
 
@@ -556,7 +559,7 @@ def test_buffers_too_small_say_how_large_they_had_to_be(torch_device):
 @pytest.mark.parametrize(("seconds", "steps"), [(0.0, 0), (0.009, 1), (0.02, 1), (0.3, 15)])
 def test_pushes_come_as_often_as_they_are_asked_for(torch_device, seconds, steps):
     """An interval shorter than a step is a push on every step, and only 0 is none."""
-    assert build(torch_device, num_envs=1, push_interval=seconds)._params.push_interval == steps
+    assert build(torch_device, num_envs=1, push_interval=seconds).legged.params.push_interval == steps
 
 
 def test_terrain_of_fine_cells_is_refused(torch_device, tmp_path):
@@ -586,6 +589,38 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
         env.step(torch.zeros(shape, device=torch_device))
 
 
+NEW_ROBOT = '''
+from dataclasses import replace
+from deimos.sim.legged.robots import go1
+
+def build(*, stiffness=40.0, damping=1.0, action_scale=0.2):
+    """A Go1 with other gains that starts a little higher."""
+    return replace(go1.build(stiffness=stiffness, damping=damping, action_scale=action_scale), spawn_height=0.5)
+'''
+
+
+def test_a_robot_is_one_file(torch_device, tmp_path, monkeypatch):
+    """A file in the folder of robots is a robot: its name is known, its numbers are the task's, and it steps."""
+    (tmp_path / "newcomer.py").write_text(NEW_ROBOT)
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path)])
+    env = build(torch_device, robot="newcomer")
+    assert [joint.stiffness for joint in env.robot.joints] == [40.0] * 12
+    assert bool((env.tensors["qpos"][:, 2] == 0.5).all())
+    assert bool(env.step(actions(6, torch_device)).obs.isfinite().all())
+    softer = build(torch_device, robot="newcomer", stiffness=20.0)
+    assert {(joint.stiffness, joint.damping) for joint in softer.robot.joints} == {(20.0, 1.0)}
+
+
+def test_the_data_hold_what_a_deployment_reads(torch_device):
+    """Joint names in order, default pose, action scale, gains, torque limits and the control period are at hand."""
+    env = build(torch_device)
+    assert [joint.name for joint in env.robot.joints[:3]] == ["FL_hip", "FL_thigh", "FL_calf"]
+    np.testing.assert_array_equal([joint.pose for joint in env.robot.joints], POSE)
+    assert {(joint.action_scale, joint.stiffness, joint.damping) for joint in env.robot.joints} == {(0.25, 30.0, 0.8)}
+    assert [joint.max_torque for joint in env.robot.joints[:3]] == [23.7, 23.7, 35.55]
+    assert env.config.physics.control_period == env.dt == pytest.approx(0.02)
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -596,6 +631,7 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
         ({"friction": (1.0, 0.5)}, "friction must be a range"),
         ({"payload": -1.0}, r"payload must be in \[0, 1e\+06\], got -1.0"),
         ({"stiffness": 0.0}, "stiffness must be finite and positive, got 0.0"),
+        ({"robot": "spot"}, "robot must be one of go1, go1_rx150, got 'spot'"),
         ({"rewards": RewardWeights(tilt=math.nan)}, "rewards.tilt must be finite, got nan"),
     ],
 )

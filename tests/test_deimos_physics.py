@@ -13,7 +13,8 @@ from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
 from deimos.sim.legged.engines.mujoco_warp import Captured, Physics, PhysicsConfig
-from deimos.sim.legged.robots import go1, rx150
+from deimos.sim.legged.robots import go1
+from deimos.sim.legged.robots import go1_rx150 as rx150
 
 ROBOT = go1.build()
 ROBOTS = {"go1": ROBOT, "go1_rx150": rx150.mount(go1.build())}
@@ -273,8 +274,8 @@ def test_buffers_tell_their_use(device):
 @pytest.mark.parametrize(
     ("bits", "message"),
     [
-        (1, r"^NEFC: up to \d+ constraint rows in a world were needed, with room for 49; raise physics.rows$"),
-        (16, r"^CCD: up to \d+ contacts in all worlds were needed, with room for 80; raise physics.contacts$"),
+        (1, r"^NEFC: up to \d+ constraint rows in a world were needed, the buffer holds 49; raise physics.rows$"),
+        (16, r"^CCD: up to \d+ contacts in all worlds were needed, the buffer holds 80; raise physics.contacts$"),
         (32, "^HFIELD: a geom covered more of the height field than is tested; take a terrain of larger cells$"),
         (256, "^EPA_HORIZON: a contact was deeper than the collision test can resolve$"),
         (33 + 512, "^NEFC: .*; HFIELD: "),

@@ -38,6 +38,7 @@ from scipy import stats
 from deimos.sim.legged.robots import go1_rx150 as rx150
 
 J, G, OBS_START, OBS, POINTS = 17, 6, 66, 76, 7
+TIP = slice(OBS_START, OBS_START + 3)  # of the observation: the end effector
 DT, CELL, CORNER = 0.02, 0.1, (-6.0, -8.0)
 GARBAGE = 7.0
 OFFSETS = np.array(rx150.OFFSETS) + np.array([rx150.MOUNT, *[(0.0, 0.0, 0.0)] * 5])
@@ -256,11 +257,9 @@ def test_evaluation_matches_reference(device, n):
         slack = 1e-6 / max(0.01, math.hypot(place[0], place[1]))
         np.testing.assert_allclose(out["term"][i, NUM_COLUMNS:], terms, rtol=1e-4 + 10 * slack, atol=1e-7)
         np.testing.assert_allclose(out["tracking"][i, 2], values["reach"], rtol=1e-4 + 10 * slack)
-        np.testing.assert_allclose(
-            out["obs"][i, OBS_START : OBS_START + 3], np.clip(seen, -2, 2), rtol=0, atol=1e-4 + slack
-        )
+        np.testing.assert_allclose(out["obs"][i, TIP], np.clip(seen, -2, 2), rtol=0, atol=1e-4 + slack)
         np.testing.assert_allclose(out["error"][i], distance, rtol=0, atol=2e-6)
-    assert np.all(np.delete(out["obs"], np.r_[OBS_START : OBS_START + 3], axis=1) == GARBAGE)
+    assert np.all(np.delete(out["obs"], TIP, axis=1) == GARBAGE)
     assert np.all(out["term"][:, :NUM_COLUMNS] == GARBAGE)
     assert np.all(out["tracking"][:, :2] == GARBAGE)
 
@@ -278,7 +277,7 @@ def test_a_goal_that_is_met_earns_all(device):
     np.testing.assert_allclose(out["term"][far, NUM_COLUMNS], 0.5 * DT, rtol=1e-4)
     np.testing.assert_allclose(out["term"][:, NUM_COLUMNS + 1], ArmWeights().precision * DT, rtol=1e-4)
     seen = np.clip(arrays["goal"][far, 3:], -2, 2)
-    np.testing.assert_allclose(out["obs"][far, OBS_START : OBS_START + 3], seen, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(out["obs"][far, TIP], seen, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -461,11 +460,9 @@ def test_rejects_arrays_without_the_arm(device, label, name, shape, message):
 def test_redraws_reject_arrays_of_another_shape(device):
     """Candidates have all components of a goal."""
     world, ints = World(make_world(5), device), wp.zeros(2, dtype=wp.int32, device=device)
+    right, short = (wp.zeros((2, 4, width), dtype=wp.float32, device=device) for width in (6, 3))
+    scale = to_array(np.ones(6), device)
     with pytest.raises(ValueError, match=r"candidate must be float32\(2, 4, 6\).*got float32\(2, 4, 3\)"):
-        redraw_candidates(
-            world.legged, world.arm, ints, to_array(np.ones(6), device), wp.zeros((2, 4, 3), device=device)
-        )
+        redraw_candidates(world.legged, world.arm, ints, scale, short)
     with pytest.raises(ValueError, match=r"scale must be float32\(6,\).*got float32\(3,\)"):
-        redraw_candidates(
-            world.legged, world.arm, ints, to_array(np.ones(3), device), wp.zeros((2, 4, 6), device=device)
-        )
+        redraw_candidates(world.legged, world.arm, ints, to_array(np.ones(3), device), right)

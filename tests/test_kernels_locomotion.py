@@ -450,6 +450,6 @@ def test_rejects_sizes_that_are_too_small(name, value, message):
 
 def test_parameters_are_given_all_and_by_name():
     """A parameter that is forgotten or misspelt is an error."""
-    with pytest.raises(ValueError, match="params must be dt, stagger, .*half_tile, got dt"):
+    with pytest.raises(ValueError, match=r"params must be dt, stagger, .*half_tile, got dt"):
         make_params(**{name: PARAMS[name] for name in PARAMS if name != "noise"})
     assert PARAMS.keys() == LocomotionParams.vars.keys()

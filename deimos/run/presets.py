@@ -1,9 +1,9 @@
 """Ready configurations: what an environment is trained with unless somebody says otherwise.
 
 A module of ``deimos.sim.envs`` may hold ``PRESETS``: by name, the fields of ``TrainConfig`` that differ from its
-defaults, in plain dictionaries: those of the environment in ``env``, of the learner in ``ppo``, of the evaluation in
-``eval``, as ``config.json`` has them. The one with the environment's own name is what ``env:NAME`` starts from. As on the command line,
-hyphens and underscores in a name are the same.
+defaults, in plain dictionaries as ``config.json`` has them: those of the environment in ``env``, of the learner in
+``ppo``, of the evaluation in ``eval``. The one with the environment's own name is what ``env:NAME`` starts from. As on
+the command line, hyphens and underscores in a name are the same.
 """
 
 from typing import Any

@@ -6,6 +6,7 @@ rise and fall with the reward.
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
@@ -179,13 +180,9 @@ class Locomotion(WarpEnv):
             self._sums += self.term.sum(0)
             self._steps_reported += 1
 
-        valid_goals = next((part.validate for part in self._launches if part.validate), None)
-        self.begin(
-            step, Captured(self._run_reset, self.device),
-            valid_goals=valid_goals and (
-                lambda candidates: valid_goals(self._row.array, self._candidate_scale.array, candidates)
-            ),
-        )  # fmt: skip
+        validate = next((part.validate for part in self._launches if part.validate), None)
+        valid_goals = partial(validate, self._row.array, self._candidate_scale.array) if validate else None
+        self.begin(step, Captured(self._run_reset, self.device), valid_goals=valid_goals)
         self.physics.buffer_use()  # what the recording needed says nothing about these worlds
 
     def _run_step(self) -> None:
