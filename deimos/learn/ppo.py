@@ -206,6 +206,10 @@ class PPO:
             raise ValueError(
                 f"minibatches must be at most the {rows} transitions of a rollout, got {config.minibatches}."
             )
+        if partial := [field.name for field in env.layout if field.seen_by != "both"]:
+            raise ValueError(
+                f"PPO shows all of the observation to actor and critic; {', '.join(partial)} must be seen by both."
+            )
         self.config = config
         self._size = rows // config.minibatches
         with weights_from(seed, "policy weights"):

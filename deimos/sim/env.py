@@ -9,7 +9,7 @@ import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Self, final
+from typing import TYPE_CHECKING, Literal, Self, final
 
 import torch
 from torch import Tensor
@@ -30,6 +30,8 @@ class ObsField:
     unit: str
     scale: float | tuple[float, ...]
     """The policy sees the physical value times this; one number for all components or one for each."""
+    seen_by: Literal["both", "actor", "critic"] = "both"
+    """Who sees it; what only the critic sees is privileged, for a simulator alone. The goal is seen by both."""
 
 
 @dataclass(frozen=True)
