@@ -8,11 +8,12 @@ from deimos._version import __version__
 
 _OFFERED = {
     "GoalDirector": "deimos.goals.director",
+    "check_env": "deimos.sim.check_env",
     "load_policy": "deimos.learn.policy",
 }
 """What the package offers, and the module that holds it."""
 
-__all__ = ["GoalDirector", "__version__", "load_policy"]
+__all__ = ["GoalDirector", "__version__", "check_env", "load_policy"]
 
 # Installed, ``kernels`` and ``terrain`` lie inside this package; in a checkout they lie beside it.
 _HOME = Path(__file__).resolve().parent
