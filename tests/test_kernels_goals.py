@@ -1,29 +1,12 @@
-"""Goal clocks and uniform candidates."""
+"""Uniform candidates for goals."""
 
 import numpy as np
 import pytest
 import warp as wp
-from deimos.kernels.goals import count_events, draw_candidates, goal_is_due, time_is_up
+from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose
 
 SIGMAS = 5.0  # a sound generator's mean is off by more than this once in 1.7 million tests
-
-
-@wp.kernel(enable_backward=False)
-def _judge_clocks(
-    # In
-    clock: wp.array[int],
-    bound: wp.array[int],
-    done: wp.array[wp.bool],
-    # Out
-    due: wp.array[wp.bool],
-    up: wp.array[wp.bool],
-    count: wp.array[int],
-):
-    i = wp.tid()
-    due[i] = goal_is_due(clock[i], bound[i])
-    up[i] = time_is_up(clock[i], bound[i])
-    count_events(due[i], done[i], count)
 
 
 def draw(row, goal_count, scale, count, device, *, seed=0, world_offset=0):
@@ -150,27 +133,3 @@ def test_draw_candidates_rejects(device, wrong, message):
     arrays = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in (right | wrong).items()}
     with pytest.raises(ValueError, match=message):
         draw_candidates(**arrays, seed=0, world_offset=0)
-
-
-def test_clocks_and_counts_by_hand(device):
-    """A goal is due at T and after it, an episode ends at its limit unless that is 0, and done comes first."""
-    clock = [2, 3, 4, 5, 5, 0]
-    bound = [3, 3, 3, 0, 5, 0]
-    done = [False, False, True, False, True, False]
-    expected_due = [False, True, True, True, True, True]
-    expected_up = [False, True, True, False, True, False]
-    clock, bound = (wp.array(a, dtype=wp.int32, device=device) for a in (clock, bound))
-    due, up = (wp.full(6, value, dtype=wp.bool, device=device) for value in (True, True))
-    count = wp.array([10, 20], dtype=wp.int32, device=device)
-
-    wp.launch(
-        _judge_clocks,
-        dim=6,
-        inputs=[clock, bound, wp.array(done, dtype=wp.bool, device=device)],
-        outputs=[due, up, count],
-        device=device,
-    )
-
-    assert due.numpy().tolist() == expected_due
-    assert up.numpy().tolist() == expected_up
-    assert count.numpy().tolist() == [10 + 3, 20 + 2]  # due and not done: worlds 1, 3, 5; done: 2 and 4

@@ -6,7 +6,8 @@ import typing
 import numpy as np
 import pytest
 import warp as wp
-from deimos.kernels.particle import ParticleState, ParticleStep, step_particles
+from deimos.kernels.episodes import make_worlds
+from deimos.kernels.particle import GOAL_START, OBS_DIM, PARTICLES, step_particles
 from deimos.kernels.particle_rewards import RewardShape, shape_reward
 
 from deimos.sim.envs.particle import HALF_SIDE, Config
@@ -86,7 +87,7 @@ def test_characteristic_lengths(device):
 def test_is_positive_wherever_a_particle_can_be(device, variant, shape):
     """Even the crash in the corner that is farthest from the farthest goal is rewarded with more than 0."""
     config = Config(variant=variant)
-    params = config.params(seed=0, env_offset=0)
+    params = config.params()
     # A velocity is within the bounds of speed; a position is within the cube, or one step outside of it.
     farthest = config.max_speed if variant == "directional" else HALF_SIDE + config.max_speed
     corner, goal = np.full(3, farthest), np.full(3, -config.goal_half_side)
@@ -111,26 +112,18 @@ def test_every_shape_can_be_configured():
 def test_configured_shape_is_the_one_that_steps_reward(device, variant, name):
     """A step pays the configured shape of the distance between particle and goal."""
     config = Config(variant=variant, reward=name)
-    params = config.params(seed=0, env_offset=0)
+    params = config.params()
     goal, at = np.array([3.0, 0.0, -4.0]), np.array([1.0, 2.0, -3.0])  # 3 apart
-    state, out = ParticleState(), ParticleStep()
-    for field in ("position", "velocity", "force", "target"):
-        setattr(state, field, wp.zeros(1, dtype=wp.vec3, device=device))
-    for field in ("goal_clock", "episode_step", "episode_count", "goal_count"):
-        setattr(state, field, wp.zeros(1, dtype=wp.int32, device=device))
-    for field in ("terminated", "truncated", "goal_due", "invalid"):
-        setattr(out, field, wp.zeros(1, dtype=wp.bool, device=device))
-    out.count, out.fault = (wp.zeros(n, dtype=wp.int32, device=device) for n in (2, 3))
-    out.obs = wp.full((1, 12), np.nan, dtype=wp.float32, device=device)
-    out.reward = wp.full(1, np.nan, dtype=wp.float32, device=device)
-    state.target.fill_(wp.vec3(*goal))
-    if variant == "directional":
-        state.velocity.fill_(wp.vec3(*at))
-    else:
-        state.position.fill_(wp.vec3(*at))
+    worlds = make_worlds(
+        1, device, obs_dim=OBS_DIM, action_dim=3, goal_start=GOAL_START, goal_scale=[1.0] * 3, goal_period=100
+    )
+    state = PARTICLES.allocate(device, num_envs=1)
+    worlds.goal.assign([goal])
+    moved = state.velocity if variant == "directional" else state.position
+    moved.fill_(wp.vec3(*at))
 
-    step_particles(params, wp.zeros(1, dtype=wp.vec3, device=device), state, out)
+    step_particles(worlds, state, params).launch()
 
     length = 2.5 if variant == "directional" else 250.0
     expected = reward_reference(name, 3.0, params.largest_distance, length)
-    assert abs(out.reward.numpy()[0] - expected) <= reward_tolerance(3.0, length)
+    assert abs(worlds.reward.numpy()[0] - expected) <= reward_tolerance(3.0, length)

@@ -1,6 +1,7 @@
 """What stands where in an observation: environments lay it out, policies carry it with them."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -12,6 +13,8 @@ class ObsField:
     unit: str
     scale: float | tuple[float, ...]
     """The policy sees the physical value times this; one number for all components or one for each."""
+    seen_by: Literal["both", "actor", "critic"] = "both"
+    """Who sees it; what only the critic sees is privileged, for a simulator alone. The goal is seen by both."""
 
 
 def goal_slice(layout: tuple[ObsField, ...]) -> slice:

@@ -89,6 +89,10 @@ class Trainer:
         keep_freed_memory()
         self.config = config
         self.env = config.env.build(config.num_envs, device, config.seed)
+        if partial := [field.name for field in self.env.layout if field.seen_by != "both"]:
+            raise ValueError(
+                f"PPO shows all of the observation to actor and critic; {', '.join(partial)} must be seen by both."
+            )
         total_steps = config.iterations * config.ppo.num_steps
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
         self.ppo = PPO(config.ppo, config.num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed)
