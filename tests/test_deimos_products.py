@@ -10,9 +10,9 @@ from torch import nn
 from deimos.nn import fusion
 from deimos.nn import matmul as products
 from deimos.nn.fused import fuse
-from deimos.nn.fusion import Whitening, fused_scores
+from deimos.nn.fusion import fused_scores
 from deimos.nn.matmul import add_product_, fast_linear, onednn
-from deimos.nn.networks import ManyCandidates, mlp
+from deimos.nn.networks import ManyCandidates, Whitening, mlp
 
 CPU = torch.device("cpu")
 MATMUL = torch.backends.mkldnn.matmul

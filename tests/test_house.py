@@ -72,7 +72,11 @@ ROOMS = {  # package: those that it may import, and those that these may import
     "adapters": {"run"},
 }
 LEAVES = {"_version", "checks", "files", "plugins"}  # modules that everybody may import
-BACKENDS = {"deimos/nn/fused.py", "deimos/nn/fused_critics.py"}  # imported by functions, where Warp is installed
+BACKENDS = {
+    "deimos/nn/fusion.py",
+    "deimos/nn/fused.py",
+    "deimos/nn/fused_critics.py",
+}  # imported by functions, where Warp is installed
 ENTRIES = {"train.py", "deimos/__main__.py", "terrain/__main__.py"}  # may import app
 
 
@@ -134,7 +138,7 @@ def python(code, *, cwd, first=()):
 def test_imports_are_silent_and_light(tmp_path):
     """Importing the packages prints nothing and starts no device; none loads mujoco, and by themselves none torch."""
     modules = [name for name in module_names("kernels", "terrain") if not name.endswith("__main__")]
-    assert {"kernels", "deimos.kernels.particle", "terrain"} <= set(modules)
+    assert {"deimos.kernels", "deimos.kernels.particle", "deimos.terrain"} <= set(modules)
     code = f"""
 import importlib, sys
 for name in {modules}:

@@ -4,21 +4,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 import tyro
 
 from deimos.app import console, figures
-from deimos.checks import RunError, check_at_least
-from deimos.learn.policy import load_policy
-from deimos.run import audit, evaluation, training
+from deimos.checks import check_at_least
+from deimos.run import api, audit, training
 from deimos.run.config import kind
+from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
+from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
-
-if TYPE_CHECKING:
-    from deimos.sim.env import EnvConfig
 
 _CHANGES = ("worlds", "steps", "seed", "oracle_worlds")
 _EVALUATION = (
@@ -94,17 +92,10 @@ def main(arguments: list[str], program: str) -> None:
         with one_stream(device):
             _evaluate_fear(training.load(folder, replace(config, device=options.device)), folder, options)
         return
-    changes = {name: getattr(options, name) for name in _CHANGES}
-    try:
-        eval_config = replace(config.eval, **{name: value for name, value in changes.items() if value is not None})
-        period = config.env.goal_period if options.goal_period is None else options.goal_period
-        env_config = config.env.with_goal_period(period)
-        if eval_config.steps < 2 * period:
-            raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
-    except ValueError as error:
-        raise RunError(str(error)) from error
+    changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
+    env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes)
     with one_stream(device):
-        rows = evaluate_policy(folder, env_config, eval_config, device)
+        rows = evaluate_run(folder, env_config, eval_config, device)
     figures.draw_summary(folder, title(config), rows)
     print(folder.path)
 
@@ -114,20 +105,11 @@ def title(config: training.TrainConfig) -> str:
     return f"{kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
 
 
-def evaluate_policy(
-    folder: RunFolder, env_config: "EnvConfig", eval_config: evaluation.EvalConfig, device: torch.device
-) -> list[dict]:
-    """Evaluate the folder's policy; its rows replace those with the same key in ``evaluation.json`` and are printed."""
-    policy = load_policy(folder.path, str(device))
-    old = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+def evaluate_run(folder: RunFolder, env_config: EnvConfig, eval_config: EvalConfig, device: torch.device) -> list[dict]:
+    """Evaluate the folder's policy under a progress bar, and print the table."""
     with console.stage_bar("evaluating: ") as progress:
-        rows = evaluation.evaluate(policy.scaled, env_config, eval_config, device, progress)
-    rows = [row | {"weights": evaluation.weights_hash(policy.actor)} for row in rows]
-    key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
-    fresh = {tuple(row[name] for name in key) for row in rows}
-    kept = [row for row in old if tuple(row.get(name) for name in key) not in fresh]
+        rows = api.evaluate_run(folder, env_config, eval_config, device, progress)
     _print_evaluation(rows)
-    folder.write_json("evaluation.json", kept + rows)
     return rows
 
 

@@ -12,7 +12,7 @@ import tyro
 
 from deimos import plugins
 from deimos.app import console, figures
-from deimos.app.evaluate import evaluate_policy, title
+from deimos.app.evaluate import evaluate_run, title
 from deimos.checks import RunError
 from deimos.goals import selectors
 from deimos.run import presets, training
@@ -81,7 +81,7 @@ def _run(trainer: training.Trainer, folder: RunFolder) -> None:
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(130)
-    rows = evaluate_policy(folder, config.env, config.eval, trainer.env.device) if config.evaluation else []
+    rows = evaluate_run(folder, config.env, config.eval, trainer.env.device) if config.evaluation else []
     figures.draw_summary(folder, title(config), rows)
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts

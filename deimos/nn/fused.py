@@ -15,7 +15,7 @@ from deimos.kernels.candidates import (
     mean_square_of_candidates,
     score_candidates,
 )
-from deimos.nn.fusion import Whitening
+from deimos.nn.networks import Whitening
 
 
 def fuse(net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None) -> "FusedScores | None":

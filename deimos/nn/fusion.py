@@ -2,24 +2,13 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-
-@dataclass(frozen=True)
-class Whitening:
-    """What a network sees of a candidate: clip((x - mean) * factor, -bound, bound). Tensors may change, not move."""
-
-    mean: Tensor
-    """Shape (goal_dim,)."""
-    factor: Tensor
-    """Shape (goal_dim,)."""
-    bound: float
-    """Above 0."""
+from deimos.nn.networks import Whitening
 
 
 def fused_scores(

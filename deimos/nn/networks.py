@@ -1,6 +1,7 @@
 """Multilayer perceptrons, their gradient without allocations, and the actor-critic."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -12,6 +13,18 @@ from deimos.nn.matmul import activate_, add_product_, fast_linear, multiply_by_s
 Activation = Literal["relu", "elu", "tanh"]
 
 _MODULES: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU, "tanh": nn.Tanh}
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """What a network sees of a candidate: clip((x - mean) * factor, -bound, bound). Tensors may change, not move."""
+
+    mean: Tensor
+    """Shape (goal_dim,)."""
+    factor: Tensor
+    """Shape (goal_dim,)."""
+    bound: float
+    """Above 0."""
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int, activation: Activation) -> nn.Sequential:

@@ -11,8 +11,8 @@ from deimos.goals import picks
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 from deimos.nn.adam import Adam
-from deimos.nn.fusion import Whitening, fused_scores
-from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
+from deimos.nn.fusion import fused_scores
+from deimos.nn.networks import Activation, Backprop, ManyCandidates, Whitening, flatten_parameters, mlp
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.seeds import generator, weights_from
 
