@@ -50,8 +50,14 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def load_tensors(path: Path, what: str, schema: int) -> dict:
+def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = None) -> dict:
     """Read a file of tensors.
+
+    Args:
+        path: The file.
+        what: What it is, for the message.
+        schema: The schema that it must have.
+        oldest: An older schema that is read too; ``None`` for none.
 
     Raises:
         RunError: If it is missing, broken, foreign or of another version.
@@ -71,7 +77,7 @@ def load_tensors(path: Path, what: str, schema: int) -> dict:
         reason = "it holds more than tensors" if isinstance(error, pickle.UnpicklingError) else first_line(error)
         raise RunError(f"{path} is not a {what}, or it is broken ({reason}).") from error
     found = data.get("schema") if isinstance(data, dict) else None
-    if not isinstance(found, int) or found != schema:
+    if not isinstance(found, int) or not (schema if oldest is None else oldest) <= found <= schema:
         raise RunError(f"{path} is not a {what} of schema {schema}, got {found}.")
     return data
 

@@ -98,7 +98,7 @@ def rows(path):
 
 def checkpoint(path):
     """What a run's checkpoint holds."""
-    return load_tensors(path / "checkpoint.pt", "checkpoint", training.SCHEMA)
+    return training.load_checkpoint(RunFolder(path))
 
 
 def assert_same(found, expected, name=""):

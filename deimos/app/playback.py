@@ -14,13 +14,12 @@ import tyro
 
 from deimos.app import console
 from deimos.checks import RunError, check_at_least, check_positive
-from deimos.files import load_tensors
 from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.selectors import uniform
 from deimos.learn.policy import load_policy
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.training import SCHEMA, TrainConfig, read_config
+from deimos.run.training import TrainConfig, load_checkpoint, read_config
 from deimos.sim.env import Env
 
 RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)
@@ -121,7 +120,7 @@ def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | No
     afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
     if afraid is None or afraid.parts:
         return None
-    state = load_tensors(folder.path / "checkpoint.pt", "checkpoint", SCHEMA)["loop"]["selector"]
+    state = load_checkpoint(folder)["loop"]["selector"]
     if "fear" not in state:  # it is a part of another selector
         return None
     afraid.load_state_dict(state)

@@ -9,6 +9,7 @@ import torch
 
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy
+from deimos.nn.matmul import on_threads
 from deimos.run import evaluation, training
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
@@ -36,7 +37,7 @@ def train(config: TrainConfig | None = None, out: Path | str | None = None) -> P
     """
     config = config or TrainConfig()
     device = training.resolve_device(config.device)
-    with one_stream(device):
+    with on_threads(torch.get_num_threads()), one_stream(device):  # a run sets the number; the host gets its own back
         trainer, folder = training.start(config, Path(out) if out is not None else None, init_from=None)
         training.train(trainer, folder)
         if config.evaluation:
@@ -61,10 +62,9 @@ def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "
     """
     folder = RunFolder.open(Path(run))
     config = training.read_config(folder)
-    torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
     env_config, eval_config = configure_evaluation(config, goal_period, changes)
     found = training.resolve_device(device)
-    with one_stream(found):
+    with on_threads(config.threads or training.cores()), one_stream(found):  # the same numbers as at the run's end
         return evaluate_run(folder, env_config, eval_config, found)
 
 

@@ -20,7 +20,8 @@ from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 
-SCHEMA = 1  # of config.json and checkpoint.pt
+SCHEMA = 1  # of config.json
+CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be taken over, but its worlds cannot go on
 CHECKPOINT_SECONDS = 30.0
 LEAST_BYTES = 100  # of any transition, and of any world
 
@@ -122,7 +123,7 @@ def _check_memory(config: TrainConfig) -> None:
 
 def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
     """Take over the networks of another run, whose observations must mean the same."""
-    state = load_tensors(origin.path / "checkpoint.pt", "checkpoint", SCHEMA)
+    state = load_checkpoint(origin)
     try:
         layout = load_policy(origin.path).layout
         if layout != trainer.env.layout:
@@ -131,6 +132,15 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise RunError(f"The networks of {origin.path} do not fit this run: {reason}") from error
+
+
+def load_checkpoint(folder: RunFolder) -> dict:
+    """What a run's checkpoint holds, of this version or of the one before.
+
+    Raises:
+        RunError: If there is none, or it is broken or foreign.
+    """
+    return load_tensors(folder.path / "checkpoint.pt", "checkpoint", CHECKPOINT_SCHEMA, oldest=1)
 
 
 def load(folder: RunFolder, config: TrainConfig) -> Trainer:
@@ -143,9 +153,15 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
     Raises:
         RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
     """
+    state = load_checkpoint(folder)
+    if state["schema"] != CHECKPOINT_SCHEMA:
+        raise RunError(
+            f"{folder.path / 'checkpoint.pt'} has the schema {state['schema']}, of an earlier version, and cannot be "
+            "resumed; evaluate its policy, or start a run with its networks by --init-from."
+        )
     torch.set_num_threads(config.threads)
     trainer = build(config, resolve_device(config.device))
-    trainer.load_state_dict(load_tensors(folder.path / "checkpoint.pt", "checkpoint", SCHEMA))
+    trainer.load_state_dict(state)
     return trainer
 
 
@@ -196,7 +212,7 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     Raises:
         RunError: If they cannot be written; the ones of before are whole.
     """
-    save_tensors(folder.path / "checkpoint.pt", {"schema": SCHEMA, **trainer.state_dict()})
+    save_tensors(folder.path / "checkpoint.pt", {"schema": CHECKPOINT_SCHEMA, **trainer.state_dict()})
     ppo, env = trainer.config.ppo, trainer.env
     policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
     save_policy(folder.path / "policy.pt", policy)
