@@ -45,8 +45,9 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     pixel = max(terrain.size) / (LENGTH if stacked else 0.55 * LENGTH)  # [m]
     views = [_draw(terrain, colours, pixel / SAMPLES, *angles) for angles in ((0.0, math.pi / 2), (TURN, TILT))]
     heights, widths = zip(*[picture.shape[:2] for picture, _ in views], strict=True)
-    total = (max(widths), sum(heights)) if stacked else (sum(widths), max(heights))
-    figure = Figure([(side / SAMPLES + WORDS) / DPI for side in total], dpi=DPI, layout="constrained")
+    width, height = (max(widths), sum(heights)) if stacked else (sum(widths), max(heights))
+    inches = (width / SAMPLES + WORDS) / DPI, (height / SAMPLES + WORDS) / DPI
+    figure = Figure(inches, dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)  # draws without a display
     axes = figure.subplots(2, 1, height_ratios=heights) if stacked else figure.subplots(1, 2, width_ratios=widths)
     figure.suptitle(title, fontsize=13)
@@ -126,22 +127,21 @@ def _scale_bar(axis: Any, left: float, right: float, bottom: float, top: float) 
 
 
 def _name_tiles(axis: Any, terrain: Terrain) -> None:
-    """Numbers of the levels beside the tiles, names of the shapes above or beside them."""
+    """Numbers of the levels and names of the shapes, beside and above the tiles."""
     if terrain.origins.shape[:2] == (1, 1):
         return  # the title says it all
     x, y = np.moveaxis(terrain.origins[..., :2] - terrain.corner - np.divide(terrain.size, 2), -1, 0)
-    levels = [
-        (x[level].mean(), f"level {level}\nd = {difficulty:.2g}") for level, difficulty in enumerate(terrain.difficulty)
-    ]
-    columns = [
-        (y[:, list(group)].mean(), name)
-        for name, group in groupby(range(len(terrain.shapes)), key=lambda column: terrain.shapes[column])
-    ]
-    wide = _is_wide(terrain)
-    half_width, half_height = max(terrain.size) / 2, min(terrain.size) / 2
-    for place, text in columns if wide else levels:
-        axis.text(-1.03 * half_width, place if wide else -place, text, ha="right", va="center", fontsize=9)
-    narrow = not wide and len(terrain.shapes) > 4
-    words = {"rotation": 40, "rotation_mode": "anchor", "ha": "left"} if narrow else {"ha": "center"}
-    for place, text in levels if wide else columns:
-        axis.text(place, half_height + 0.03 * half_width, text, va="bottom", fontsize=9, **words)
+    levels = [f"level {number}\nd = {difficulty:.2g}" for number, difficulty in enumerate(terrain.difficulty)]
+    groups = [(name, list(group)) for name, group in groupby(range(y.shape[1]), key=lambda j: terrain.shapes[j])]
+    columns, middles = [name for name, _ in groups], [y[:, group].mean() for _, group in groups]
+    axis.set_axis_on()
+    axis.set_frame_on(False)
+    axis.xaxis.tick_top()
+    axis.tick_params(length=0, labelsize=9)
+    if _is_wide(terrain):
+        axis.set_xticks(x.mean(axis=1), levels)
+        axis.set_yticks(middles, columns)
+    else:
+        narrow = {"rotation": 40, "rotation_mode": "anchor", "ha": "left"} if len(columns) > 4 else {}
+        axis.set_xticks(middles, columns, **narrow)
+        axis.set_yticks(-x.mean(axis=1), levels)

@@ -371,24 +371,6 @@ def test_true_process_says_one_line(copied, arguments):
     assert contents(copied.parent) == before
 
 
-SIM = ("warp", "tyro", "rich", "tensorboard", "matplotlib", "PIL", "mujoco", "mujoco_warp", "trimesh", "scipy")
-
-
-@pytest.mark.parametrize("arguments", [[], ["--help"], ["--version"], ["train"], ["evaluate", "run"], ["terrain"]])
-def test_base_install_names_its_extra(here, capsys, arguments):
-    """With torch and NumPy alone, help and version are there, and the commands say in one line what to install."""
-    code = f"import sys; sys.modules.update(dict.fromkeys({SIM})); from deimos.app import cli; "
-    command = [sys.executable, "-c", code + f"sys.exit(cli.main({arguments}))"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if arguments[:1] in ([], ["--help"], ["--version"]):
-        assert cli.main(arguments) == 0
-        assert (done.returncode, done.stdout, done.stderr) == (0, *capsys.readouterr())
-    else:
-        assert (done.returncode, done.stdout) == (2, "")
-        line = r"deimos: This needs \w+, which is not installed: pip install 'deimos-rl\[sim\]'\n"
-        assert re.fullmatch(line, done.stderr), done.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "package"),
     [

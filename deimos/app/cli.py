@@ -3,7 +3,7 @@
 Whatever the user can mend (a flag, a folder, a disk, a missing package) ends in one line on stderr and exit code 2.
 """
 
-import importlib
+import importlib.util
 import sys
 import threading
 
@@ -21,7 +21,7 @@ COMMANDS = {
 """By name: the module whose ``main`` is the command, imported when it is asked for, and a line about it."""
 
 EXTRAS = {
-    "warp": "sim", "tyro": "sim", "rich": "sim", "tensorboard": "sim", "matplotlib": "sim", "PIL": "sim",
+    "warp": "sim", "tyro": "sim", "rich": "sim", "tensorboard": "sim", "matplotlib": "sim", "PIL": "legged",
     "mujoco": "legged", "mujoco_warp": "legged", "trimesh": "legged", "imageio_ffmpeg": "legged", "scipy": "study",
 }  # fmt: skip
 """The extra of ``deimos-rl`` that installs a package."""
@@ -60,6 +60,8 @@ def _run(arguments: list[str]) -> None:
     if arguments[:1] == ["--version"]:
         print(__version__)
         return
+    if importlib.util.find_spec("tyro") is None:  # no command works on the base install
+        raise ModuleNotFoundError("No module named 'tyro'", name="tyro")
     commands = {name: (about, _command(module)) for name, (module, about) in COMMANDS.items()}
     about = f"Deimos {__version__}: robot policies trained under a Director that chooses their goals by fear."
     console.dispatch(commands, about, arguments, "deimos")

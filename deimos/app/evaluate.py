@@ -1,7 +1,7 @@
 """``deimos evaluate``: the policy of a run under Naive and the Adversary, or its fear network against what happened."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from deimos.run import api, audit, training
 from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
@@ -100,7 +101,7 @@ def main(arguments: list[str], program: str) -> None:
     print(folder.path)
 
 
-def title(config: training.TrainConfig) -> str:
+def title(config: TrainConfig) -> str:
     """What stands above the figures of a run."""
     return f"{kind(config.env)} {getattr(config.env, 'variant', '')}, {config.label}, seed {config.seed}"
 
@@ -113,50 +114,48 @@ def evaluate_run(folder: RunFolder, env_config: EnvConfig, eval_config: EvalConf
     return rows
 
 
-def _evaluate_fear(trainer: training.Trainer, folder: RunFolder, options: EvaluateOptions) -> None:
+def _evaluate_fear(trainer: Trainer, folder: RunFolder, options: EvaluateOptions) -> None:
     """Audit the fear network within contexts, or its probabilities."""
     if options.contexts:
         found = audit.audit_fear(trainer, options.contexts)
         folder.write_json("audit.json", found)
-        lines = [(label, _cell(found[name], form)) for label, name, form in _AUDIT]
-        _print_table("Fear network against exact outcomes", [], lines)
+        _print_table("Fear network against exact outcomes", {"": found}, _AUDIT)
         return
     judged = audit.audit_calibration(trainer, options.calibration)
     qualities = {name: quality for name, (_, _, quality) in judged.items()}
     folder.write_json("calibration.json", qualities)
-    lines = [
-        (name.replace("_", " "), *[_cell(each[name], ".0f" if name == "interactions" else ".4f")
-                                   for each in qualities.values()])
-        for name in next(iter(qualities.values()))
-    ]  # fmt: skip
-    _print_table("Fear network's probabilities", ["goals", *qualities], lines)
+    names = next(iter(qualities.values()))
+    lines = [(name.replace("_", " "), name, ".0f" if name == "interactions" else ".4f") for name in names]
+    _print_table("Fear network's probabilities", qualities, lines)
     print(figures.draw_calibration(folder, {name: (p, crashed) for name, (p, crashed, _) in judged.items()}))
 
 
 def _print_evaluation(rows: list[dict]) -> None:
-    """Print Naive beside Adversary."""
-    lines = [(label, *[_cell(row.get(name), form) for row in rows]) for label, name, form in _EVALUATION]
-    lines = [line for line in lines if set(line[1:]) != {"-"}]
-    for name in rows[0].get("errors", {}):
-        lines.append((f"median error, {name}", *[_cell(row["errors"][name], ".3f") for row in rows]))
-    groups = len(rows[0]["tracking"])
-    for i in range(groups if groups > 1 else 0):  # a single one is the reward
-        lines.append((f"tracking of goal group {i}", *[_cell(row["tracking"][i], ".3f") for row in rows]))
-    _print_table("Evaluation", ["", *[row["goals"].capitalize() for row in rows]], lines)
+    """Print Naive beside Adversary, without what neither has."""
+    columns, more = {}, {}
+    for row in rows:
+        more = {f"median error, {name}": error for name, error in row.get("errors", {}).items()}
+        if len(row["tracking"]) > 1:  # a single one is the reward
+            more |= {f"tracking of goal group {i}": value for i, value in enumerate(row["tracking"])}
+        columns[row["goals"].capitalize()] = row | more
+    lines = [*_EVALUATION, *[(name, name, ".3f") for name in more]]
+    lines = [line for line in lines if any(_cell(row.get(line[1]), line[2]) != "-" for row in columns.values())]
+    _print_table("Evaluation", columns, lines)
     if any(row.get("weak_adversary") for row in rows):
         print("weak Adversary: inconclusive; it has seen too few crashes, or its AUROC is too low")
 
 
-def _print_table(name: str, header: list[str], lines: Sequence[tuple[str, ...]]) -> None:
-    """Print labels at the left and numbers at the right."""
+def _print_table(title: str, columns: dict[str, dict], lines: Iterable[tuple[str, str, str]]) -> None:
+    """Print values side by side; a line is its label, the key of its values and their format."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=name, title_justify="left", show_header=bool(header))
-    for number, label in enumerate(header or lines[0]):
-        table.add_column(label if header else "", justify="right" if number else "left")
-    for line in lines:
-        table.add_row(*line)
+    table = Table(title=title, title_justify="left", show_header=any(columns))
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for label, key, form in lines:
+        table.add_row(label, *[_cell(values.get(key), form) for values in columns.values()])
     Console().print(table)
 
 

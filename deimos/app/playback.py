@@ -19,7 +19,8 @@ from deimos.goals.selectors import uniform
 from deimos.learn.policy import load_policy
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.training import TrainConfig, load_checkpoint, read_config
+from deimos.run.trainer import TrainConfig
+from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
 
 RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -181,7 +181,7 @@ def _shape_options(name: str) -> type:
     """``TileOptions`` with the parameters of a shape, whose direction is in its name."""
     cls = catalog.shape_class(name)
     direction = getattr(catalog.make(name), "direction", None)
-    fixed = [("direction", tyro.conf.Suppress[Literal["up", "down"]], dataclasses.field(default=direction))]
+    fixed = [("direction", Annotated[Literal["up", "down"], tyro.conf.Suppress], dataclasses.field(default=direction))]
     about = f"{name}: " + (cls.__doc__ or "").partition("\n\n")[0]
     return dataclasses.make_dataclass(
         "ShapeOptions", fixed if direction else [], bases=(TileOptions, cls), frozen=True, kw_only=True,

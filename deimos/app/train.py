@@ -1,6 +1,5 @@
 """``deimos train``: train a policy and evaluate it, or resume an earlier run."""
 
-import argparse
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from deimos.checks import RunError
 from deimos.goals import selectors
 from deimos.run import presets, training
 from deimos.run.folder import RunFolder
-from deimos.run.training import TrainConfig
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
 from deimos.sim.shared import one_stream
 
@@ -46,16 +45,26 @@ class FolderOptions(TrainConfig):
     """Start with the networks of the run in this folder."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FirstOptions:
+    """What decides which other options there are."""
+
+    resume: Path | None = None
+    """See ``ResumeOptions``."""
+    preset: str | None = None
+    """Name of a ready configuration to start from."""
+
+
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos train``."""
-    if any(argument.split("=")[0] == "--resume" for argument in arguments):
+    first, rest = console.parse(FirstOptions, arguments, program, add_help=False, return_unknown_args=True)
+    if first.resume is not None:
         _resume(console.parse(ResumeOptions, arguments, program))
         return
-    _check_names(arguments)
-    arguments, config = _take_preset(arguments)
-    options = _train_options()
+    _check_names(rest)
+    options, config = _train_options(), _preset(first.preset, rest)
     default = options(**{field.name: getattr(config, field.name) for field in fields(config)})
-    _train(console.parse(options, arguments, program, default=default))
+    _train(console.parse(options, rest, program, default=default))
 
 
 def _train(options: Any) -> None:
@@ -72,7 +81,7 @@ def _resume(options: ResumeOptions) -> None:
         _run(*training.resume(options.resume, options.env_steps, options.device))
 
 
-def _run(trainer: training.Trainer, folder: RunFolder) -> None:
+def _run(trainer: Trainer, folder: RunFolder) -> None:
     """Train, evaluate, draw and say where everything is."""
     config = trainer.config
     with console.stop_on_interrupt() as stopped:
@@ -90,7 +99,7 @@ def _run(trainer: training.Trainer, folder: RunFolder) -> None:
 
 
 @contextlib.contextmanager
-def _training_bar(trainer: training.Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
+def _training_bar(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
     """Iteration, frames per second, reward, crashes per 1000 transitions, time left."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -132,21 +141,15 @@ def _subcommands(package: Any, *more: Any) -> Any:
     return Union[tuple([*more, *options])]  # noqa: UP007 (a union of a computed list)
 
 
-def _take_preset(arguments: list[str]) -> tuple[list[str], TrainConfig]:
-    """The arguments without ``--preset NAME``, and what they start from: that preset, or the environment's own."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--preset")
-    try:
-        found, rest = parser.parse_known_args(arguments)
-    except argparse.ArgumentError as error:
-        raise RunError(f"--preset needs a name; there are: {', '.join(presets.names())}.") from error
-    env = next((argument.removeprefix("env:") for argument in rest if argument.startswith("env:")), None)
+def _preset(name: str | None, arguments: list[str]) -> TrainConfig:
+    """What the options start from: the preset of a name, or that of the environment."""
+    env = next((argument.removeprefix("env:") for argument in arguments if argument.startswith("env:")), None)
     env = env and env.replace("-", "_")  # the name of its module
-    name = found.preset or env or "particle"
+    name = name or env or "particle"
     try:
         if env is not None and presets.environment(name) != env:
             raise RunError(f"The preset '{name}' is for env:{presets.environment(name)}, not for env:{env}.")
-        return rest, presets.preset(name)
+        return presets.preset(name)
     except ValueError as error:
         raise RunError(str(error)) from error
 
