@@ -56,30 +56,29 @@ def change_of_level(
 
 @wp.func
 def next_level(
-    worlds: Worlds,
-    params: LocomotionParams,
-    env: int,
-    num_levels: int,
-    num_columns: int,
-    crashed: wp.bool,
-    counts: wp.bool,
-    distance: float,
-    state: LocomotionState,
+    worlds: Worlds, params: LocomotionParams, ground: Ground, sim: Simulation, state: LocomotionState, env: int
 ) -> int:
-    """The level that a world's next episode is played on; the last one's outcome may not count."""
+    """The level that a world's next episode is played on.
+
+    A reset in the middle of an episode, or of an invalid world, says nothing about how it went: the level stays.
+    """
     world = worlds.world_offset + env
     episode = worlds.episode_count[env]
+    num_levels = ground.origin.shape[0]
+    column = world % ground.origin.shape[1]
     if params.level_rule == wp.static(int(LevelRule.FROZEN)):
-        return (world // num_columns) % num_levels
+        return (world // ground.origin.shape[1]) % num_levels
     u = uniform4(worlds.seed, wp.static(int(Purpose.LEVEL)), world, episode, 0, 0)
     if episode == 0:
         return wp.min(int(u[0] * float(params.start_levels)), num_levels - 1)
     level = state.level[env]
     seen = state.tracked[env]
-    if not counts or seen[1] == 0.0:
+    crashed = worlds.terminated[env]
+    if worlds.invalid[env] or seen[1] == 0.0 or not (crashed or worlds.truncated[env]):
         return level
-    speed = wp.sqrt(worlds.goal[env, 0] * worlds.goal[env, 0] + worlds.goal[env, 1] * worlds.goal[env, 1])
-    wanted = speed * params.dt * float(worlds.time_limit)
+    start = ground.origin[wp.min(level, num_levels - 1), column]
+    distance = wp.length(wp.vec2(sim.qpos[env, 0] - start[0], sim.qpos[env, 1] - start[1]))
+    wanted = wp.length(wp.vec2(worlds.goal[env, 0], worlds.goal[env, 1])) * params.dt * float(worlds.time_limit)
     level += change_of_level(params.level_rule, crashed, seen[0] / seen[1], distance, wanted, params.half_tile)
     if level >= num_levels:  # who has passed the last level is not kept there
         return wp.min(int(u[0] * float(num_levels)), num_levels - 1)
@@ -101,15 +100,9 @@ def highest_ground(params: LocomotionParams, heights: wp.array2d[float], x: floa
 
 @wp.func
 def place_robot(
-    worlds: Worlds,
-    params: LocomotionParams,
-    joints: Joints,
-    ground: Ground,
-    env: int,
-    episode: int,
-    origin: wp.vec3,
+    worlds: Worlds, params: LocomotionParams, joints: Joints, ground: Ground, env: int, episode: int, origin: wp.vec3,
     sim: Simulation,
-):
+):  # fmt: skip
     """Draw where and how a robot starts, within its joints' ranges.
 
     As in Legged Gym the legs' joints are at 0.5 to 1.5 of their pose; an arm's are near theirs.
@@ -169,17 +162,7 @@ def _update_levels(
     env = wp.tid()
     if not worlds.mask[env]:
         return
-    num_levels = ground.origin.shape[0]
-    num_columns = ground.origin.shape[1]
-    column = (worlds.world_offset + env) % num_columns
-    start = ground.origin[wp.min(state.level[env], num_levels - 1), column]
-    dx = sim.qpos[env, 0] - start[0]
-    dy = sim.qpos[env, 1] - start[1]
-    distance = wp.sqrt(dx * dx + dy * dy)
-    # A reset in the middle of an episode, or of an invalid world, says nothing about how it went.
-    crashed = worlds.terminated[env]
-    counts = (crashed or worlds.truncated[env]) and not worlds.invalid[env]
-    state.level[env] = next_level(worlds, params, env, num_levels, num_columns, crashed, counts, distance, state)
+    state.level[env] = next_level(worlds, params, ground, sim, state, env)
 
 
 def update_levels(legged: LeggedWorlds) -> None:

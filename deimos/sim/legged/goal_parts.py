@@ -19,9 +19,9 @@ from deimos.sim.legged.robots import Robot
 class Launches:
     """What a part does in the worlds that it was bound to."""
 
-    evaluate: Callable[[], None] | None = None
+    evaluate: Callable[[], None] = lambda: None
     """Evaluates a step: writes the part's terms, tracking and observation; before the step as a whole is evaluated."""
-    reset: Callable[[], None] | None = None
+    reset: Callable[[], None] = lambda: None
     """Finishes the reset of the worlds of the mask: their first goals and observations."""
     validate: Callable[[wp.array, wp.array, wp.array], wp.Launch] | None = None
     """Records what makes goals of uniform candidates valid: of the rows, half side of the box, and the candidates."""

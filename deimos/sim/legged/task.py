@@ -189,8 +189,7 @@ class Locomotion(WarpEnv):
         apply_actions(self.legged)
         self.physics.step()
         for part in self._launches:
-            if part.evaluate:
-                part.evaluate()
+            part.evaluate()
         evaluate_step(self.legged)
         finish_obs(self.legged, self.worlds.invalid, wanted=False)
 
@@ -199,8 +198,7 @@ class Locomotion(WarpEnv):
         self.physics.reset(self.worlds.mask)
         reset_worlds(self.legged)
         for part in self._launches:
-            if part.reset:
-                part.reset()
+            part.reset()
         finish_obs(self.legged, self.worlds.mask, wanted=True)
 
     def describe_fault(self, world: int) -> str:

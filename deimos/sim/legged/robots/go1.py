@@ -66,8 +66,8 @@ def build(*, stiffness: float = STIFFNESS, damping: float = DAMPING, action_scal
         Joint(
             name=f"{leg}_{joint}",
             pose=(_left(leg) if joint == "hip" else 1) * POSE[joint],
-            action_scale=action_scale,
             range=RANGE[joint],
+            action_scale=action_scale,
             stiffness=stiffness,
             damping=damping,
             max_torque=MAX_TORQUE[joint],

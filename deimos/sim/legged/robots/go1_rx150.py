@@ -162,13 +162,8 @@ def mount(robot: Robot) -> Robot:
     )
     add_actuators(spec, joints)
     mounted = (MOUNT[0] + OFFSETS[0][0], MOUNT[1] + OFFSETS[0][1], MOUNT[2] + OFFSETS[0][2])
-    arm = Arm(
-        offsets=(mounted, *OFFSETS[1:]),
-        axes=tuple(_axis(i) for i in range(len(JOINTS))),
-        shoulder=SHOULDER,
-        body=BODY,
-        radius=GRIPPER_RADIUS,
-    )
+    axes = tuple(_axis(i) for i in range(len(JOINTS)))
+    arm = Arm(offsets=(mounted, *OFFSETS[1:]), axes=axes, shoulder=SHOULDER, body=BODY, radius=GRIPPER_RADIUS)
     parts = ((*robot.parts[0], *CAPSULES), *robot.parts[1:])
     return dataclasses.replace(robot, joints=robot.joints + joints, parts=parts, arm=arm)
 
