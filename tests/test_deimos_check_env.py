@@ -1,0 +1,190 @@
+"""``check_env``: all our environments keep the contract, and what a plug-in forgot is named."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from deimos.sim.check_env import check_env
+from deimos.sim.envs import particle, quad, quad_arm
+
+PAGE = Path(__file__).parent.parent / "docs" / "add_an_environment.md"
+OURS = {
+    "directional": particle.Config(),
+    "absolute": particle.Config(variant="absolute", obs_scale="raw", reward="exponential"),
+    "relative": particle.Config(variant="relative", spawn_range=50.0, time_limit=30, stagger_goals=True),
+    "quad": quad.Config(),
+    "quad-arm": quad_arm.Config(),
+}
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_our_environments_keep_the_contract(torch_device, name):
+    """Nothing is found in the environments of the tree."""
+    check_env(OURS[name].build(2, torch_device, 0))
+
+
+@pytest.fixture
+def plant(tmp_path):
+    """A function that builds the page's cart with one piece of its source replaced."""
+    source = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
+
+    def build(device, old, new):
+        assert source.count(old) >= 1, old
+        path = tmp_path / "broken_cart.py"
+        path.write_text(source.replace(old, new))
+        spec = importlib.util.spec_from_file_location("broken_cart", path)
+        sys.modules["broken_cart"] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.Config().build(8, device, 0)
+
+    yield build
+    sys.modules.pop("broken_cart", None)
+
+
+def test_the_sound_cart_passes(torch_device, plant):
+    """What the bugs below are planted into has none."""
+    check_env(plant(torch_device, "", ""))
+
+
+# In the kernels or the constructor.
+FORGOTTEN = {
+    "a scale": ('"velocity", 1, "m/s", 1.0', '"velocity", 1, "m/s", (1.0, 1.0)', "layout: velocity must have a scale"),
+    "the actor's goal": ('"goal", 1, "m", 1 / HALF_LENGTH)', '"goal", 1, "m", 1.0, seen_by="critic")', "seen by both"),
+    "begin_episode": (
+        "begin_episode(env, worlds)  #", "worlds.episode_count[env]  #", "an episode must have begun in every world",
+    ),
+    "half of obs": ("obs[env, 1] = cart.velocity[env]", "obs[env, 1] = 0.0 / 0.0", "the first observation must be"),
+    "the draw of goals": ("goal_range=(1.2 * HALF_LENGTH,)", "goal_range=(0.0,)", "first goals must differ and be se"),
+    "world_offset": ("worlds.world_offset + env", "env", r"draws must be addressed by world_offset \+ env"),
+    "the reset's state": ("cart.velocity[env] = 0.0", "pass", "restart must begin the first episodes again, but"),
+    "write_goal": ("            write_goal(env, worlds)\n", "", "first goals must differ and be seen"),
+    "the mask": ("if worlds.mask[env]:", "if worlds.num_envs > 0:", "reset must leave the worlds outside its mask"),
+    "end_step": ("        end_step(env, crashed, False, cause, worlds)\n", "", "step 1 must advance episode_step"),
+    "no goal changes": (
+        "end_step(env", "worlds.goal_count[env] = worlds.goal_count[env] + 1\n        end_step(env",
+        "step must not reset a world or change a goal, but goal_count changed",
+    ),
+    "a reward": ("worlds.reward[env] = 1.0", "worlds.reward[env] = -1.0", "Step.reward must be finite and at least 0"),
+    "the cause": ("cause = wp.static(ACTION)", "cause = 0", "check must stop the run after an action that is not fin"),
+    "an array to resume": ("StructTable(Cart))", "StructTable(Cart), resume=False)", "clones must move alike, but obs"),
+    "groups": (
+        '    """Carts; see ``Config``."""\n', "    goal_groups = (slice(0, 1), slice(0, 1))\n",
+        "goal_groups must name every component of a goal once",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("forgotten", FORGOTTEN)
+def test_what_a_plug_in_forgot_is_named(torch_device, plant, forgotten):
+    """A bug planted in the source of an environment is found, and the message says what is missing."""
+    old, new, message = FORGOTTEN[forgotten]
+    env = plant(torch_device, old, new)
+    with pytest.raises(ValueError, match=f"CartEnv: .*({message})"):
+        check_env(env)
+
+
+def wrap(method, after):
+    """A method that does ``after(self, result, *arguments)`` to what it gives back."""
+    return lambda self, *arguments: after(self, method(self, *arguments), *arguments)
+
+
+def forget_rows(self, result, rows, count, scale=None):
+    """Goals that depend on who else asks."""
+    return result + 0.01 * len(rows)
+
+
+def forget_count(self, result, rows, count, scale=None):
+    """Goals that depend on how many are asked for."""
+    return result + 0.01 * count
+
+
+def forget_to_count(self, result, rows, goal):
+    """New goals that do not count."""
+    self.tensors["goal_count"][rows] -= 1
+
+
+def forget_others(self, result, rows, goal):
+    """New goals that move other worlds."""
+    self.tensors["position"] += 1
+
+
+def forget_to_show(self, result, rows, goal):
+    """New goals that are not seen."""
+    self.obs[rows, 9:] = 0.5
+
+
+def forget_the_view(self, result, *arguments):
+    """A state that is rebound at every step."""
+    self.tensors["position"] = self.tensors["position"].clone()
+    return result
+
+
+def forget_the_seed(self, result, *arguments):
+    """A step that draws from a global generator."""
+    self.tensors["position"] += torch.rand(1)
+    return result
+
+
+def forget_the_clock(self, result, *arguments):
+    """A goal that is due a step too early."""
+    result.goal_due[:] = self.tensors["goal_clock"] >= self.goal_period - 1
+    return result
+
+
+def forget_the_limit(self, result, *arguments):
+    """Episodes that never end."""
+    result.truncated[:] = False
+    return result
+
+
+def forget_the_difference(self, result, *arguments):
+    """A crash that is a truncation too."""
+    result.terminated[:] = result.truncated[:] = True
+    return result
+
+
+def forget_the_first_goal_count(self, result, *arguments):
+    """First goals that count."""
+    self.tensors["goal_count"] += self._views["mask"]
+
+
+def forget_the_copy(self, result):
+    """A state dictionary of views."""
+    return dict(self.tensors)
+
+
+BUGS = [
+    ("sample_goals", forget_rows, "sample_goals must not depend on who else asks"),
+    ("sample_goals", forget_count, "sample_goals must give the first ones of a longer list"),
+    ("set_goals", forget_to_count, "sample_goals must give other goals once a goal was set: count it"),
+    ("set_goals", forget_others, "set_goals must leave the other worlds alone, but position changed"),
+    ("set_goals", forget_to_show, "set_goals must show the goals that it was given"),
+    ("step", forget_the_view, "position must stay where it is: write into it, never rebind it"),
+    ("step", forget_the_seed, "the same seed must give the same numbers"),
+    ("step", forget_the_clock, "a goal must be not be due before T = 6 steps, but not so after 5 steps"),
+    ("step", forget_the_limit, "episodes must be truncated at the time limit of 30 steps"),
+    ("step", forget_the_difference, "a world that crashed must not be truncated too"),
+    ("reset", forget_the_first_goal_count, "first goals must not count in goal_count"),
+    ("state_dict", forget_the_copy, "state_dict must give copies"),
+]
+
+
+@pytest.mark.parametrize(("method", "bug", "message"), BUGS, ids=[bug.__name__ for _, bug, _ in BUGS])
+def test_bugs_in_methods_are_named(torch_device, monkeypatch, method, bug, message):
+    """A method that does not keep its promise is found, and the message says which one it is."""
+    env = OURS["relative"].build(2, torch_device, 0)
+    monkeypatch.setattr(particle.Particle, method, wrap(getattr(particle.Particle, method), bug))
+    with pytest.raises(ValueError, match=f"Particle: .*({message})"):
+        check_env(env)
+
+
+def test_the_configuration_must_be_one(torch_device):
+    """An environment whose ``config`` is none cannot be built again, and the message says so."""
+    env = OURS["absolute"].build(2, torch_device, 0)
+    env.config = {}
+    with pytest.raises(ValueError, match="config must be the environment's EnvConfig, got dict"):
+        check_env(env)
