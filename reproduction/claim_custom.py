@@ -183,7 +183,7 @@ def _parabola(*samples: Array, x: Array) -> Array:
     return np.einsum("kn,...n->...k", solve, np.concatenate(samples, axis=-1))
 
 
-def vertex(samples: dict[str, Array], resamples: int = stats.RESAMPLES) -> tuple[Interval, Array, Array]:
+def vertex(samples: dict[str, Array], resamples: int | None = None) -> tuple[Interval, Array, Array]:
     """Where the parabola through log crashes over the achieved percentile has its vertex.
 
     Returns:
@@ -224,7 +224,7 @@ def hump(data: Data, environment: str) -> list[Finding]:
         curvature = "curvature of log crashes over the achieved percentile > 0"
         found += tests.resampled(curvature, where, "curvature", list(samples.values()),
                                  lambda *s, x=x: _parabola(*s, x=x)[..., 0], math.log(2))  # fmt: skip
-        interval, slopes, places = vertex(samples, stats.RESAMPLES)
+        interval, slopes, places = vertex(samples)
         falls, rises = tests.above_zero(-slopes[0]), tests.above_zero(slopes[1])
         found += [Finding(
             what="the lowest point lies inside", where=where, effect="vertex [achieved percentile]", interval=interval,

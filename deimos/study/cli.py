@@ -107,14 +107,6 @@ class ReportOptions:
     """Folder of the study, or of its exported tables."""
     out: Path | None = None
     """Where to write. By default the folder itself."""
-    resamples: int = 10_000
-    """Bootstrap resamples, at least 1000."""
-    seed: int = 0
-    """Seed of the bootstrap."""
-
-    def __post_init__(self) -> None:
-        check_at_least("resamples", self.resamples, 1000)
-        check_at_least("seed", self.seed, 0)
 
 
 def run(options: RunOptions, stopped: Callable[[], bool] = lambda: False) -> None:
@@ -243,7 +235,7 @@ def report(options: ReportOptions) -> None:
     """
     from deimos.study.report import write
 
-    print(write(options.folder, options.out or options.folder, resamples=options.resamples, seed=options.seed))
+    print(write(options.folder, options.out or options.folder))
 
 
 COMMANDS: dict[str, tuple[type, Callable[..., None]]] = {
