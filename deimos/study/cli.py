@@ -271,12 +271,7 @@ def _summary(progress: Progress) -> str:
     parts = [f"{progress.finished} of {progress.total} cells finished"]
     if progress.failed:
         parts.append(f"{len(progress.failed)} failed")
-    parts += [
-        f"{cell.name} {100 * cell.iteration // cell.iterations} %" if cell.iteration < cell.iterations
-        else f"{cell.name} evaluating" for cell in progress.running
-    ]  # fmt: skip
-    if fps := sum(cell.fps for cell in progress.running if cell.iteration < cell.iterations):
-        parts.append(f"{fps:.0f} FPS")
+    parts += [f"{name} {share:.0%}" if share < 1 else f"{name} evaluating" for name, share in progress.running.items()]
     if progress.seconds_left:
         hours, rest = divmod(int(progress.seconds_left), 3600)
         parts.append(f"{hours}:{rest // 60:02d}:{rest % 60:02d} left")
