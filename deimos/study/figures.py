@@ -6,7 +6,7 @@ Every method has one colour and one marker throughout: those of the data's ``Sty
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -146,7 +146,7 @@ def training(data: Data, environment: str) -> "Figure":
     return figure
 
 
-def _panels(style: Style, sharey: str | bool) -> "tuple[Figure, Any]":
+def _panels(style: Style, sharey: Literal["row", "all"]) -> "tuple[Figure, Any]":
     """Two rows of as many axes as there are panels of methods."""
     import matplotlib.pyplot as plt
 
@@ -184,7 +184,7 @@ def profiles(data: Data, environment: str, period: int) -> "Figure | None":
     """Performance profiles: share of the policies whose crashes per 1000 transitions exceed a threshold."""
     import matplotlib.pyplot as plt
 
-    figure, axes = _panels(data.style, sharey=True)
+    figure, axes = _panels(data.style, sharey="all")
     thresholds = np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 120)])
     drawn = 0
     for row, goals in enumerate(GOALS):
