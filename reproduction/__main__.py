@@ -39,7 +39,7 @@ def report_claims(options: ReportOptions) -> None:
     Raises:
         RunError: If there are no results, or the folder cannot be written.
     """
-    print(write(options.folder, options.out or options.folder, resamples=options.resamples, seed=options.seed))
+    print(write(options.folder, options.out or options.folder))
 
 
 def print_coverage(options: CoverageOptions) -> None:

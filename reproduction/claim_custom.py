@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -183,7 +184,12 @@ def _parabola(*samples: Array, x: Array) -> Array:
     return np.einsum("kn,...n->...k", solve, np.concatenate(samples, axis=-1))
 
 
-def vertex(samples: dict[str, Array], resamples: int = stats.RESAMPLES) -> tuple[Interval, Array, Array]:
+def _slope(c: Array, at: float) -> Array:
+    """Of a parabola, at a place in half ranges from the middle."""
+    return 2 * at * c[..., 0] + c[..., 1]
+
+
+def vertex(samples: dict[str, Array], resamples: int | None = None) -> tuple[Interval, Array, Array]:
     """Where the parabola through log crashes over the achieved percentile has its vertex.
 
     Returns:
@@ -205,7 +211,7 @@ def vertex(samples: dict[str, Array], resamples: int = stats.RESAMPLES) -> tuple
     low, high = np.quantile(places, [0.025, 0.975])
     own = float(place(_parabola(*samples.values(), x=x)))
     ends = [(ACHIEVED[name] - 50.0) / 50.0 for name in ("coop", "antagonist")]
-    slopes = np.stack([resampled(lambda c, end=end: 2 * end * c[..., 0] + c[..., 1]) for end in ends])
+    slopes = np.stack([resampled(partial(_slope, at=end)) for end in ends])
     return Interval(own, float(low), float(high)), slopes, places
 
 
@@ -224,7 +230,7 @@ def hump(data: Data, environment: str) -> list[Finding]:
         curvature = "curvature of log crashes over the achieved percentile > 0"
         found += tests.resampled(curvature, where, "curvature", list(samples.values()),
                                  lambda *s, x=x: _parabola(*s, x=x)[..., 0], math.log(2))  # fmt: skip
-        interval, slopes, places = vertex(samples, stats.RESAMPLES)
+        interval, slopes, places = vertex(samples)
         falls, rises = tests.above_zero(-slopes[0]), tests.above_zero(slopes[1])
         found += [Finding(
             what="the lowest point lies inside", where=where, effect="vertex [achieved percentile]", interval=interval,

@@ -30,7 +30,7 @@ def compare(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
     """Values of one sample are larger than those of another: rank-sum test, P(x > y)."""
     if min(len(x), len(y)) < LEAST:
         return []
-    interval = stats.probability_of_improvement([(x, y)], resamples=stats.RESAMPLES)
+    interval = stats.probability_of_improvement([(x, y)])
     p = significance.mann_whitney(x, y)
     return [Finding(
         what=what, where=where, effect="P(x > y)", interval=interval,
@@ -69,7 +69,7 @@ def spread(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
     """One sample varies more than another: Brown and Forsythe's test; the interval of the ratio only describes."""
     if min(len(x), len(y)) < LEAST:
         return []
-    log_ratio = stats.bootstrap([x, y], significance.log_iqr_ratio, resamples=stats.RESAMPLES)
+    log_ratio = stats.bootstrap([x, y], significance.log_iqr_ratio)
     with np.errstate(over="ignore"):
         interval = Interval(*np.exp([log_ratio.estimate, log_ratio.low, log_ratio.high]).tolist())
     distance = [np.abs(z - np.median(z)).mean() for z in (x, y)]
@@ -86,7 +86,7 @@ def positive(what: str, where: Where | str, effect: str, x: Array, wanted: float
     """The mean of a sample is above ``at``: one-sample t test, with the interval by the bootstrap-t."""
     if len(x) < LEAST:
         return []
-    interval = stats.bootstrap_t(x, resamples=stats.RESAMPLES)
+    interval = stats.bootstrap_t(x)
     if np.ptp(x) == 0.0:
         p_for, p_against = float(x.mean() <= at), float(x.mean() >= at)
     else:
@@ -106,7 +106,7 @@ def paired_more(what: str, where: Where | str, x: Array, y: Array) -> list[Findi
     difference = x - y
     moved = difference[difference != 0]
     p = 1.0 if len(moved) == 0 else float(scipy_stats.wilcoxon(moved).pvalue)
-    middle = stats.bootstrap([difference], lambda z: np.median(z, axis=-1), resamples=stats.RESAMPLES)
+    middle = stats.bootstrap([difference], lambda z: np.median(z, axis=-1))
     sign = np.sign(scipy_stats.rankdata(np.abs(moved)) @ np.sign(moved)) if len(moved) else 0.0
     return [Finding(
         what=what, where=where, effect="median log ratio", interval=middle,
@@ -147,7 +147,7 @@ def resampled(
     """A statistic of several samples is positive: its bootstrap distribution."""
     if min((len(x) for x in samples), default=0) < LEAST:
         return []
-    values = stats.distribution(samples, statistic, resamples=stats.RESAMPLES)
+    values = stats.distribution(samples, statistic)
     low, high = np.quantile(values, [0.025, 0.975])
     p_for, p_against = above_zero(values)
     return [Finding(

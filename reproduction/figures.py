@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deimos.study.data import Data, Where
-from deimos.study.figures import GOALS, Figures, Style, logarithmic, of_environment
+from deimos.study.data import Data, Style, Where
+from deimos.study.figures import GOALS, Figures, logarithmic, of_environment
 from deimos.study.stats import Array
 from reproduction.thesis import ACHIEVED, DIRECTOR_METHODS, ENVIRONMENTS
 
@@ -27,19 +27,19 @@ STYLE = Style(
 )  # fmt: skip
 
 
-def figures(data: Data, style: Style, environment: str) -> Figures:
+def figures(data: Data, environment: str) -> Figures:
     """The figures of every study, and the dose-response of the Directors."""
-    found = of_environment(data, style, environment)
+    found = of_environment(data, environment)
     for period in data.periods(environment):
         found[f"dose-{environment}-T{period}"] = (
             f"{environment}, T = {period}: crashes over the percentile of fear that a method's goals have on average; "
             "medians with quartiles, and the parabola of claim C25.",
-            partial(dose_response, data, style, environment, period),
+            partial(dose_response, data, environment, period),
         )
     return found
 
 
-def dose_response(data: Data, style: Style, environment: str, period: int) -> "Figure | None":
+def dose_response(data: Data, environment: str, period: int) -> "Figure | None":
     """Crashes over the achieved percentile of fear, Naive and Adversary side by side."""
     import matplotlib.pyplot as plt
 
@@ -54,8 +54,9 @@ def dose_response(data: Data, style: Style, environment: str, period: int) -> "F
             if len(values):
                 low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
                 panel.errorbar(
-                    ACHIEVED[name], middle, [[middle - low], [high - middle]], color="black", marker=style.marker(name),
-                    markerfacecolor=style.colour(name), markersize=8, capsize=3, linewidth=1,
+                    ACHIEVED[name], middle, [[middle - low], [high - middle]], color="black",
+                    marker=data.style.marker(name), markerfacecolor=data.style.colour(name), markersize=8,
+                    capsize=3, linewidth=1,
                 )  # fmt: skip
         _parabola(panel, {n: x for n, x in samples.items() if n in DIRECTOR_METHODS and len(x)})
         panel.set_title(f"against the {goals.capitalize()}")

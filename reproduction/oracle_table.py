@@ -1,6 +1,6 @@
 """How much of what can be feared does a learnt fear network find? Prints the tables of docs/selectors.md.
 
-    python docs/oracle_table.py runs/population    # after docs/particle_population.py runs/population
+    python -m reproduction.oracle_table runs/population    # after reproduction.particle_population runs/population
 
 For every policy that was trained in Directional under Uniform goals, a fear network is trained as the Adversary's
 is. Then all candidates of the decisions that 200 worlds come to under Uniform goals are tried in clones, so that every
@@ -28,7 +28,8 @@ from deimos.run.training import load, read_config
 from deimos.sim.env import Env
 
 WORLDS, STEPS = 200, 1000
-RULES = {"Uniform": ("percentile", 0.0), "p25": ("percentile", 25.0), "p75": ("percentile", 75.0)} | {
+RULES: dict[str, tuple[picks.Rule, float]] = {
+    "Uniform": ("percentile", 0.0), "p25": ("percentile", 25.0), "p75": ("percentile", 75.0),
     "p90": ("percentile", 90.0), "argmax": ("argmax", 0.0),
 }  # fmt: skip
 

@@ -1,10 +1,10 @@
 """Train and evaluate the populations of docs/particle.md, and print its tables.
 
-    python docs/particle_population.py runs/population            # trains what is missing, then prints
-    python docs/particle_population.py runs/population --audit    # adds the audit of the fear network
-    python docs/particle_population.py runs/population --pilots   # the pilots instead: one seed of many settings
+    python -m reproduction.particle_population runs/population            # trains what is missing, then prints
+    python -m reproduction.particle_population runs/population --audit    # adds the audit of the fear network
+    python -m reproduction.particle_population runs/population --pilots   # the pilots instead: a seed of many settings
 
-A run that was killed goes on from its checkpoint when the command is given again.
+A run that was killed continues from its checkpoint when the command is given again.
 """
 
 import argparse
@@ -46,7 +46,7 @@ PILOTS = [  # each under Uniform goals, seed 0: variant and what differs from th
 
 
 def run(folder: Path, options: list[str]) -> None:
-    """Train and evaluate one policy, or go on with it, unless its evaluation is there."""
+    """Train and evaluate one policy, or continue with it, unless its evaluation is there."""
     if (folder / "evaluation.json").exists():
         return
     begun = (folder / "checkpoint.pt").exists()

@@ -1,8 +1,8 @@
 """Train a committed flat policy on rough ground and print the table of docs/quad.md or docs/quad_arm.md.
 
-    python docs/quad_rough.py runs/rough                 # 20 minutes of one core; go on with the same command
-    python docs/quad_rough.py runs/rough --figure curve.png
-    python docs/quad_rough.py runs/rough_arm --preset quad-arm
+    python -m reproduction.quad_rough runs/rough    # 20 minutes of one core; again to continue
+    python -m reproduction.quad_rough runs/rough --figure curve.png
+    python -m reproduction.quad_rough runs/rough_arm --preset quad-arm
 
 Per-world rewards and levels of every iteration go to worlds.npz in the run's folder, for intervals over worlds.
 """
@@ -13,14 +13,16 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from deimos.run import training
 from deimos.run.folder import RunError
 from deimos.run.presets import preset
+from deimos.sim.legged.config import LocomotionConfig
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parent.parent / "docs" / "results"
 ORIGINS = {"quad": RESULTS / "quad_flat", "quad-arm": RESULTS / "quad_arm_stand"}
 RESAMPLES = 10_000
 RECORDS = ("reward", "level", "invalid", "memory", "seconds")
@@ -45,7 +47,7 @@ class Recorder:
         self.rows["invalid"].append(row["invalid_steps"])
         self.rows["memory"].append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
         self.rows["seconds"].append(self.seconds)
-        np.savez(self.path.with_suffix(".part.npz"), **self.rows)
+        np.savez(self.path.with_suffix(".part.npz"), allow_pickle=False, **self.rows)
         self.path.with_suffix(".part.npz").replace(self.path)
         done, total = trainer.iteration, trainer.config.iterations
         print(f"iteration {done}/{total}, {self.seconds / 60:.1f} min, {fps:.0f} FPS", file=sys.stderr, flush=True)
@@ -124,7 +126,7 @@ def main() -> None:
         trainer, folder = training.resume(args.folder)
     else:
         base = preset(args.preset)
-        env = replace(base.env, terrain="rough", noise=False, start_levels=args.start_levels)
+        env = replace(cast(LocomotionConfig, base.env), terrain="rough", noise=False, start_levels=args.start_levels)
         config = replace(
             base, env=env, method="uniform", num_envs=512, env_steps=100_000, seed=args.seed, threads=1,
             evaluation=False, device="cpu",

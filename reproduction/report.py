@@ -2,12 +2,13 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from deimos.study import report, stats
+from deimos.study import report
+from deimos.study.data import Data
 from deimos.study.document import Block, Bullets, Heading, Paragraph, Table
-from deimos.study.report import Material, interval
+from deimos.study.report import interval
 from reproduction import claims
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import FACTOR, LEAST, PROBABILITY, REWARD_SHARE, SPREAD
@@ -16,19 +17,19 @@ from reproduction.figures import STYLE, figures
 from reproduction.thesis import LEGGED_METHODS, RATIOS_4_1
 
 
-def write(folder: Path, out: Path, *, resamples: int = stats.RESAMPLES, seed: int = 0) -> Path:
+def write(folder: Path, out: Path) -> Path:
     """Write the report; see ``deimos.study.report.write``."""
-    return report.write(folder, out, style=STYLE, page=page, draw=figures, resamples=resamples, seed=seed)
+    return report.write(folder, out, STYLE, page, figures)
 
 
-def page(material: Material) -> list[Block]:
+def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
     """The sections of every study, the claims after what was run, and their tests at the end."""
-    outcomes = [claims.test(claim, material.data.only(LEGGED_METHODS)) for claim in CLAIMS]
+    outcomes = [claims.test(claim, data.only(LEGGED_METHODS)) for claim in CLAIMS]
     return [
-        Heading("A study of goal selection", 1), *report.what_was_run(material), *_verdicts(outcomes),
-        *report.environments(material), *report.over_all(material),
-        *report.speed(material, RATIOS_4_1), *[block for outcome in outcomes for block in _details(outcome)],
-        Heading("Limits"), Bullets(_limits(material)),
+        Heading("A study of goal selection", 1), *report.what_was_run(data), *_verdicts(outcomes),
+        *report.environments(data, captions), *report.over_all(data),
+        *report.speed(data, RATIOS_4_1), *[block for outcome in outcomes for block in _details(outcome)],
+        Heading("Limits"), Bullets(_limits(data)),
     ]  # fmt: skip
 
 
@@ -76,9 +77,9 @@ def _details(outcome: Outcome) -> list[Block]:
     return [*blocks, Table(header, rows)] if rows else [*blocks, Paragraph("There are no data for it here.")]
 
 
-def _limits(material: Material) -> list[str]:
+def _limits(data: Data) -> list[str]:
     """Those of every study, and of the tests of claims."""
-    unit, power, *rest = report.limits(material)
+    unit, power, *rest = report.limits(data)
     return [
         unit,
         f"{power} Nothing is tested below {LEAST} policies.",

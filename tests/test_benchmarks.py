@@ -147,7 +147,7 @@ def test_numbers_are_written(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "what"),
+        ([], "Missing from python -m benchmarks"),
         (["pendulum"], "pendulum"),
         (["particle", "--rounds", "0"], "rounds must be at least 1, got 0"),
         (["particle", "--json", "nowhere/x.json"], "json must be in a folder that exists, got nowhere/x.json"),

@@ -11,8 +11,7 @@ from PIL import Image
 
 from deimos.run.folder import RunError
 from deimos.study import document, figures, report, stats
-from deimos.study.data import Data
-from deimos.study.figures import Style
+from deimos.study.data import Data, Style
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results
 from reproduction import report as thesis
 from reproduction.claim_list import CLAIMS
@@ -56,7 +55,7 @@ def folder(tmp_path_factory):
     fill(path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stats, "RESAMPLES", 200)  # nothing here looks at the ends of an interval
-        thesis.write(path, path, resamples=200)
+        thesis.write(path, path)
     return path
 
 
@@ -153,7 +152,7 @@ def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):
     """The bootstrap is seeded: another call writes the same Markdown."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
     monkeypatch.setattr(figures, "draw", lambda figures, out: {})
-    thesis.write(folder, tmp_path, resamples=200)
+    thesis.write(folder, tmp_path)
     text = re.sub(r"!\[.*\n\n", "", (folder / "report.md").read_text())
     assert (tmp_path / "report.md").read_text() == text
 
@@ -203,7 +202,7 @@ def test_methods_without_a_style_are_told_apart():
 
 def test_order_is_the_callers_and_then_by_name(folder):
     """What the caller orders comes first; other names follow, with their numbers as numbers."""
-    data = Data.read(folder, ["quad", "vds", "uniform"])
+    data = Data.read(folder, Style(order=["quad", "vds", "uniform"]))
     assert data.environments == ["quad", "directional"]
     assert data.methods("quad") == ["vds", "uniform", "antagonist", "coop", "p25", "p75"]
     assert data._sorted({"p100", "p5", "p75"}) == ["p5", "p75", "p100"]
@@ -212,7 +211,7 @@ def test_order_is_the_callers_and_then_by_name(folder):
 def test_report_without_a_thesis(folder, tmp_path, monkeypatch):
     """The report of any study has its tables and figures in one panel, compares with its own method, and no claims."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
-    report.write(folder, tmp_path, style=Style(reference="vds"), resamples=200)
+    report.write(folder, tmp_path, style=Style(reference="vds"))
     text = (tmp_path / "report.md").read_text()
     assert "P(more crashes than vds)" in text
     assert "ratio to vds" in text
@@ -229,13 +228,13 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
     """A page of the caller's own is what is written, figures that it names included."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
 
-    def page(material):
-        assert list(material.captions) == ["own-directional", "own-quad"]
-        pictures = [document.Picture(name, caption) for name, caption in material.captions.items()]
+    def page(data, captions):
+        assert list(captions) == ["own-directional", "own-quad"]
+        pictures = [document.Picture(name, caption) for name, caption in captions.items()]
         return [document.Heading("Mine", 1), *pictures]
 
-    def draw(data, style, environment):
-        return {f"own-{environment}": ("A caption.", lambda: figures.boxes(data, style, environment, 100))}
+    def draw(data, environment):
+        return {f"own-{environment}": ("A caption.", lambda: figures.boxes(data, environment, 100))}
 
     report.write(folder, tmp_path, page=page, draw=draw)
     assert (tmp_path / "report.md").read_text().startswith("# Mine\n\n![A caption.](figures/own-directional.png)")

@@ -158,7 +158,7 @@ def test_worker_that_dies_is_retried_once_then_given_up(file, tmp_path, capsys):
     killed = []
 
     def kill(progress):
-        for process in [] if victim.name not in {running.name for running in progress.running} else [*engine._running]:
+        for process in [] if victim.name not in progress.running else [*engine._running]:
             if victim.name in process.args and process.pid not in killed:
                 process.kill()
                 killed.append(process.pid)
@@ -169,7 +169,7 @@ def test_worker_that_dies_is_retried_once_then_given_up(file, tmp_path, capsys):
     error = "killed by SIGKILL (out of memory?)"
     assert study.failures(victim) == [error, error]
     assert end.failed == {victim.name: error}
-    assert (end.finished, end.total, end.running) == (1, 2, [])
+    assert (end.finished, end.total, end.running) == (1, 2, {})
     assert {row["method"] for row in study.results().rows} == {"uniform"}
 
     with pytest.raises(

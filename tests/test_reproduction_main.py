@@ -2,11 +2,12 @@
 
 import pytest
 
+from deimos.study import stats
 from deimos.study.results import RESULT_COLUMNS, Results
 from reproduction import __main__ as reproduction
 
 
-def test_report_has_the_claims(tmp_path, capsys):
+def test_report_has_the_claims(tmp_path, capsys, monkeypatch):
     """The report of a folder of tables has a verdict on each of the thesis's claims."""
     values = {str: "v", int: 100, float: 0.5, bool: False, tuple: (), dict: {}}
     row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()}
@@ -15,7 +16,8 @@ def test_report_has_the_claims(tmp_path, capsys):
         for method in ("uniform", "p25") for seed in range(2) for goals in ("naive", "adversary")
     ]  # fmt: skip
     Results(rows).write(tmp_path)
-    assert reproduction.main(["report", str(tmp_path), "--resamples", "1000"]) == 0
+    monkeypatch.setattr(stats, "RESAMPLES", 200)
+    assert reproduction.main(["report", str(tmp_path)]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'report.html'}\n"
     text = (tmp_path / "report.md").read_text()
     assert all(f"| C{number} |" in text for number in range(1, 33))

@@ -107,14 +107,6 @@ class ReportOptions:
     """Folder of the study, or of its exported tables."""
     out: Path | None = None
     """Where to write. By default the folder itself."""
-    resamples: int = 10_000
-    """Bootstrap resamples, at least 1000."""
-    seed: int = 0
-    """Seed of the bootstrap."""
-
-    def __post_init__(self) -> None:
-        check_at_least("resamples", self.resamples, 1000)
-        check_at_least("seed", self.seed, 0)
 
 
 def run(options: RunOptions, stopped: Callable[[], bool] = lambda: False) -> None:
@@ -243,7 +235,7 @@ def report(options: ReportOptions) -> None:
     """
     from deimos.study.report import write
 
-    print(write(options.folder, options.out or options.folder, resamples=options.resamples, seed=options.seed))
+    print(write(options.folder, options.out or options.folder))
 
 
 COMMANDS: dict[str, tuple[type, Callable[..., None]]] = {
@@ -279,12 +271,7 @@ def _summary(progress: Progress) -> str:
     parts = [f"{progress.finished} of {progress.total} cells finished"]
     if progress.failed:
         parts.append(f"{len(progress.failed)} failed")
-    parts += [
-        f"{cell.name} {100 * cell.iteration // cell.iterations} %" if cell.iteration < cell.iterations
-        else f"{cell.name} evaluating" for cell in progress.running
-    ]  # fmt: skip
-    if fps := sum(cell.fps for cell in progress.running if cell.iteration < cell.iterations):
-        parts.append(f"{fps:.0f} FPS")
+    parts += [f"{name} {share:.0%}" if share < 1 else f"{name} evaluating" for name, share in progress.running.items()]
     if progress.seconds_left:
         hours, rest = divmod(int(progress.seconds_left), 3600)
         parts.append(f"{hours}:{rest // 60:02d}:{rest % 60:02d} left")

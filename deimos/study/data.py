@@ -3,8 +3,9 @@
 import copy
 import math
 import re
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,43 @@ import numpy as np
 from deimos.run.folder import RunError
 from deimos.study.results import Results, Row
 from deimos.study.stats import Array
+
+_COLOURS = "#0072B2 #E69F00 #009E73 #CC79A7 #D55E00 #56B4E9 #7f7f7f #a6761d #332288 #e7298a".split()
+_MARKERS = "ovs^D<P>X*hpdH8"
+
+
+@dataclass(frozen=True)
+class Style:
+    """How methods are ordered and drawn; a caller gives what the study's own methods should look like."""
+
+    order: Sequence[str] = ()
+    """Environments and methods as tables and figures show them; others follow, by name."""
+    panels: Mapping[str, Sequence[str]] = field(default_factory=lambda: {"all methods": ()})
+    """Titles of the panels that methods are drawn in, with their methods; others are in the last."""
+    everywhere: str = ""
+    """A method whose training curve is in every panel, to compare with; empty for none."""
+    colours: Mapping[str, str] = field(default_factory=dict)
+    """Hexadecimal colours of methods; others have one of Okabe and Ito's or the like."""
+    reference: str = "uniform"
+    """The method that tables compare the others with."""
+
+    def complete(self, methods: Sequence[str]) -> "Style":
+        """The same with a colour for each of some methods."""
+        free = cycle([colour for colour in _COLOURS if colour not in self.colours.values()] or _COLOURS)
+        added = {name: next(free) for name in methods if name not in self.colours}
+        return replace(self, colours={**self.colours, **added})
+
+    def colour(self, method: str) -> str:
+        """The colour of a method, the same in every figure."""
+        return self.colours[method]
+
+    def marker(self, method: str) -> str:
+        """The marker of a method, the same in every figure."""
+        return _MARKERS[[*self.colours].index(method) % len(_MARKERS)]
+
+    def panel(self, method: str) -> str:
+        """Title of the panel that a method is drawn in."""
+        return next((title for title, names in self.panels.items() if method in names), [*self.panels][-1])
 
 
 @dataclass(frozen=True)
@@ -48,17 +86,17 @@ class Data:
 
     Args:
         results: Rows and training curves.
-        order: Environments and methods in the order in which tables and figures show them; others follow, by name.
+        style: How methods are ordered and drawn; methods without a colour get one.
 
     Raises:
         RunError: If they are no one study; see ``Results.check``.
     """
 
-    def __init__(self, results: Results, order: Sequence[str] = ()) -> None:
+    def __init__(self, results: Results, style: Style | None = None) -> None:
         results.check()
         self.rows = results.rows
         self.weak = [row for row in self.rows if row["weak_adversary"]]
-        self._order = order
+        self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = {}
         for row in self.rows:
             if not row["weak_adversary"]:
@@ -71,7 +109,7 @@ class Data:
             self._curves.setdefault((line["environment"], line["method"]), {})[line["seed"]] = curve
 
     @classmethod
-    def read(cls, folder: Path, order: Sequence[str] = ()) -> "Data":
+    def read(cls, folder: Path, style: Style | None = None) -> "Data":
         """Read the results of a folder.
 
         Raises:
@@ -80,7 +118,7 @@ class Data:
         results = Results.read(folder)
         if not results.rows:
             raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
-        return cls(results, order)
+        return cls(results, style)
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
@@ -110,7 +148,7 @@ class Data:
 
     def _sorted(self, names: Collection[str]) -> list[str]:
         """Names in order; the numbers in those that have no place in it count as numbers."""
-        known = [name for name in self._order if name in names]
+        known = [name for name in self.style.order if name in names]
         parts = {name: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", name)] for name in names}
         return known + sorted(set(names) - set(known), key=parts.__getitem__)
 

@@ -1,20 +1,18 @@
 """The figures of a study, as PNG and SVG, for print and the colour-blind.
 
-Every method has one colour and one marker throughout, which a ``Style`` says.
+Every method has one colour and one marker throughout: those of the data's ``Style``.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from deimos.run.folder import RunError
 from deimos.study import stats
-from deimos.study.data import Curve, Data, Where
+from deimos.study.data import Curve, Data, Style, Where
 from deimos.study.stats import Array
 
 if TYPE_CHECKING:
@@ -25,83 +23,30 @@ CAVEAT = "Curves of different methods are not comparable: each crashes under its
 DPI = 130
 WINDOW = 0.05  # of the training, for the rolling mean
 GOALS = ("naive", "adversary")
-_COLOURS = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#CC79A7",
-    "#D55E00",
-    "#56B4E9",
-    "#7f7f7f",
-    "#a6761d",
-    "#332288",
-    "#e7298a",
-)
-_MARKERS = "ovs^D<P>X*hpdH8"
-
-
-@dataclass(frozen=True)
-class Style:
-    """How methods are ordered and drawn; a caller gives what the study's own methods should look like."""
-
-    order: Sequence[str] = ()
-    """Environments and methods as tables and figures show them; others follow, by name."""
-    panels: Mapping[str, Sequence[str]] = field(default_factory=lambda: {"all methods": ()})
-    """Titles of the panels that methods are drawn in, with their methods; others are in the last."""
-    everywhere: str = ""
-    """A method whose training curve is in every panel, to compare with; empty for none."""
-    colours: Mapping[str, str] = field(default_factory=dict)
-    """Hexadecimal colours of methods; others have one of Okabe and Ito's or the like."""
-    reference: str = "uniform"
-    """The method that tables compare the others with."""
-
-    def complete(self, methods: Sequence[str]) -> "Style":
-        """The same with a colour for each of some methods."""
-        free = cycle([colour for colour in _COLOURS if colour not in self.colours.values()] or _COLOURS)
-        added = {name: next(free) for name in methods if name not in self.colours}
-        return replace(self, colours={**self.colours, **added})
-
-    def colour(self, method: str) -> str:
-        """The colour of a method, the same in every figure."""
-        return self.colours[method]
-
-    def marker(self, method: str) -> str:
-        """The marker of a method, the same in every figure."""
-        return _MARKERS[[*self.colours].index(method) % len(_MARKERS)]
-
-    def panel(self, method: str) -> str:
-        """Title of the panel that a method is drawn in."""
-        return next((title for title, names in self.panels.items() if method in names), [*self.panels][-1])
 
 
 Figures = dict[str, tuple[str, Callable[[], "Figure | None"]]]
 """Of every figure by its name: the caption, and what makes it or finds that there are no data for it."""
 
 
-def of_environment(data: Data, style: Style, environment: str) -> Figures:
-    """The figures of one environment.
-
-    Args:
-        data: The results.
-        style: With colours for all its methods.
-        environment: Its name.
-    """
+def of_environment(data: Data, environment: str) -> Figures:
+    """The figures of one environment."""
     figures: Figures = {}
     if any(data.curves(environment, name) for name in data.methods(environment)):
         figures[f"training-{environment}"] = (
             f"Training in {environment}: rolling means, mean over seeds with standard error. {CAVEAT}",
-            partial(training, data, style, environment),
+            partial(training, data, environment),
         )
     for period in data.periods(environment):
         place, ending = f"{environment}, T = {period}", f"{environment}-T{period}"
         figures[f"evaluation-{ending}"] = (
             f"{place}: every point is a policy; boxes are quartiles, whiskers 1.5 times their range. Weak adversaries "
             "are left out.",
-            partial(boxes, data, style, environment, period),
+            partial(boxes, data, environment, period),
         )
         figures[f"profile-{ending}"] = (
             f"{place}: share of the policies that crash more often than x, with pointwise 95 % bands.",
-            partial(profiles, data, style, environment, period),
+            partial(profiles, data, environment, period),
         )
     return figures
 
@@ -127,7 +72,7 @@ def draw(figures: Figures, folder: Path) -> dict[str, str]:
     return captions
 
 
-def boxes(data: Data, style: Style, environment: str, period: int) -> "Figure":
+def boxes(data: Data, environment: str, period: int) -> "Figure":
     """Box-and-whisker plots of crashes and rewards, Naive and Adversary side by side."""
     import matplotlib.pyplot as plt
 
@@ -139,7 +84,7 @@ def boxes(data: Data, style: Style, environment: str, period: int) -> "Figure":
         where = Where(environment, goals, period)
         axes[0, column].set_title(f"against the {goals.capitalize()}")
         for row, (metric, label) in enumerate((("crashes", "crashes"), ("reward", "mean reward per transition"))):
-            _boxes(axes[row, column], style, {name: data.sample(where, name, metric) for name in methods})
+            _boxes(axes[row, column], data.style, {name: data.sample(where, name, metric) for name in methods})
             if column == 0:
                 axes[row, column].set_ylabel(label)
         axes[1, column].set_xticks(range(len(methods)), methods, rotation=45, ha="right")
@@ -177,17 +122,17 @@ def logarithmic(axes: "Axes") -> None:
     axes.set_ylim(bottom=-1)
 
 
-def training(data: Data, style: Style, environment: str) -> "Figure":
+def training(data: Data, environment: str) -> "Figure":
     """Crashes and rewards during training, a column for each panel of methods."""
     found = [name for name in data.methods(environment) if data.curves(environment, name)]
-    figure, axes = _panels(style, sharey="row")
-    for column, title in enumerate(style.panels):
-        own = [name for name in found if style.panel(name) == title]
-        names = [name for name in found if name == style.everywhere and name not in own] + own
+    figure, axes = _panels(data.style, sharey="row")
+    for column, title in enumerate(data.style.panels):
+        own = [name for name in found if data.style.panel(name) == title]
+        names = [name for name in found if name == data.style.everywhere and name not in own] + own
         axes[0, column].set_title(title)
         for name in names:
             for row, number in enumerate((lambda c: c.crashes, lambda c: c.reward)):
-                _curve(axes[row, column], style, name, data.curves(environment, name), number)
+                _curve(axes[row, column], data.style, name, data.curves(environment, name), number)
         axes[1, column].set_xlabel("parallel steps")
         if names:
             axes[0, column].legend(frameon=False, ncols=2, fontsize=9)
@@ -201,7 +146,7 @@ def training(data: Data, style: Style, environment: str) -> "Figure":
     return figure
 
 
-def _panels(style: Style, sharey: str | bool) -> "tuple[Figure, Any]":
+def _panels(style: Style, sharey: Literal["row", "all"]) -> "tuple[Figure, Any]":
     """Two rows of as many axes as there are panels of methods."""
     import matplotlib.pyplot as plt
 
@@ -235,20 +180,20 @@ def _rolling(x: Array, window: int) -> Array:
     return (total[end] - total[begin]) / (end - begin)
 
 
-def profiles(data: Data, style: Style, environment: str, period: int) -> "Figure | None":
+def profiles(data: Data, environment: str, period: int) -> "Figure | None":
     """Performance profiles: share of the policies whose crashes per 1000 transitions exceed a threshold."""
     import matplotlib.pyplot as plt
 
-    figure, axes = _panels(style, sharey=True)
+    figure, axes = _panels(data.style, sharey="all")
     thresholds = np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 120)])
     drawn = 0
     for row, goals in enumerate(GOALS):
-        for column, title in enumerate(style.panels):
+        for column, title in enumerate(data.style.panels):
             panel = axes[row, column]
             for name in data.methods(environment):
                 values = data.sample(Where(environment, goals, period), name, "crashes_per_1000")
-                if style.panel(name) == title and len(values) >= 2:
-                    _profile(panel, style, name, values, thresholds)
+                if data.style.panel(name) == title and len(values) >= 2:
+                    _profile(panel, data.style, name, values, thresholds)
                     drawn += 1
             panel.set_xscale("symlog", linthresh=1e-3)
             panel.grid(alpha=0.3)

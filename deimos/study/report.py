@@ -7,7 +7,7 @@ these sections and others.
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,50 +28,29 @@ COVERAGE = (  # python -m reproduction coverage, its defaults
 )
 
 
-@dataclass(frozen=True)
-class Material:
-    """What the sections of a report are made of."""
-
-    data: Data
-    """The results."""
-    style: Style
-    """How its methods look, and which one the others are compared with."""
-    captions: Mapping[str, str]
-    """Of the figures, by their names."""
-    resamples: int = stats.RESAMPLES
-    """Bootstrap resamples of the tables."""
-    seed: int = 0
-    """Of the bootstrap."""
-
-
-def page(material: Material) -> list[Block]:
-    """The sections that every study has."""
+def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
+    """The sections that every study has; ``captions`` are those of its figures, by their names."""
     return [
-        Heading("A study of goal selection", 1), *what_was_run(material), *environments(material),
-        *over_all(material), *speed(material), Heading("Limits"), Bullets(limits(material)),
+        Heading("A study of goal selection", 1), *what_was_run(data), *environments(data, captions),
+        *over_all(data), *speed(data), Heading("Limits"), Bullets(limits(data)),
     ]  # fmt: skip
 
 
 def write(
     folder: Path,
     out: Path,
-    *,
     style: Style | None = None,
-    page: Callable[[Material], list[Block]] = page,
-    draw: Callable[[Data, Style, str], Figures] = figures.of_environment,
-    resamples: int = stats.RESAMPLES,
-    seed: int = 0,
+    page: Callable[[Data, Mapping[str, str]], list[Block]] = page,
+    draw: Callable[[Data, str], Figures] = figures.of_environment,
 ) -> Path:
     """Write ``report.html``, ``report.md`` and ``figures/``.
 
     Args:
         folder: A study's folder, or one of exported tables.
         out: Where to write; made if it is not there.
-        style: How methods look; ``None`` for colours by their order.
+        style: How methods are ordered and drawn.
         page: Makes the page.
         draw: Names the figures of an environment.
-        resamples: Bootstrap resamples of the tables.
-        seed: Of the bootstrap.
 
     Returns:
         Path of the HTML page.
@@ -79,15 +58,13 @@ def write(
     Raises:
         RunError: If there are no results, or something cannot be read or written.
     """
-    style = style or Style()
-    data = Data.read(folder, style.order)
-    style = style.complete(sorted({row["method"] for row in data.rows}))
+    data = Data.read(folder, style)
     try:
         (out / FIGURES).mkdir(parents=True, exist_ok=True)
         captions: dict[str, str] = {}
         for environment in data.environments:
-            captions |= figures.draw(draw(data, style, environment), out / FIGURES)
-        blocks = page(Material(data, style, captions, resamples, seed))
+            captions |= figures.draw(draw(data, environment), out / FIGURES)
+        blocks = page(data, captions)
         (out / "report.md").write_text(to_markdown(blocks, FIGURES))
         (out / "report.html").write_text(to_html(blocks, out / FIGURES))
     except OSError as error:
@@ -95,9 +72,8 @@ def write(
     return out / "report.html"
 
 
-def what_was_run(material: Material) -> list[Block]:
+def what_was_run(data: Data) -> list[Block]:
     """Environments, methods, seeds, sizes, weak adversaries and versions."""
-    data = material.data
     rows = []
     for environment in data.environments:
         own = [row for row in data.rows if row["environment"] == environment]
@@ -135,26 +111,24 @@ def _values(rows: Sequence[dict], column: str) -> str:
     return ", ".join(map(str, sorted({row[column] for row in rows})))
 
 
-def environments(material: Material) -> list[Block]:
+def environments(data: Data, captions: Mapping[str, str]) -> list[Block]:
     """Of every environment a table for each evaluation, and its figures."""
-    data = material.data
     blocks: list[Block] = []
     for environment in data.environments:
         blocks.append(Heading(environment))
         for period in data.periods(environment):
             for goals in ("naive", "adversary", "oracle"):
-                blocks += _table(material, Where(environment, goals, period))
-        names = [name for name in material.captions if f"-{environment}-" in f"{name}-"]
-        blocks += [Picture(name, material.captions[name]) for name in names]
+                blocks += _table(data, Where(environment, goals, period))
+        names = [name for name in captions if f"-{environment}-" in f"{name}-"]
+        blocks += [Picture(name, captions[name]) for name in names]
     return blocks
 
 
-def _table(material: Material, where: Where) -> list[Block]:
-    data, resamples, seed = material.data, material.resamples, material.seed
+def _table(data: Data, where: Where) -> list[Block]:
     methods = [name for name in data.methods(where.environment) if len(data.sample(where, name, "crashes")) >= 2]
     if not methods:
         return []
-    reference = material.style.reference
+    reference = data.style.reference
     base, parts = data.sample(where, reference, "crashes"), data.parts(where)
     rows = []
     for name in methods:
@@ -163,16 +137,16 @@ def _table(material: Material, where: Where) -> list[Block]:
         more = "-"
         if name != reference and len(base) >= 2:
             pair = [(crashes, base)]
-            more = interval(stats.probability_of_improvement(pair, resamples=resamples, seed=seed), ".2f")
+            more = interval(stats.probability_of_improvement(pair), ".2f")
         rows.append([
             name, str(len(crashes)),
-            _boot(crashes, _median, resamples, seed), _boot(crashes, stats.iqm, resamples, seed),
-            interval(_of_counts(stats.bootstrap_t(crashes, resamples=resamples, seed=seed))),
-            _boot(crashes, stats.cvar, resamples, seed), _boot(crashes, stats.iqr, resamples, seed),
+            _boot(crashes, _median), _boot(crashes, stats.iqm),
+            interval(_of_counts(stats.bootstrap_t(crashes))),
+            _boot(crashes, stats.cvar), _boot(crashes, stats.iqr),
             " to ".join(f"{x:.3g}" for x in np.quantile(crashes, [0.1, 0.9])),
-            f"{np.median(rate):.4f}" if len(rate) else "-", _boot(reward, stats.iqm, resamples, seed, ".4f"),
-            _boot(score, stats.iqm, resamples, seed, ".3f"), more,
-            *[_boot(data.sample(where, name, part), stats.iqm, resamples, seed, ".3g") for part in parts],
+            f"{np.median(rate):.4f}" if len(rate) else "-", _boot(reward, stats.iqm, ".4f"),
+            _boot(score, stats.iqm, ".3f"), more,
+            *[_boot(data.sample(where, name, part), stats.iqm, ".3g") for part in parts],
         ])  # fmt: skip
     header = ["method", "seeds", "crashes: median", "IQM", "mean", "worst 20 % (CVaR)", "IQR", "10 % to 90 %",
               "crashes per interaction", "reward: IQM", "score: IQM", f"P(more crashes than {reference})",
@@ -189,10 +163,10 @@ def _median(x: Array) -> Array:
     return np.median(x, axis=-1)
 
 
-def _boot(x: Array, statistic: stats.Statistic, resamples: int, seed: int, form: str = ".3g") -> str:
+def _boot(x: Array, statistic: stats.Statistic, form: str = ".3g") -> str:
     if len(x) < 2:
         return "-"
-    return interval(stats.bootstrap([x], statistic, resamples=resamples, seed=seed), form)
+    return interval(stats.bootstrap([x], statistic), form)
 
 
 def _of_counts(interval: Interval) -> Interval:
@@ -207,9 +181,8 @@ def interval(found: Interval, form: str = ".3g") -> str:
     return f"{found.estimate:{form}} [{found.low:{form}}, {found.high:{form}}]"
 
 
-def over_all(material: Material) -> list[Block]:
+def over_all(data: Data) -> list[Block]:
     """Safety over all environments and T, by the stratified bootstrap, for the methods that were run in all."""
-    data = material.data
     blocks: list[Block] = []
     for goals in ("naive", "adversary"):
         places = [place for environment in data.environments for place in data.places(environment, goals)]
@@ -222,8 +195,7 @@ def over_all(material: Material) -> list[Block]:
         for name in shared:
             safety = [1 - data.sample(place, name, "log_crashes") / max(most, 1e-9)
                       for place, most in zip(places, worst, strict=True)]  # fmt: skip
-            found = stats.bootstrap(safety, lambda *x: stats.iqm(np.concatenate(x, axis=-1)),
-                                    resamples=material.resamples, seed=material.seed)  # fmt: skip
+            found = stats.bootstrap(safety, lambda *x: stats.iqm(np.concatenate(x, axis=-1)))
             rows.append([name, interval(found, ".3f")])
         blocks += [Heading(f"Against the {goals.capitalize()}, {len(places)} evaluations together", 3),
                    Table(["method", "safety: IQM [95 %]"], rows)]  # fmt: skip
@@ -233,20 +205,20 @@ def over_all(material: Material) -> list[Block]:
     return [Heading("Over all environments"), Paragraph(text), *blocks]
 
 
-def speed(material: Material, published: Mapping[str, Mapping[str, float]] | None = None) -> list[Block]:
+def speed(data: Data, published: Mapping[str, Mapping[str, float]] | None = None) -> list[Block]:
     """Frames per second.
 
     Args:
-        material: Of the report.
+        data: The results.
         published: Ratios to the reference method that somebody else measured, by environment and method.
     """
-    data, rows = material.data, []
+    rows = []
     for environment in data.environments:
         place = data.places(environment, "naive")[:1]
         if not place:
             continue
         fps = {name: data.sample(place[0], name, "fps") for name in data.methods(environment)}
-        base = fps.get(material.style.reference, np.array([]))
+        base = fps.get(data.style.reference, np.array([]))
         for name, values in fps.items():
             if len(values) < 2:
                 continue
@@ -259,14 +231,13 @@ def speed(material: Material, published: Mapping[str, Mapping[str, float]] | Non
         "Frames per second over all worlds during training, learning included: mean over seeds ± standard error. Only "
         "ratios are comparable, and only among runs of one kind of machine."
     )
-    header = ["environment", "method", "FPS", f"ratio to {material.style.reference}"]
+    header = ["environment", "method", "FPS", f"ratio to {data.style.reference}"]
     header += [] if published is None else ["published ratio"]
     return [Heading("Speed"), Paragraph(text), Table(header, rows)] if rows else []
 
 
-def limits(material: Material) -> list[str]:
+def limits(data: Data) -> list[str]:
     """What a reader must bear in mind, one text each."""
-    data = material.data
     smallest = min(
         len(data.sample(place, name, "crashes"))
         for environment in data.environments

@@ -16,20 +16,6 @@ TAIL_BYTES = 400
 
 
 @dataclass(frozen=True)
-class Running:
-    """A cell that is being worked on."""
-
-    name: str
-    """Its name."""
-    iteration: int
-    """Iterations of its training that are done."""
-    iterations: int
-    """Iterations in all."""
-    fps: float
-    """Transitions per second in the last iteration; 0 before the first."""
-
-
-@dataclass(frozen=True)
 class Progress:
     """Where a study stands."""
 
@@ -39,8 +25,8 @@ class Progress:
     """Cells that have results."""
     failed: dict[str, str]
     """Cells that are given up, with how the last attempt ended."""
-    running: list[Running]
-    """Cells that are being worked on."""
+    running: dict[str, float]
+    """Cells that are being worked on, with the share of their training that is done."""
     seconds_left: float | None
     """Estimate from what was done so far [s]; ``None`` before anything was."""
 
@@ -58,10 +44,10 @@ class Runner:
     """What works on its cells."""
     workers: int
     """Cells at a time, at least 1."""
-    _active: dict[str, Cell] = field(default_factory=dict)
-    _begun: dict[str, int] = field(default_factory=dict)  # iterations that cells had done before they were begun here
+    _begun: dict[str, int] = field(default_factory=dict)  # cells begun here, with iterations that were done before
+    _active: set[str] = field(default_factory=set)
     _finished: set[str] = field(default_factory=set)  # digests
-    _failed: dict[str, str] = field(default_factory=dict)  # names, with the last error
+    _failed: dict[str, str] = field(default_factory=dict)
     _stopping: bool = False
     _killed: bool = False
 
@@ -87,13 +73,14 @@ class Runner:
                 waiting = True
                 while waiting:
                     waiting = bool(wait(jobs, POLL_SECONDS).not_done)
-                    report(self._progress(cells, time.monotonic() - begin))
+                    progress = self._progress(cells, time.monotonic() - begin)
+                    report(progress)
                     if stopped() and not self._stopping:
                         self._stopping = True
                         self.engine.stop()
                 for job in jobs:
                     job.result()  # raises what was raised there
-                return self._progress(cells, time.monotonic() - begin)
+                return progress
             finally:  # nothing is left here but after an error or a second Ctrl-C
                 self._stopping = self._killed = True
                 self.engine.kill()
@@ -102,10 +89,10 @@ class Runner:
         """Have a cell worked on until it is finished or given up."""
         errors = self.study.failures(cell)
         while not self._stopping and len(errors) < ATTEMPTS:
-            self._begun.setdefault(cell.name, self._state(cell).iteration)
-            self._active[cell.name] = cell
+            self._begun.setdefault(cell.name, self._iterations(cell))
+            self._active.add(cell.name)
             error = self.engine.run(cell)
-            del self._active[cell.name]
+            self._active.discard(cell.name)
             if error is None and self.study.finished([cell]):
                 self._finished.add(cell.digest)
                 return
@@ -116,28 +103,26 @@ class Runner:
         if len(errors) >= ATTEMPTS:
             self._failed[cell.name] = errors[-1]
 
-    def _state(self, cell: Cell) -> Running:
-        """How far a cell's training is, by the end of its ``timing.csv``."""
-        iteration, fps = 0, 0.0
+    def _iterations(self, cell: Cell) -> int:
+        """How many iterations of a cell's training are done, by the end of its ``timing.csv``."""
         try:
             with (self.study.cell_path(cell) / "run" / "timing.csv").open("rb") as file:
                 file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
-                lines = file.read().decode().split("\n")
-            values = lines[-2].split(",")  # the last whole line
-            iteration, fps = int(values[0]), float(values[1])
+                return int(file.read().decode().split("\n")[-2].split(",")[0])  # of the last whole line
         except (OSError, IndexError, ValueError):
-            pass  # no iteration is whole yet
-        return Running(cell.name, iteration, cell.config.iterations, fps)
+            return 0  # none is whole yet
 
     def _progress(self, cells: list[Cell], seconds: float) -> Progress:
-        running = [self._state(cell) for cell in list(self._active.values())]
-        done = left = 0.0  # transitions
+        running: dict[str, float] = {}
+        done = left = 0  # transitions
         for cell in cells:
-            iteration = self._state(cell).iteration if cell.name in self._begun else 0
+            iterations = self._iterations(cell) if cell.name in self._begun else 0
             size = cell.config.ppo.num_steps * cell.config.num_envs
-            done += size * max(0, iteration - self._begun.get(cell.name, iteration))
+            done += size * max(0, iterations - self._begun.get(cell.name, iterations))
             if cell.digest not in self._finished and cell.name not in self._failed:
-                left += size * (cell.config.iterations - iteration)
+                left += size * (cell.config.iterations - iterations)
+            if cell.name in self._active:
+                running[cell.name] = iterations / cell.config.iterations
         return Progress(
             total=len(cells), finished=len(self._finished), failed=dict(self._failed), running=running,
             seconds_left=left * seconds / done if done else None,

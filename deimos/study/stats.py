@@ -69,13 +69,15 @@ def cvar(x: Array, share: float = 0.2) -> Array:
     return -np.sort(-x, axis=-1) @ weight / weight.sum()
 
 
-def distribution(samples: Sequence[Array], statistic: Statistic, *, resamples: int = RESAMPLES, seed: int = 0) -> Array:
+def distribution(
+    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0
+) -> Array:
     """A statistic of resamples that are drawn from every sample with replacement (the stratified bootstrap).
 
     Args:
         samples: One array per stratum (method or task).
         statistic: Vectorised over leading axes.
-        resamples: Number of bootstrap resamples.
+        resamples: Number of bootstrap resamples; ``None`` for ``RESAMPLES``.
         seed: Of the resampling.
 
     Returns:
@@ -83,28 +85,27 @@ def distribution(samples: Sequence[Array], statistic: Statistic, *, resamples: i
     """
     with np.errstate(invalid="ignore"):  # scipy's own interval, which is not used, where a value is infinite
         return stats.bootstrap(
-            [_checked(x) for x in samples], lambda *x, axis: statistic(*x), vectorized=True, n_resamples=resamples,
-            method="percentile", rng=np.random.default_rng(seed),
+            [_checked(x) for x in samples], lambda *x, axis: statistic(*x), vectorized=True,
+            n_resamples=resamples or RESAMPLES, method="percentile", rng=np.random.default_rng(seed),
         ).bootstrap_distribution  # fmt: skip
 
 
 def bootstrap(
-    samples: Sequence[Array], statistic: Statistic, *, resamples: int = RESAMPLES, seed: int = 0, level: float = LEVEL
+    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
     """Percentile interval of a statistic by the stratified bootstrap; see ``distribution``.
 
     Args:
         samples: One array per stratum (method or task).
         statistic: Vectorised over leading axes.
-        resamples: Number of bootstrap resamples.
+        resamples: Number of bootstrap resamples; ``None`` for ``RESAMPLES``.
         seed: Of the resampling.
-        level: Of the interval, in (0, 1).
     """
     values = distribution(samples, statistic, resamples=resamples, seed=seed)
-    return Interval(float(statistic(*map(_checked, samples))), *_quantiles(values, level))
+    return Interval(float(statistic(*map(_checked, samples))), *_quantiles(values))
 
 
-def bootstrap_t(x: Array, *, resamples: int = RESAMPLES, seed: int = 0, level: float = LEVEL) -> Interval:
+def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Interval:
     """Interval of the mean by the studentised bootstrap [1]_, the one for small and skewed samples.
 
     References:
@@ -121,25 +122,24 @@ def bootstrap_t(x: Array, *, resamples: int = RESAMPLES, seed: int = 0, level: f
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(away == 0.0, 0.0, away / errors)  # infinite where all drawn values are the same
 
-    low, high = _quantiles(distribution([x], student, resamples=resamples, seed=seed), level)
+    low, high = _quantiles(distribution([x], student, resamples=resamples, seed=seed))
     return Interval(float(mean), float(mean - high * error), float(mean - low * error))
 
 
 def probability_of_improvement(
-    pairs: Sequence[tuple[Array, Array]], *, resamples: int = RESAMPLES, seed: int = 0, level: float = LEVEL
+    pairs: Sequence[tuple[Array, Array]], *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
     """P(X > Y), ties counting half, averaged over tasks: U / (n m) of Mann and Whitney [1]_.
 
     Args:
         pairs: X and Y of every task.
-        resamples: Number of bootstrap resamples of all samples.
+        resamples: Number of bootstrap resamples of all samples; ``None`` for ``RESAMPLES``.
         seed: Of the resampling.
-        level: Of the interval, in (0, 1).
 
     References:
         .. [1] Agarwal et al., arXiv:2108.13264, section 4.3.
     """
-    rng = np.random.default_rng(seed)
+    rng, resamples = np.random.default_rng(seed), resamples or RESAMPLES
     estimate, values = 0.0, np.zeros(resamples)
     for x, y in pairs:
         x, y = _checked(x), _checked(y)
@@ -147,21 +147,20 @@ def probability_of_improvement(
         estimate += wins.mean() / len(pairs)
         counts = [rng.multinomial(len(z), np.full(len(z), 1 / len(z)), size=resamples) / len(z) for z in (x, y)]
         values += np.einsum("ri,ij,rj->r", counts[0], wins, counts[1], optimize=True) / len(pairs)
-    low, high = _quantiles(values, level)
+    low, high = _quantiles(values)
     return Interval(float(estimate), low, high)
 
 
 def performance_profile(
-    samples: Sequence[Array], thresholds: Array, *, resamples: int = RESAMPLES, seed: int = 0, level: float = LEVEL
+    samples: Sequence[Array], thresholds: Array, *, resamples: int | None = None, seed: int = 0
 ) -> tuple[Array, Array, Array]:
     """Share of runs above each threshold, averaged over tasks, with its pointwise band [1]_.
 
     Args:
         samples: One array per task.
         thresholds: Shape (k,).
-        resamples: Number of bootstrap resamples.
+        resamples: Number of bootstrap resamples; ``None`` for ``RESAMPLES``.
         seed: Of the resampling.
-        level: Of the band, in (0, 1).
 
     Returns:
         Share, lower and upper end, each of shape (k,).
@@ -171,12 +170,12 @@ def performance_profile(
     """
     samples = [_checked(x) for x in samples]
     share = np.mean([(x[:, None] > thresholds).mean(axis=0) for x in samples], axis=0)
-    rng = np.random.default_rng(seed)
+    rng, resamples = np.random.default_rng(seed), resamples or RESAMPLES
     values = np.zeros((resamples, len(thresholds)))
     for x in samples:
         counts = rng.multinomial(len(x), np.full(len(x), 1 / len(x)), size=resamples) / len(x)
         values += counts @ (x[:, None] > thresholds) / len(samples)
-    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
     return share, low, high
 
 
@@ -215,10 +214,10 @@ def detectable_spread(n: int, m: int, alpha: float = 0.05, populations: int = 40
     return high
 
 
-def _quantiles(values: Array, level: float) -> tuple[float, float]:
+def _quantiles(values: Array) -> tuple[float, float]:
     """Ends of the percentile interval; infinite values count."""
     finite = bool(np.isfinite(values).all())  # there is nothing between two infinities
-    ends = [(1 - level) / 2, (1 + level) / 2]
+    ends = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
     low, high = np.quantile(values, ends) if finite else np.quantile(values, ends, method="nearest")
     return float(low), float(high)
 
