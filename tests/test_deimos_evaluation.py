@@ -137,7 +137,8 @@ def held_out(probe, crashed):
     return Resolved(
         env=nothing.long(), state=torch.stack([probe.float(), crashed.float()], dim=1), goal=nothing.unsqueeze(1),
         next_goal=nothing.unsqueeze(1), score=nothing, reward=nothing, tracking=nothing, probe=probe,
-        note=nothing.long(), crashed=crashed, issued=nothing.long(), resolved=nothing.long(), horizon=nothing.long() + 1,
+        note=nothing.long(), crashed=crashed, issued=nothing.long(), resolved=nothing.long(),
+            horizon=nothing.long() + 1,
     )  # fmt: skip
 
 
