@@ -217,6 +217,19 @@ assert not loaded, loaded
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+def test_nothing_that_it_keeps_carries_a_gradient():
+    """In a loop that records gradients, as a differentiable simulator's does, it keeps copies without them."""
+    goals, no = GoalDirector(AFRAID, 2), torch.zeros(4, dtype=torch.bool)
+    goal = torch.zeros(4, 2, requires_grad=True) * 1.0
+    for _ in range(6):
+        state, candidates, tracking = (torch.rand(4, *shape, requires_grad=True) for shape in ((3,), (9, 2), ()))
+        goal = goals.step(2 * state, goal, no, no, 2 * candidates, tracking=2 * tracking).goal
+        assert not goal.requires_grad
+    kept = goals.interactions.resolved()
+    assert len(kept) > 0
+    assert not any(getattr(kept, name).requires_grad for name in Resolved.__dataclass_fields__)
+
+
 def arguments(**changes):
     """A good first call, with changes."""
     no = torch.zeros(4, dtype=torch.bool)

@@ -388,7 +388,7 @@ def test_predictions_are_judged_once_and_before_they_are_learnt_from(monkeypatch
     assert len(recent) > 50
     assert row["calibration/brier"] == pytest.approx((before - recent.crashed.float()).square().mean().item(), rel=1e-5)
     assert row["fear/resolved"] == (window.resolved > 144).sum()
-    assert row["fear/crash_share"] == pytest.approx(window.where(window.resolved > 144).crashed.float().mean().item())
+    assert row["fear/crash_rate"] == pytest.approx(window.where(window.resolved > 144).crashed.float().mean().item())
     assert selector.calibration.prior == pytest.approx(math.log(selector.fear.share / (1 - selector.fear.share)))
 
 

@@ -34,17 +34,9 @@ class Calibration(Stateful):
         self.prior = 0.0
         self.temperature = 1.0
 
-    def logit(self, score: Tensor) -> Tensor:
-        """Log odds of a crash, same shape.
-
-        Args:
-            score: Logits of the class-balanced classifier, any shape.
-        """
-        return (score + self.prior) / self.temperature
-
     def probability(self, score: Tensor) -> Tensor:
-        """Probability of a crash, in (0, 1); the arguments are those of ``logit``."""
-        return torch.sigmoid(self.logit(score))
+        """Probability of a crash, in (0, 1), of logits of the class-balanced classifier."""
+        return self.of_log_odds(score + self.prior)
 
     def of_log_odds(self, log_odds: Tensor) -> Tensor:
         """Probability of a crash where the prior, perhaps one of another day, has been added already."""
@@ -108,7 +100,7 @@ def reliability(probability: Tensor, crashed: Tensor, bins: int = BINS) -> Relia
     return Reliability(predicted, observed, count)
 
 
-def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
+def evaluate(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     """How good predicted probabilities are.
 
     Args:
@@ -121,7 +113,7 @@ def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
         uncertainty up to the spread within bins. ``ece``, the expected calibration error over the same bins;
         ``log_loss_skill``, 1 - loss / (loss of predicting the base rate): 0 knows nothing, 1 everything.
         ``top_decile_gap``: predicted minus observed rate where the predictions are highest, which is what a
-        gate at run time sees. NaN where there is nothing to judge, for the skill also where a class is empty.
+        gate at run time sees. NaN where there is nothing to evaluate, for the skill also where a class is empty.
 
     References:
         .. [1] Murphy, *A New Vector Partition of the Probability Score*, J. Appl. Meteorology 12, 1973.

@@ -156,7 +156,7 @@ class GoalDirector:
         Args:
             state: States, shape (B, state_dim).
             goal: Active goals, shape (B, goal_dim).
-            new_goal: Goals to judge, shape (B, goal_dim).
+            new_goal: Goals to evaluate, shape (B, goal_dim).
 
         Raises:
             ValueError: If the selector has no fear network.

@@ -119,7 +119,7 @@ class Fear(Stateful):
 
         Args:
             state: States, shape (B, state_dim).
-            goal: Goals in force, shape (B, goal_dim).
+            goal: Active goals, shape (B, goal_dim).
             candidates: Possible next goals, shape (B, N, goal_dim).
 
         Returns:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from deimos.checks import check_at_least, check_choice, check_range
 from deimos.goals import picks
-from deimos.goals.calibration import Calibration, judge
+from deimos.goals.calibration import Calibration, evaluate
 from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
@@ -70,7 +70,7 @@ class FearSelector(GoalSelector):
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
-        # As a forecast it keeps the prior of its day, whatever the share of crashes is when it is judged.
+        # As a forecast it keeps the prior of its day, whatever the share of crashes is when it is evaluated.
         return Proposal(picks.take(candidates, pick), picks.take(score, pick) + self.calibration.prior, probe=probe)
 
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
@@ -78,7 +78,7 @@ class FearSelector(GoalSelector):
         return self.fear.score(self._seen(state), goal, candidates)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
-        """Fit the fear network to the window; what has resolved since the last time judges it first."""
+        """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at
         self._learnt_at = interactions.now
@@ -86,15 +86,15 @@ class FearSelector(GoalSelector):
         known = window.score.isfinite()
         score, crashed = window.score[known], window.crashed[known]
         fair = known & window.probe if self.config.probe else known  # chosen goals are a biased sample
-        judged = fair & recent
+        fresh = fair & recent
         row = {
             "fear/auroc": auroc(window.score[fair], window.crashed[fair]),
-            "fear/crash_share": window.crashed[recent].float().mean().item(),
+            "fear/crash_rate": window.crashed[recent].float().mean().item(),
             "fear/resolved": float(recent.sum()),
             "fear/score": window.score[recent].nanmean().item(),
             "fear/temperature": self.calibration.temperature,
         }
-        quality = judge(self.calibration.of_log_odds(window.score[judged]), window.crashed[judged])
+        quality = evaluate(self.calibration.of_log_odds(window.score[fresh]), window.crashed[fresh])
         row |= {f"calibration/{name}": value for name, value in quality.items()}
         # The temperature is fitted to scores from before the network learnt from their outcomes.
         crashes = int(crashed.sum())

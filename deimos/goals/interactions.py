@@ -1,6 +1,6 @@
 """Pending and resolved interactions: a goal is issued, and the policy crashes on it or survives it.
 
-An interaction is (state, goal in force, next goal) at the moment of the choice. It resolves as *crashed*
+An interaction is (state, active goal, next goal) at the moment of the choice. It resolves as *crashed*
 when the world crashes within T steps (its horizon), on the step of the next goal change included, and as *survived*
 when the next goal is due and the world lives. Where the episode ends otherwise before that, it is
 dropped. First goals are no interactions unless somebody opens them.
@@ -24,7 +24,7 @@ class Resolved:
     state: Tensor
     """State at the moment of the choice, shape (n, state_dim)."""
     goal: Tensor
-    """Goal that was in force, shape (n, goal_dim)."""
+    """Goal that was active until then, shape (n, goal_dim)."""
     next_goal: Tensor
     """Goal that was executed: as it was issued, unless ``execute`` told another, shape (n, goal_dim)."""
     score: Tensor
@@ -145,7 +145,7 @@ class Interactions(Stateful):
         Args:
             rows: Worlds, int64, shape (m,), each once.
             state: States, shape (m, state_dim).
-            goal: Goals that were in force, shape (m, goal_dim).
+            goal: Goals that were active until now, shape (m, goal_dim).
             next_goal: Goals as they are issued, shape (m, goal_dim).
             score: What the selector thinks of them, shape (m,).
             horizon: Steps until they are over if nothing happens, at least 1, one number or int64, shape (m,).
@@ -190,7 +190,7 @@ class Interactions(Stateful):
         """What was issued after step ``since`` and is still known, pending or resolved.
 
         Returns:
-            World, int64, shape (n,); state (n, state_dim), goal that was in force and goal that is
+            World, int64, shape (n,); state (n, state_dim), goal that was active until then and goal that is
             executed, (n, goal_dim) each.
         """
         pending = torch.nonzero(self.active & (self.issued_at > since)).squeeze(1)

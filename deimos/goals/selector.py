@@ -24,7 +24,7 @@ class Spaces:
     goal_dim: int
     """Components of a goal."""
     goal_period: int
-    """T: steps that a goal is in force."""
+    """T: steps that a goal is active."""
     device: torch.device
     """Where the tensors lie."""
     groups: tuple[slice, ...] = (slice(None),)
@@ -80,28 +80,18 @@ def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
 
 
 class Transitions(Protocol):
-    """What selectors may learn from the learner's transitions; shapes are (num_steps, num_envs), but for ``obs``."""
+    """What selectors may learn from the learner's transitions, of shape (num_steps, num_envs) but for ``obs``."""
 
     num_steps: int
-    """Steps of every world since the last call of ``learn``."""
-    obs: Tensor
-    """Observations that the steps started from, and those after the last, shape (num_steps + 1, num_envs, obs_dim)."""
-    reward: Tensor
-    """Rewards as the environment gives them."""
+    obs: Tensor  # that the steps started from, and those after the last: (num_steps + 1, num_envs, obs_dim)
+    reward: Tensor  # as the environment gives them
     terminated: Tensor
-    """True where the world crashed, bool."""
     truncated: Tensor
-    """True where the episode was cut off without a crash, bool."""
-    weight: Tensor
-    """Weight of the transition in everything learnt: 0 leaves it out."""
-    advantage: Tensor
-    """The learner's advantages in units of scaled rewards."""
-    reward_scale: float
-    """What the learner multiplies rewards by before it values them."""
+    weight: Tensor  # in everything learnt: 0 leaves a transition out
+    advantage: Tensor  # the learner's, in units of scaled rewards
+    reward_scale: float  # what the learner multiplies rewards by before it values them
     discount: float
-    """gamma of the learner, in [0, 1]."""
     gae_lambda: float
-    """lambda of the learner's advantages, in [0, 1]."""
 
     def cut_off(self) -> tuple[Tensor, Tensor, Tensor]:
         """Steps and worlds that were truncated, int64, shape (m,) each, and their last observations, (m, obs_dim)."""
@@ -144,7 +134,7 @@ class GoalSelector(Stateful, abc.ABC):
         Args:
             rows: Worlds, int64, shape (B,).
             state: Their states, shape (B, state_dim).
-            goal: Their goals in force, shape (B, goal_dim).
+            goal: Their active goals, shape (B, goal_dim).
             candidates: Independent uniform goals for each, shape (B, num_candidates, goal_dim).
             draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All chance
                 in the choice comes from here, so that it is the same in any batch.
@@ -182,20 +172,9 @@ class Delegate(GoalSelector):
     def current(self) -> GoalSelector:
         """Who chooses."""
 
-    @property
-    def num_candidates(self) -> int:  # type: ignore[override]
-        """See ``GoalSelector.num_candidates``."""
-        return self.current.num_candidates
-
-    @property
-    def needs_rollout(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.needs_rollout``."""
-        return any(part.needs_rollout for part in self.parts)
-
-    @property
-    def first_goals_scaled(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.first_goals_scaled``."""
-        return self.current.first_goals_scaled
+    needs_rollout = property(lambda self: any(part.needs_rollout for part in self.parts))
+    num_candidates = property(lambda self: self.current.num_candidates)
+    first_goals_scaled = property(lambda self: self.current.first_goals_scaled)
 
     def goal_range(self) -> Tensor | None:
         """See ``GoalSelector.goal_range``."""

@@ -158,10 +158,6 @@ class ManyCandidates:
         rows = workspace * 2**20 // (8 * widest)  # a layer's input and output
         self._rows = min(rows, rows_in_cache(widest)) if weight.device.type == "cpu" else rows
 
-    def contexts_at_once(self, count: int) -> int:
-        """Contexts, each with ``count`` candidates, whose activations fit the workspace; at least 1."""
-        return max(1, self._rows // count)
-
     @torch.no_grad()
     def __call__(self, context: Tensor, candidates: Tensor) -> Tensor:
         """The network's output for every candidate, shape (B, N, outputs).
@@ -173,7 +169,7 @@ class ManyCandidates:
         count = candidates.shape[1]
         of_candidate = self._of_candidate.expand(len(candidates), -1, -1)
         of_context = torch.addmm(self._first.bias, context, self._of_context).unsqueeze(1)
-        size = self.contexts_at_once(count)
+        size = max(1, self._rows // count)
         outputs = []
         for known, part in zip(of_context.split(size), candidates.split(size), strict=True):
             x = torch.baddbmm(known, part, of_candidate[: len(part)]).flatten(0, 1)

@@ -23,7 +23,7 @@ def advantages(
     Neither passes advantage across the reset.
 
     Args:
-        reward: Rewards, shape (num_steps, num_envs).
+        reward: Rewards, shape (num_steps, ...).
         value: V of the observation that each step started from, same shape.
         next_value: V of the observation that each step ended in, *before* any reset, same shape.
         terminated: True where the task itself ended the episode, bool, same shape.
@@ -32,7 +32,7 @@ def advantages(
         gae_lambda: lambda, in [0, 1].
 
     Returns:
-        Advantages, shape (num_steps, num_envs). Add ``value`` for the value targets.
+        Advantages, same shape. Add ``value`` for the value targets.
 
     Raises:
         ValueError: If the shapes differ.

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.goals.calibration import judge
+from deimos.goals.calibration import evaluate
 from deimos.goals.fear import auroc
 from deimos.goals.fear_selector import fear_selector
 from deimos.goals.interactions import Resolved
@@ -102,7 +102,7 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
 
     Returns:
         For ``selected`` and ``uniform`` goals: probabilities, shape (n,), what became of them, bool, shape (n,),
-        and the dictionary of ``calibration.judge``, with ``interactions``, ``crash_rate`` and ``auroc``.
+        and the dictionary of ``calibration.evaluate``, with ``interactions``, ``crash_rate`` and ``auroc``.
 
     Raises:
         RunError: If there is no fear network.
@@ -118,7 +118,7 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
         score = afraid.score(done.state, done.goal, done.next_goal.unsqueeze(1)).squeeze(1)
         probability = afraid.calibration.probability(score)
         counts = {"interactions": float(len(done)), "crash_rate": done.crashed.float().mean().item()}
-        quality = counts | {"auroc": auroc(score, done.crashed)} | judge(probability, done.crashed)
+        quality = counts | {"auroc": auroc(score, done.crashed)} | evaluate(probability, done.crashed)
         results[name] = probability, done.crashed, quality
     return results
 

@@ -21,7 +21,7 @@ CLIP = 5.0  # bound of whitened inputs, as in the paper
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """The goal whose (state, goal in force, next goal) a trained network predicts a frozen random one worst on."""
+    """The goal whose (state, active goal, next goal) a trained network predicts a frozen random one worst on."""
 
     rule: Literal["argmax", "proportional"] = "argmax"
     """Take the most surprising candidate, or draw in proportion to the surprise."""
@@ -88,7 +88,7 @@ class RND(GoalSelector):
         self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=spaces.device))
         self.generator = generator(seed, "rnd minibatches", spaces.device)
-        # Inputs are whitened by the moments of states, goals in force and *uniform* candidates; those of the
+        # Inputs are whitened by the moments of states, active goals and *uniform* candidates; those of the
         # chosen goals would drift with what is chosen.
         self._uniform = torch.full((spaces.num_envs, spaces.goal_dim), torch.nan, device=spaces.device)
         self._moments = torch.zeros(3, inputs, dtype=torch.float64, device=spaces.device)  # count, sum, of squares
@@ -115,12 +115,7 @@ class RND(GoalSelector):
         context = self._whiten(torch.cat([state, goal], dim=1), self._context)
         if self._fused is not None:
             return self._fused(context, candidates)
-        scores = []
-        # Features of all candidates together would not fit a cache; fresh memory for them costs more than the products.
-        size = self._error.contexts_at_once(candidates.shape[1])
-        for known, part in zip(context.split(size), candidates.split(size), strict=True):
-            scores.append(self._error(known, self._whiten(part, self._goal)).square_().mean(2))
-        return scores[0] if len(scores) == 1 else torch.cat(scores)
+        return self._error(context, self._whiten(candidates, self._goal)).square_().mean(2)
 
     @torch.no_grad()
     def _join(self) -> None:

@@ -67,7 +67,7 @@ class Schedule(Delegate):
         """See ``GoalSelector.learn``."""
         row = {"schedule/switched": float(self.switched)}
         first, second = self.parts
-        # The scores at issue are those of whoever chose: the other one must not judge itself by them.
+        # The scores at issue are those of whoever chose: the other one must not be evaluated by them.
         of_first, of_second = interactions, interactions.without_scores()
         if self.switched:
             of_first, of_second = of_second, of_first

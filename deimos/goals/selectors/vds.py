@@ -163,25 +163,21 @@ class VDS(GoalSelector):
             value = self.values(rollout.obs)
         else:
             value = self._own_values(rollout.obs, worlds)
-        next_value = value[:, 1:]
+        old, next_value = value.transpose(0, 1)[:-1], value.transpose(0, 1)[1:]  # (num_steps, K, worlds of each)
+        reward, terminated, truncated = (
+            tensor[:, worlds] for tensor in (rollout.reward, rollout.terminated, rollout.truncated)
+        )
         step, world, obs = rollout.cut_off()
         if len(step):
-            final = torch.zeros(len(worlds), *rollout.truncated.shape, device=value.device)
-            final[:, step, world] = self.values(obs)
-            own = final.gather(2, worlds.unsqueeze(1).expand(-1, rollout.num_steps, -1))
-            next_value = torch.where(_of_worlds(rollout.truncated, worlds), own, next_value)
-        old = value[:, :-1]
-
-        def along_time(tensor: Tensor) -> Tensor:  # (K, num_steps, m) -> (num_steps, K * m)
-            return tensor.transpose(0, 1).flatten(1)
-
+            final = torch.zeros(*rollout.truncated.shape, len(worlds), device=value.device)
+            final[step, world] = self.values(obs).t()
+            member = torch.arange(len(worlds), device=value.device).unsqueeze(1)
+            next_value = torch.where(truncated, final[:, worlds, member], next_value)
         advantage = advantages(
-            along_time(_of_worlds(rollout.reward, worlds)) * rollout.reward_scale, along_time(old),
-            along_time(next_value), along_time(_of_worlds(rollout.terminated, worlds)),
-            along_time(_of_worlds(rollout.truncated, worlds)),
+            reward * rollout.reward_scale, old, next_value, terminated, truncated,
             discount=rollout.discount, gae_lambda=rollout.gae_lambda,
         )  # fmt: skip
-        return old, advantage.view(rollout.num_steps, len(worlds), -1).transpose(0, 1) + old
+        return old.transpose(0, 1), (advantage + old).transpose(0, 1)
 
     def _own_values(self, obs: Tensor, worlds: Tensor) -> Tensor:
         """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
@@ -223,8 +219,3 @@ class VDS(GoalSelector):
         """See ``GoalSelector.check``."""
         if not bool(self._parameters.isfinite().all()):
             raise SimulationError("A weight of the VDS ensemble is not finite after a fit.")
-
-
-def _of_worlds(tensor: Tensor, worlds: Tensor) -> Tensor:
-    """The columns of ``tensor``, shape (steps, num_envs), that each critic has, shape (K, steps, worlds of each)."""
-    return tensor[:, worlds].transpose(0, 1)
