@@ -282,9 +282,9 @@ def poison_world(name):
         (poison_fear, r"Iteration 3: A weight of the fear network is not finite"),
         (poison_world("position"), r"Iteration 3: World 17: its .*position.* is not finite"),
         (poison_world("velocity"), r"Iteration 3: World 17: its .*velocity.* is not finite"),
-        (poison_world("target"), r"Iteration 3: World 17: its .*goal.* is not finite"),
+        (poison_world("goal"), r"Iteration 3: World 17: its .*goal.* is not finite"),
     ],
-    ids=["actor", "critic", "fear", "position", "velocity", "target"],
+    ids=["actor", "critic", "fear", "position", "velocity", "goal"],
 )  # fmt: skip
 def test_nan_stops_the_run_and_keeps_the_checkpoint(tmp_path, poison, message):
     """NaN in a weight or a world stops the run, says where, and leaves the checkpoint of before, which loads."""
