@@ -138,7 +138,8 @@ def _name_tiles(axis: Any, terrain: Terrain) -> None:
     if terrain.origins.shape[:2] == (1, 1):
         return  # the title says it all
     x, y = np.moveaxis(terrain.origins[..., :2] - terrain.corner - np.divide(terrain.size, 2), -1, 0)
-    levels = [f"level {number}\nd = {difficulty:.2g}" for number, difficulty in enumerate(terrain.difficulty)]
+    between = "\n" if _is_wide(terrain) else ", "
+    levels = [f"level {number}{between}d = {difficulty:.2g}" for number, difficulty in enumerate(terrain.difficulty)]
     groups = [(name, list(group)) for name, group in groupby(range(y.shape[1]), key=lambda j: terrain.shapes[j])]
     columns, middles = [name for name, _ in groups], [y[:, group].mean() for _, group in groups]
     axis.set_axis_on()
