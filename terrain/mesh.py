@@ -51,7 +51,7 @@ def sheet(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
 
 
 def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
-    """Level rectangles with vertical risers between those of different height.
+    """Flat rectangles with vertical risers between those of different height.
 
     Args:
         x: Where a rectangle ends and the next begins [m], rising, shape (n + 1,).
@@ -78,7 +78,7 @@ def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
 
 
 def rings(half_sides: np.ndarray, heights: np.ndarray) -> Mesh:
-    """Nested level squares around the origin, with vertical risers.
+    """Nested flat squares around the origin, with vertical risers.
 
     Args:
         half_sides: Half side of each square [m], falling, shape (n,). A square as large as the one before hides it.

@@ -89,30 +89,37 @@ def _draw(terrain: Terrain, colours: Any, step: float, turn: float, tilt: float)
     stride = max(1, int(step / terrain.cell))
     ground = (terrain.heights.T[::-1] if _is_wide(terrain) else terrain.heights)[::stride, ::stride]
     cell = stride * terrain.cell
-    light = LightSource(azdeg=315, altdeg=30)  # flat ground keeps its colour
-    shaded = light.shade(ground, colours.cmap, colours.norm, blend_mode="soft", dx=cell, dy=cell)[..., :3]
+    light = LightSource(azdeg=315, altdeg=30)  # brightness 1/2 where it is flat, which keeps the colour of its height
+    south, east = np.gradient(ground, cell)
+    normals = np.stack([-east, south, np.ones_like(east)], axis=-1)
+    brightness = (normals @ light.direction / np.linalg.norm(normals, axis=-1)).clip(0.0, 1.0)
 
     half_height, half_width = (cell * (side - 1) / 2 for side in ground.shape)
     reach = half_width * math.cos(turn) + half_height * math.sin(turn)
     depth = half_width * math.sin(turn) + half_height * math.cos(turn)
-    across, away = np.arange(-reach, reach, step)[None, :], np.arange(-depth, depth, step)[:, None]
-    column = np.rint((half_width + across * math.cos(turn) - away * math.sin(turn)) / cell).astype(int)
-    row = np.rint((half_height - across * math.sin(turn) - away * math.cos(turn)) / cell).astype(int)
+    across = np.arange(-reach + step / 2, reach, step, np.float32)[None, :]  # middles of the pixels
+    away = np.arange(-depth, depth + step, step, np.float32)[:, None]
+    column = np.rint((half_width + across * math.cos(turn) - away * math.sin(turn)) / cell).astype(np.int32)
+    row = np.rint((half_height - across * math.sin(turn) - away * math.cos(turn)) / cell).astype(np.int32)
     inside = (column >= 0) & (column < ground.shape[1]) & (row >= 0) & (row < ground.shape[0])
-    column, row = column.clip(0, ground.shape[1] - 1), row.clip(0, ground.shape[0] - 1)
+    place = row.clip(0, ground.shape[0] - 1), column.clip(0, ground.shape[1] - 1)
     edge, rise = away * math.sin(tilt), math.cos(tilt)
-    top = np.maximum.accumulate(np.where(inside, edge + ground[row, column] * rise, -np.inf), axis=0)
+    top = np.maximum.accumulate(np.where(inside, edge + ground[place] * rise, -np.inf), axis=0)
 
     foot = min(0.0, float(ground.min())) * rise - 0.01 * max(terrain.size) * rise  # of the cut around the ground
-    heights = np.arange(edge[0, 0] + foot, top.max(), step)  # of the picture's rows
-    picture = np.ones((len(heights), across.shape[1], 3))
-    for k in range(across.shape[1]):
-        near = edge[int(inside[:, k].argmax()), 0]  # where the ground begins
-        seen = np.searchsorted(top[:, k], heights)
-        ground_rows = (seen < len(top)) & (heights >= near)
-        picture[ground_rows, k] = shaded[row[seen[ground_rows], k], column[seen[ground_rows], k]]
-        picture[(heights < near) & (heights >= near + foot) & inside[:, k].any(), k] = WALL
-    return picture[::-1], (-reach, reach, heights[0], heights[-1])
+    up = np.arange(edge[0, 0] + foot + step / 2, top.max(), step)[:, None]  # middles of the pixels
+    seen = np.stack([np.searchsorted(samples, up[:, 0]) for samples in top.T], axis=1)
+    near = edge[inside.argmax(axis=0), 0]  # where the ground begins
+    beside = (seen == len(top)) | (up < near)
+    seen = seen.clip(1, len(top) - 1)
+    here, before = (np.take_along_axis(ground[place], index, axis=0) for index in (seen, seen - 1))
+    height = ((up - edge[seen, 0]) / rise).clip(np.minimum(here, before), here)  # from the foot of a riser to its top
+    shade = np.take_along_axis(brightness[place], seen, axis=0)
+    picture = light.blend_soft_light(colours.to_rgba(height)[..., :3], shade[..., None])
+    picture[beside] = 1.0
+    picture[beside & (up < near) & (up >= near + foot) & inside.any(axis=0)] = WALL
+    bottom = up[0, 0] - step / 2
+    return picture[::-1], (-reach, step * picture.shape[1] - reach, bottom, step * picture.shape[0] + bottom)
 
 
 def _scale_bar(axis: Any, left: float, right: float, bottom: float, top: float) -> None:
@@ -131,7 +138,8 @@ def _name_tiles(axis: Any, terrain: Terrain) -> None:
     if terrain.origins.shape[:2] == (1, 1):
         return  # the title says it all
     x, y = np.moveaxis(terrain.origins[..., :2] - terrain.corner - np.divide(terrain.size, 2), -1, 0)
-    levels = [f"level {number}\nd = {difficulty:.2g}" for number, difficulty in enumerate(terrain.difficulty)]
+    between = "\n" if _is_wide(terrain) else ", "
+    levels = [f"level {number}{between}d = {difficulty:.2g}" for number, difficulty in enumerate(terrain.difficulty)]
     groups = [(name, list(group)) for name, group in groupby(range(y.shape[1]), key=lambda j: terrain.shapes[j])]
     columns, middles = [name for name, _ in groups], [y[:, group].mean() for _, group in groups]
     axis.set_axis_on()

@@ -16,7 +16,7 @@ Ramp = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class TileShape(abc.ABC):
-    """A square of ground around the origin, at height 0 along its edge, with a level middle to stand on.
+    """A square of ground around the origin, at height 0 along its edge, with a flat middle to stand on.
 
     A file of ``terrain.shapes`` holds one, named ``Shape``; its fields are its parameters. Every number must be
     positive, and both ends of a ramp at least 0; further checks belong into ``__post_init__``. A field ``direction``
@@ -27,7 +27,7 @@ class TileShape(abc.ABC):
     tile: float = 8.0
     """Side of the square [m], positive."""
     platform: float = 3.0
-    """Side of the level middle [m], positive and smaller than the tile."""
+    """Side of the flat middle [m], positive and smaller than the tile."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -34,7 +34,7 @@ class Share:
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Tiles of rising difficulty along x (levels), a column for each shape along y, and a level border around."""
+    """Tiles of rising difficulty along x (levels), a column for each shape along y, and a flat border around."""
 
     shapes: tuple[Share, ...]
     """What the columns are made of, in order, at least one."""
@@ -45,7 +45,7 @@ class Grid:
     tile: float = 8.0
     """Side of a tile [m], positive."""
     border: float = 25.0
-    """Width of the level border [m], at least 0."""
+    """Width of the flat border [m], at least 0."""
     cell: float = 0.05
     """Distance of two samples of the height grid [m]; must divide tile and border."""
     easiest: float = 0.0

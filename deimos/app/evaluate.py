@@ -121,13 +121,13 @@ def _evaluate_fear(trainer: Trainer, folder: RunFolder, options: EvaluateOptions
         folder.write_json("audit.json", found)
         _print_table("Fear network against exact outcomes", {"": found}, _AUDIT)
         return
-    judged = audit.audit_calibration(trainer, options.calibration)
-    qualities = {name: quality for name, (_, _, quality) in judged.items()}
+    audited = audit.audit_calibration(trainer, options.calibration)
+    qualities = {name: quality for name, (_, _, quality) in audited.items()}
     folder.write_json("calibration.json", qualities)
     names = next(iter(qualities.values()))
     lines = [(name.replace("_", " "), name, ".0f" if name == "interactions" else ".4f") for name in names]
     _print_table("Fear network's probabilities", qualities, lines)
-    print(figures.draw_calibration(folder, {name: (p, crashed) for name, (p, crashed, _) in judged.items()}))
+    print(figures.draw_calibration(folder, {name: (p, crashed) for name, (p, crashed, _) in audited.items()}))
 
 
 def _print_evaluation(rows: list[dict]) -> None:

@@ -47,12 +47,12 @@ def draw_summary(folder: RunFolder, title: str, evaluated: list[dict]) -> Path:
     return _save(figure, folder.path / "summary.png")
 
 
-def draw_calibration(folder: RunFolder, judged: "dict[str, tuple[Tensor, Tensor]]") -> Path:
+def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor]]") -> Path:
     """Draw ``calibration.png``: predicted against observed crash rates, with the predictions' histogram below.
 
     Args:
         folder: The run.
-        judged: By kind of goals: probabilities, shape (n,), and whether the goal ended in a crash, bool, shape (n,).
+        audited: By kind of goals: probabilities, shape (n,), and whether the goal ended in a crash, bool, shape (n,).
 
     Raises:
         RunError: If it cannot be written.
@@ -63,7 +63,7 @@ def draw_calibration(folder: RunFolder, judged: "dict[str, tuple[Tensor, Tensor]
     figure = Figure(figsize=(6, 7), layout="constrained")
     curves, histogram = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)
     curves.plot([0, 1], [0, 1], color="grey", linewidth=0.8, linestyle=":")
-    for (name, (probability, crashed)), colour, marker in zip(judged.items(), (ORANGE, BLUE), "so", strict=False):
+    for (name, (probability, crashed)), colour, marker in zip(audited.items(), (ORANGE, BLUE), "so", strict=False):
         bins = reliability(probability, crashed)
         crashes = (bins.observed * bins.count).round().long().tolist()
         tests = [binomtest(k, n) for k, n in zip(crashes, bins.count.tolist(), strict=True)]

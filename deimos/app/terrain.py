@@ -160,11 +160,11 @@ def field_docs(cls: type) -> dict[str, str]:
 def build_shape(arguments: list[str], program: str) -> None:
     """Build one tile."""
     known = f"one of: {', '.join(catalog.names())}"
-    if {"-h", "--help"} & set(arguments[:1]):
+    if not arguments or arguments[0].startswith("-"):
+        if not {"-h", "--help"} & set(arguments):
+            raise RunError(f"shape needs a name first, {known}.")
         print(f"usage: {program} NAME [OPTIONS]\n\nNAME is {known}.\n{program} NAME --help explains its parameters.")
         return
-    if not arguments or arguments[0].startswith("-"):
-        raise RunError(f"shape needs a name first, {known}.")
     name, rest = arguments[0], arguments[1:]
     options = console.parse(_shape_options(name), rest, f"{program} {name}")
     check_range("difficulty", options.difficulty, 0, 1)

@@ -1,4 +1,4 @@
-"""Level ground."""
+"""Flat ground."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from ..shape import TileShape
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Level ground at every difficulty."""
+    """Flat ground at every difficulty."""
 
     @property
     def standing_room(self) -> float:

@@ -10,7 +10,7 @@ from ..shape import Ramp, TileShape, at
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """A level middle with a vertical wall all around."""
+    """A flat middle with a vertical wall all around."""
 
     platform: float = 4.0
     """Side of the floor [m], positive and smaller than the tile."""

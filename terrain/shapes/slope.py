@@ -1,4 +1,4 @@
-"""Four slopes between the edge and a level middle."""
+"""Four slopes between the edge and a flat middle."""
 
 from dataclasses import dataclass
 from typing import Literal

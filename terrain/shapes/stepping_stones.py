@@ -10,7 +10,7 @@ from ..shape import Ramp, TileShape, at, check_ramp
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Rows of square stones over a deep floor, each row shifted at random, around a level middle."""
+    """Rows of square stones over a deep floor, each row shifted at random, around a flat middle."""
 
     side: Ramp = (1.575, 0.075)
     """Side of a stone at difficulty 0 and at 1 [m], each positive; Legged Gym's 1.5 (1.05 - d). Changed as little
@@ -20,7 +20,7 @@ class Shape(TileShape):
     depth: float = 1.0
     """Depth of the floor [m], positive."""
     rim: float = 0.5
-    """Width of the level rim along the edge [m], positive."""
+    """Width of the flat rim along the edge [m], positive."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

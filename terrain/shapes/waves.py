@@ -12,10 +12,10 @@ from ..shape import Ramp, TileShape, at
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Round hills and hollows, the product of a sine along x and one along y, fading out around a level middle."""
+    """Round hills and hollows, the product of a sine along x and one along y, fading out around a flat middle."""
 
     platform: float = 1.0
-    """Side of the level middle [m], positive and smaller than the tile."""
+    """Side of the flat middle [m], positive and smaller than the tile."""
     height: Ramp = (0.0, 0.2)
     """Height from a hollow to a hill at difficulty 0 and at 1 [m], each at least 0."""
     count: int = 4
