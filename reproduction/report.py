@@ -55,7 +55,7 @@ def _verdict(outcome: Outcome) -> str:
 
 
 def _tally(outcome: Outcome) -> str:
-    counts: Counter[str] = Counter(each.verdict for each in outcome.judged)
+    counts: Counter[str] = Counter(each.verdict for each in outcome.assessed)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in claims.VERDICTS if counts[verdict])
 
 
@@ -71,7 +71,7 @@ def _details(outcome: Outcome) -> list[Block]:
             f"(wanted {each.finding.wanted:.2g})",
             each.verdict + ("" if each.finding.required else " (can only contradict)"),
         ]
-        for each in outcome.judged
+        for each in outcome.assessed
     ]  # fmt: skip
     header = ["where", "what", "n", "effect", "size [95 %]", "p", "minimum detectable effect", "verdict"]
     return [*blocks, Table(header, rows)] if rows else [*blocks, Paragraph("There are no data for it here.")]
