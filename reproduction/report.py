@@ -7,7 +7,7 @@ from pathlib import Path
 
 from deimos.study import report
 from deimos.study.data import Data
-from deimos.study.document import Block, Bullets, Heading, Paragraph, Table
+from deimos.study.document import Block, Table
 from deimos.study.report import interval
 from reproduction import claims
 from reproduction.claim_list import CLAIMS
@@ -26,10 +26,10 @@ def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
     """The sections of every study, the claims after what was run, and their tests at the end."""
     outcomes = [claims.test(claim, data.only(LEGGED_METHODS)) for claim in CLAIMS]
     return [
-        Heading("A study of goal selection", 1), *report.what_was_run(data), *_verdicts(outcomes),
+        "# A study of goal selection", *report.what_was_run(data), *_verdicts(outcomes),
         *report.environments(data, captions), *report.over_all(data),
         *report.speed(data, RATIOS_4_1), *[block for outcome in outcomes for block in _details(outcome)],
-        Heading("Limits"), Bullets(_limits(data)),
+        "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
 
 
@@ -41,11 +41,9 @@ def _verdicts(outcomes: Sequence[Outcome]) -> list[Block]:
         for o in outcomes
     ]
     return [
-        Heading("Claims"),
-        Paragraph(
-            f"Of the thesis's {len(outcomes)} claims: {summary}. They are tested on the thesis's own methods; the "
-            "tests of each, with effects, are below."
-        ),
+        "## Claims",
+        f"Of the thesis's {len(outcomes)} claims: {summary}. They are tested on the thesis's own methods; the "
+        "tests of each, with effects, are below.",
         Table(["claim", "what the thesis says", "verdict", "tests made", "what they say", "without data"], rows),
     ]
 
@@ -61,8 +59,8 @@ def _tally(outcome: Outcome) -> str:
 
 def _details(outcome: Outcome) -> list[Block]:
     claim = outcome.claim
-    blocks: list[Block] = [Heading(f"{claim.id}: {_verdict(outcome)}", 3), Paragraph(claim.text)]
-    blocks.append(Paragraph(f"Test: {claim.test}." + (f" {claim.note}" if claim.note else "")))
+    blocks: list[Block] = [f"### {claim.id}: {_verdict(outcome)}", claim.text]
+    blocks.append(f"Test: {claim.test}." + (f" {claim.note}" if claim.note else ""))
     rows = [
         [
             str(each.finding.where), each.finding.what, " + ".join(map(str, each.finding.n)), each.finding.effect,
@@ -74,7 +72,7 @@ def _details(outcome: Outcome) -> list[Block]:
         for each in outcome.assessed
     ]  # fmt: skip
     header = ["where", "what", "n", "effect", "size [95 %]", "p", "minimum detectable effect", "verdict"]
-    return [*blocks, Table(header, rows)] if rows else [*blocks, Paragraph("There are no data for it here.")]
+    return [*blocks, Table(header, rows)] if rows else [*blocks, "There are no data for it here."]
 
 
 def _limits(data: Data) -> list[str]:
