@@ -14,6 +14,7 @@ from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import FACTOR, LEAST, PROBABILITY, REWARD_SHARE, SPREAD
 from reproduction.claims import Outcome
 from reproduction.figures import STYLE, figures
+from reproduction.significance import detectable_spread
 from reproduction.thesis import LEGGED_METHODS, RATIOS_4_1
 
 
@@ -78,9 +79,11 @@ def _details(outcome: Outcome) -> list[Block]:
 def _limits(data: Data) -> list[str]:
     """Those of every study, and of the tests of claims."""
     unit, power, *rest = report.limits(data)
+    r10, r30 = (detectable_spread(n, n) for n in (10, 30))
     return [
         unit,
-        f"{power} Nothing is tested below {LEAST} policies.",
+        f"{power} A ratio of standard deviations must be {r10:.1f} and {r30:.1f} to be found. Nothing is tested below "
+        f"{LEAST} policies.",
         f"Declared beforehand: of interest are P = {PROBABILITY} and ratios of spread of {SPREAD:g}; equivalent are "
         f"crashes within a factor of {FACTOR:g} and rewards within {100 * REWARD_SHARE:.0f} % of Uniform's median. "
         "`Undecided` is a test that would probably have found such an effect and did not; `underpowered` one that "
