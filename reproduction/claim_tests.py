@@ -77,7 +77,7 @@ def spread(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
     return [Finding(
         what=what, where=where, effect="ratio of IQRs", interval=interval,
         p_for=p if distance[0] > distance[1] else 1.0, p_against=p if distance[0] < distance[1] else 1.0,
-        detectable=lambda alpha: stats.detectable_spread(len(x), len(y), round(alpha, 6)), wanted=SPREAD,
+        detectable=lambda alpha: significance.detectable_spread(len(x), len(y), round(alpha, 6)), wanted=SPREAD,
         n=(len(x), len(y)),
     )]  # fmt: skip
 

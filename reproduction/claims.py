@@ -40,7 +40,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Judged:
+class Assessed:
     """A finding with what it says after the correction for the number of tests of its claim."""
 
     finding: Finding
@@ -48,7 +48,7 @@ class Judged:
     verdict: Verdict
     """What it says."""
     p: float
-    """The smaller of its two p-values, corrected as ``judge`` says."""
+    """The smaller of its two p-values, corrected as ``assess`` says."""
     detectable: float
     """Smallest effect that it could have found with a power of 80 %, at the corrected level."""
 
@@ -83,7 +83,7 @@ class Outcome:
     """The claim."""
     verdict: Verdict
     """What its findings say together."""
-    judged: list[Judged] = field(default_factory=list)
+    assessed: list[Assessed] = field(default_factory=list)
     """Its findings."""
     missing: tuple[str, ...] = ()
     """Environments that it speaks of and that have no data for it."""
@@ -91,7 +91,7 @@ class Outcome:
     @property
     def made(self) -> int:
         """Required tests that there were data for."""
-        return sum(each.finding.required for each in self.judged)
+        return sum(each.finding.required for each in self.assessed)
 
     @property
     def in_part(self) -> bool:
@@ -104,11 +104,11 @@ def test(claim: Claim, data: Data) -> Outcome:
     found = {environment: claim.findings(data, environment) for environment in claim.environments}
     findings = [finding for part in found.values() for finding in part]
     missing = tuple(environment for environment, part in found.items() if not part)
-    judged = judge(findings, claim.combine)
-    return Outcome(claim, combined(judged, claim.combine, claim.planned), judged, missing)
+    assessed = assess(findings, claim.combine)
+    return Outcome(claim, combined(assessed, claim.combine, claim.planned), assessed, missing)
 
 
-def judge(findings: Sequence[Finding], combine: Literal["all", "any"] = "all", alpha: float = ALPHA) -> list[Judged]:
+def assess(findings: Sequence[Finding], combine: Literal["all", "any"] = "all", alpha: float = ALPHA) -> list[Assessed]:
     """Say what each finding of a claim means, with p-values corrected so that the claim's verdicts have level alpha.
 
     A claim that needs all its findings is supported only if every test rejects the opposite at level alpha. Such an
@@ -128,7 +128,7 @@ def judge(findings: Sequence[Finding], combine: Literal["all", "any"] = "all", a
         against = holm(against).tolist()
     else:
         for_claim = holm(for_claim).tolist()
-    judged = []
+    assessed = []
     for finding, p_for, p_against in zip(findings, for_claim, against, strict=True):
         detectable = finding.detectable(alpha / len(findings))
         verdict: Verdict = "undecided" if detectable <= finding.wanted else "underpowered"
@@ -136,18 +136,18 @@ def judge(findings: Sequence[Finding], combine: Literal["all", "any"] = "all", a
             verdict = "supported"
         elif p_against < alpha:
             verdict = "contradicted"
-        judged.append(Judged(finding, verdict, float(min(p_for, p_against)), detectable))
-    return judged
+        assessed.append(Assessed(finding, verdict, float(min(p_for, p_against)), detectable))
+    return assessed
 
 
-def combined(judged: Sequence[Judged], how: Literal["all", "any"] = "all", planned: int = 1) -> Verdict:
+def combined(assessed: Sequence[Assessed], how: Literal["all", "any"] = "all", planned: int = 1) -> Verdict:
     """The verdict over all findings of a claim.
 
     With ``all``, one contradicted finding contradicts the claim, and every required one must support it. With
     ``any``, one supported finding is enough, and the claim is contradicted only if all that were planned are.
     """
-    required = [each.verdict for each in judged if each.finding.required]
-    verdicts = [each.verdict for each in judged]
+    required = [each.verdict for each in assessed if each.finding.required]
+    verdicts = [each.verdict for each in assessed]
     if not required:
         return "contradicted" if "contradicted" in verdicts else "not testable"
     if how == "any":

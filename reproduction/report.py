@@ -7,13 +7,14 @@ from pathlib import Path
 
 from deimos.study import report
 from deimos.study.data import Data
-from deimos.study.document import Block, Bullets, Heading, Paragraph, Table
+from deimos.study.document import Block, Table
 from deimos.study.report import interval
 from reproduction import claims
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import FACTOR, LEAST, PROBABILITY, REWARD_SHARE, SPREAD
 from reproduction.claims import Outcome
 from reproduction.figures import STYLE, figures
+from reproduction.significance import detectable_spread
 from reproduction.thesis import LEGGED_METHODS, RATIOS_4_1
 
 
@@ -26,10 +27,10 @@ def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
     """The sections of every study, the claims after what was run, and their tests at the end."""
     outcomes = [claims.test(claim, data.only(LEGGED_METHODS)) for claim in CLAIMS]
     return [
-        Heading("A study of goal selection", 1), *report.what_was_run(data), *_verdicts(outcomes),
+        "# A study of goal selection", *report.what_was_run(data), *_verdicts(outcomes),
         *report.environments(data, captions), *report.over_all(data),
         *report.speed(data, RATIOS_4_1), *[block for outcome in outcomes for block in _details(outcome)],
-        Heading("Limits"), Bullets(_limits(data)),
+        "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
 
 
@@ -41,11 +42,9 @@ def _verdicts(outcomes: Sequence[Outcome]) -> list[Block]:
         for o in outcomes
     ]
     return [
-        Heading("Claims"),
-        Paragraph(
-            f"Of the thesis's {len(outcomes)} claims: {summary}. They are tested on the thesis's own methods; the "
-            "tests of each, with effects, are below."
-        ),
+        "## Claims",
+        f"Of the thesis's {len(outcomes)} claims: {summary}. They are tested on the thesis's own methods; the "
+        "tests of each, with effects, are below.",
         Table(["claim", "what the thesis says", "verdict", "tests made", "what they say", "without data"], rows),
     ]
 
@@ -55,14 +54,14 @@ def _verdict(outcome: Outcome) -> str:
 
 
 def _tally(outcome: Outcome) -> str:
-    counts: Counter[str] = Counter(each.verdict for each in outcome.judged)
+    counts: Counter[str] = Counter(each.verdict for each in outcome.assessed)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in claims.VERDICTS if counts[verdict])
 
 
 def _details(outcome: Outcome) -> list[Block]:
     claim = outcome.claim
-    blocks: list[Block] = [Heading(f"{claim.id}: {_verdict(outcome)}", 3), Paragraph(claim.text)]
-    blocks.append(Paragraph(f"Test: {claim.test}." + (f" {claim.note}" if claim.note else "")))
+    blocks: list[Block] = [f"### {claim.id}: {_verdict(outcome)}", claim.text]
+    blocks.append(f"Test: {claim.test}." + (f" {claim.note}" if claim.note else ""))
     rows = [
         [
             str(each.finding.where), each.finding.what, " + ".join(map(str, each.finding.n)), each.finding.effect,
@@ -71,18 +70,20 @@ def _details(outcome: Outcome) -> list[Block]:
             f"(wanted {each.finding.wanted:.2g})",
             each.verdict + ("" if each.finding.required else " (can only contradict)"),
         ]
-        for each in outcome.judged
+        for each in outcome.assessed
     ]  # fmt: skip
     header = ["where", "what", "n", "effect", "size [95 %]", "p", "minimum detectable effect", "verdict"]
-    return [*blocks, Table(header, rows)] if rows else [*blocks, Paragraph("There are no data for it here.")]
+    return [*blocks, Table(header, rows)] if rows else [*blocks, "There are no data for it here."]
 
 
 def _limits(data: Data) -> list[str]:
     """Those of every study, and of the tests of claims."""
     unit, power, *rest = report.limits(data)
+    r10, r30 = (detectable_spread(n, n) for n in (10, 30))
     return [
         unit,
-        f"{power} Nothing is tested below {LEAST} policies.",
+        f"{power} A ratio of standard deviations must be {r10:.1f} and {r30:.1f} to be found. Nothing is tested below "
+        f"{LEAST} policies.",
         f"Declared beforehand: of interest are P = {PROBABILITY} and ratios of spread of {SPREAD:g}; equivalent are "
         f"crashes within a factor of {FACTOR:g} and rewards within {100 * REWARD_SHARE:.0f} % of Uniform's median. "
         "`Undecided` is a test that would probably have found such an effect and did not; `underpowered` one that "

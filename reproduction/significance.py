@@ -154,3 +154,24 @@ def detectable_mean(x: Array, alpha: float = 0.05) -> float:
     """Smallest mean that a two-sided t test tells from 0 with a power of 80 %, at this spread."""
     t = stats.t(len(x) - 1)
     return float((t.ppf(1 - alpha / 2) + t.ppf(POWER)) * x.std(ddof=1) / math.sqrt(len(x)))
+
+
+@lru_cache
+def detectable_spread(n: int, m: int, alpha: float = 0.05, populations: int = 4000) -> float:
+    """Smallest ratio of standard deviations that Brown and Forsythe's test finds with a power of 80 %.
+
+    Simulated on normal samples, to 0.5 %; at most 100.
+    """
+    rng = np.random.default_rng(0)
+    x, y = (rng.normal(size=(populations, k)) for k in (n, m))
+
+    def power(ratio: float) -> float:
+        return float((stats.levene(ratio * x, y, center="median", axis=1).pvalue < alpha).mean())
+
+    low, high = 1.0, 100.0
+    if power(high) < POWER:
+        return high
+    while high / low > 1.005:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if power(middle) >= POWER else (middle, high)
+    return high

@@ -175,7 +175,8 @@ def test_empty_folder_has_no_report(tmp_path):
 
 def test_text_is_escaped():
     """What HTML or a Markdown table would take for markup is only text."""
-    blocks = [document.Heading("a < b"), document.Table(["x"], [["P(a | b) & <c>"]])]
+    blocks = ["# a < b", document.Table(["x"], [["P(a | b) & <c>"]])]
+    assert "<h1>a &lt; b</h1>" in document.to_html(blocks, None)
     assert "<td>P(a | b) &amp; &lt;c&gt;</td>" in document.to_html(blocks, None)
     assert "| P(a \\| b) & <c> |" in document.to_markdown(blocks, "figures")
 
@@ -231,7 +232,7 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
     def page(data, captions):
         assert list(captions) == ["own-directional", "own-quad"]
         pictures = [document.Picture(name, caption) for name, caption in captions.items()]
-        return [document.Heading("Mine", 1), *pictures]
+        return ["# Mine", *pictures]
 
     def draw(data, environment):
         return {f"own-{environment}": ("A caption.", lambda: figures.boxes(data, environment, 100))}

@@ -133,16 +133,6 @@ def test_detectable_probability_is_noethers():
     assert stats.detectable_probability(3, 3) == math.inf  # 3 above 3 is p = 0.1
 
 
-def test_detectable_spread_has_the_promised_power():
-    """At the ratio that it names, SciPy's Brown-Forsythe test on fresh normal samples finds 80 %."""
-    ratio = stats.detectable_spread(10, 10)
-    rng = np.random.default_rng(3)
-    x, y = ratio * rng.normal(size=(2000, 10)), rng.normal(size=(2000, 10))
-    p = scipy_stats.levene(x, y, center="median", axis=1).pvalue
-    # Both shares are binomial: standard errors of sqrt(0.16 / 4000) and sqrt(0.16 / 2000), four of them together.
-    assert (p < 0.05).mean() == pytest.approx(0.8, abs=4 * math.sqrt(0.16 / 4000 + 0.16 / 2000))
-
-
 @pytest.mark.parametrize("x", [np.array([1.0]), np.ones((2, 2)), np.array([1.0, math.nan])])
 def test_bad_samples_are_refused(x):
     """A sample is two numbers or more along one axis."""

@@ -92,10 +92,10 @@ def test_complete_data_give_every_planned_test(alike, claim):
     """With every method in every environment a claim makes exactly the tests that were planned."""
     outcome = claims.test(claim, alike)
     assert (outcome.made, outcome.missing, outcome.in_part) == (claim.planned, (), False)
-    for judged in outcome.judged:
-        assert 0.0 <= judged.p <= 1.0
-        assert judged.detectable >= 0.0
-        assert not math.isnan(judged.finding.interval.estimate)
+    for assessed in outcome.assessed:
+        assert 0.0 <= assessed.p <= 1.0
+        assert assessed.detectable >= 0.0
+        assert not math.isnan(assessed.finding.interval.estimate)
 
 
 def test_only_some_methods_are_left():
@@ -114,7 +114,7 @@ def test_only_some_methods_are_left():
 def test_no_data_is_not_testable(claim):
     """Where no environment of a claim was run, it is not testable, and says where data are missing."""
     outcome = claims.test(claim, Data(population(3, ["elsewhere"])))
-    assert (outcome.verdict, outcome.judged, outcome.missing) == ("not testable", [], claim.environments)
+    assert (outcome.verdict, outcome.assessed, outcome.missing) == ("not testable", [], claim.environments)
 
 
 @pytest.mark.parametrize(
@@ -128,8 +128,8 @@ def test_no_data_is_not_testable(claim):
 )
 def test_verdict_of_one_finding(p_for, p_against, detectable, verdict):
     """A miss is undecided only if the test could have found the smallest effect of interest."""
-    (judged,) = claims.judge([finding(p_for, p_against, detectable)])
-    assert (judged.verdict, judged.p) == (verdict, min(p_for, p_against))
+    (assessed,) = claims.assess([finding(p_for, p_against, detectable)])
+    assert (assessed.verdict, assessed.p) == (verdict, min(p_for, p_against))
 
 
 @pytest.mark.parametrize(("how", "alone", "together"), [("all", "supported", "contradicted"),
@@ -138,11 +138,11 @@ def test_only_what_one_finding_decides_is_corrected(how, alone, together):
     """What needs every test of a claim takes p-values as they are; what one of them decides corrects them by Holm."""
     of = {"supported": (0.03, 1), "contradicted": (1, 0.03)}
     pair = [finding(*of[alone])] * 2
-    assert [(each.verdict, each.p) for each in claims.judge(pair, how)] == [(alone, 0.03)] * 2
-    assert claims.combined(claims.judge(pair, how), how, 2) == alone
+    assert [(each.verdict, each.p) for each in claims.assess(pair, how)] == [(alone, 0.03)] * 2
+    assert claims.combined(claims.assess(pair, how), how, 2) == alone
     pair = [finding(*of[together])] * 2
-    assert [(each.verdict, each.p) for each in claims.judge(pair, how)] == [("undecided", 0.06)] * 2
-    assert claims.combined(claims.judge(pair, how), how, 2) == "undecided"
+    assert [(each.verdict, each.p) for each in claims.assess(pair, how)] == [("undecided", 0.06)] * 2
+    assert claims.combined(claims.assess(pair, how), how, 2) == "undecided"
 
 
 def test_effects_are_detectable_at_the_stricter_level():
@@ -150,7 +150,7 @@ def test_effects_are_detectable_at_the_stricter_level():
     levels = []
     spy = finding(1, 1)
     object.__setattr__(spy, "detectable", lambda alpha: levels.append(alpha) or 1.0)
-    claims.judge([spy, spy])
+    claims.assess([spy, spy])
     assert levels == [0.025, 0.025]
 
 
@@ -168,16 +168,16 @@ def test_verdict_of_a_claim():
         ([yes, finding(1, 1, required=False)], "supported", "supported"),
         ([yes, finding(1, 1e-6, required=False)], "contradicted", "supported"),
     ):
-        assert claims.combined(claims.judge(findings)) == every
-        assert claims.combined(claims.judge(findings, "any"), "any") == one
-    assert claims.combined(claims.judge([no, no], "any"), "any", planned=3) == "undecided"
+        assert claims.combined(claims.assess(findings)) == every
+        assert claims.combined(claims.assess(findings, "any"), "any") == one
+    assert claims.combined(claims.assess([no, no], "any"), "any", planned=3) == "undecided"
 
 
 def test_eight_seeds_can_support_a_claim_of_ten_tests():
     """Signed ranks of 8 pairs reach p = 1 / 128 and no less: enough for a claim that needs all of its ten tests."""
     rising = claim_tests.paired_more("", "here", np.arange(1.0, 9.0), np.zeros(8))
     assert rising[0].p_for == 2 / 2**8
-    assert claims.combined(claims.judge(rising * 10), planned=10) == "supported"
+    assert claims.combined(claims.assess(rising * 10), planned=10) == "supported"
 
 
 def test_planted_effects_are_found():
@@ -190,14 +190,14 @@ def test_planted_effects_are_found():
 
     data = Data(population(20, ["directional", "absolute"], right, 0.3))
     attacked = claims.test(BY_ID["C7"], data)
-    by_method = {each.finding.what.split(":")[0]: each.verdict for each in attacked.judged}
+    by_method = {each.finding.what.split(":")[0]: each.verdict for each in attacked.assessed}
     assert by_method["p25"] != "supported"  # it crashes no more under attack here
     assert {verdict for name, verdict in by_method.items() if name not in ("p25", "rnd")} == {"supported"}
     safest = claims.test(BY_ID["C15"], data)
-    crashes = [each.verdict for each in safest.judged if each.finding.what.startswith("crashes")]
+    crashes = [each.verdict for each in safest.assessed if each.finding.what.startswith("crashes")]
     assert crashes == ["supported"] * 7
     assert claims.test(BY_ID["C1"], data).verdict != "supported"  # all train alike
-    assert [each.verdict for each in claims.test(BY_ID["C11"], data).judged] == []
+    assert [each.verdict for each in claims.test(BY_ID["C11"], data).assessed] == []
     swapped = Data(population(20, ["directional"], lambda e, m, g, t: 7.0 if m == "p25" else 5.0, 0.3))
     assert claims.test(BY_ID["C15"], swapped).verdict == "contradicted"
 
@@ -301,7 +301,7 @@ def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, tested):
     for row in rows:
         row |= {"crashes": row["seed"] % 2, "worlds": worlds, "steps": 1000}  # 1 is below 1.5, and yet too many
     outcome = claims.test(BY_ID["C11"], Data(results))
-    assert [each.finding.interval.estimate for each in outcome.judged] == [0.5] * tested
+    assert [each.finding.interval.estimate for each in outcome.assessed] == [0.5] * tested
     assert outcome.missing == (() if tested else ("relative",))
     assert (outcome.verdict == "not testable") != tested
 

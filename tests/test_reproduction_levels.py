@@ -54,7 +54,7 @@ def rates(monkeypatch, claim, verdicts=("supported", "contradicted"), only="", r
         data = study(rng, **populations)
         findings = [f for each in claim.environments for f in claim.findings(data, each) if only in f.what]
         assert findings
-        found.append(claims.combined(claims.judge(findings, claim.combine), claim.combine, len(findings)))
+        found.append(claims.combined(claims.assess(findings, claim.combine), claim.combine, len(findings)))
     shares = [found.count(verdict) / POPULATIONS for verdict in verdicts]
     print(f"\n{claim.id} {only} {populations}: {', '.join(map('{} {:.1%}'.format, verdicts, shares))}")
     return shares

@@ -117,3 +117,13 @@ def test_coverage_of_the_intervals():
     assert rows["mean", "percentile"].lognormal < rows["mean", "bootstrap-t"].lognormal
     assert rows["mean", "bootstrap-t"].normal > 0.92 - error
     assert rows["ratio of IQRs", "percentile of the logarithm"].normal > 0.97
+
+
+def test_detectable_spread_has_the_promised_power():
+    """At the ratio that it names, SciPy's Brown-Forsythe test on fresh normal samples finds 80 %."""
+    ratio = significance.detectable_spread(10, 10)
+    rng = np.random.default_rng(3)
+    x, y = ratio * rng.normal(size=(2000, 10)), rng.normal(size=(2000, 10))
+    p = scipy_stats.levene(x, y, center="median", axis=1).pvalue
+    # Both shares are binomial: standard errors of sqrt(0.16 / 4000) and sqrt(0.16 / 2000), four of them together.
+    assert (p < 0.05).mean() == pytest.approx(0.8, abs=4 * math.sqrt(0.16 / 4000 + 0.16 / 2000))

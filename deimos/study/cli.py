@@ -22,17 +22,6 @@ from deimos.study.folder import StudyFolder
 from deimos.study.results import check_comparable, identity, merge
 from deimos.study.runner import Progress, Runner
 
-USAGE = """usage: deimos study COMMAND [OPTIONS]
-
-commands:
-  run        train and evaluate a grid of environments, methods and seeds; continues where it was stopped
-  show       where a study stands
-  merge      add the results of other studies to one
-  export     write the results of a study as CSV tables
-  report     statistics and figures: one HTML page and its Markdown twin
-
-Every command explains its options with --help."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:

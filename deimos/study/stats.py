@@ -6,7 +6,6 @@ Samples are float arrays, one value per policy. Every interval is two-sided; eve
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,27 +190,6 @@ def detectable_probability(n: int, m: int, alpha: float = 0.05) -> float:
         return math.inf
     z = stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(POWER)
     return min(1.0, 0.5 + float(z) * math.sqrt((n + m) / (12 * n * m)))
-
-
-@lru_cache
-def detectable_spread(n: int, m: int, alpha: float = 0.05, populations: int = 4000) -> float:
-    """Smallest ratio of standard deviations that Brown and Forsythe's test finds with a power of 80 %.
-
-    Simulated on normal samples, to 0.5 %; at most 100.
-    """
-    rng = np.random.default_rng(0)
-    x, y = (rng.normal(size=(populations, k)) for k in (n, m))
-
-    def power(ratio: float) -> float:
-        return float((stats.levene(ratio * x, y, center="median", axis=1).pvalue < alpha).mean())
-
-    low, high = 1.0, 100.0
-    if power(high) < POWER:
-        return high
-    while high / low > 1.005:
-        middle = math.sqrt(low * high)
-        low, high = (low, middle) if power(middle) >= POWER else (middle, high)
-    return high
 
 
 def _quantiles(values: Array) -> tuple[float, float]:
