@@ -39,6 +39,9 @@ class Purpose(IntEnum):
     PUSH = 5
     FRICTION = 6
     LEVEL = 7
+    EXPLORATION = 16
+    """The learner's noise. This and what follows is drawn by torch (``deimos.nn.random``)."""
+    DIRECTOR = 17
 
 
 class vec4u(wp.types.vector(length=4, dtype=wp.uint32)):
