@@ -40,6 +40,7 @@ class WarpEnv(Env):
         dt: Duration of a step [s]; 1 where the world has no seconds.
         time_limit: Steps after which an episode is truncated; 0 for never.
         stagger: Whether the goal clock of every world's first episode starts at a random step.
+        largest_reward: Largest reward of one step for matching the goal: the unit of ``config.crash_penalty``.
     """
 
     quantities: tuple[str, ...] = ("action",)
@@ -48,13 +49,14 @@ class WarpEnv(Env):
     def __init__(
         self, config: EnvConfig, num_envs: int, device: torch.device, seed: int, env_offset: int, *,
         layout: Sequence[ObsField], goal_range: Sequence[float], action_dim: int, action_bound: float = math.inf,
-        dt: float = 1.0, time_limit: int = 0, stagger: bool = False,
+        dt: float = 1.0, time_limit: int = 0, stagger: bool = False, largest_reward: float = 1.0,
     ) -> None:  # fmt: skip
         self.config = config
         self.num_envs, self.device = num_envs, device
         self._seed, self._offset = seed, env_offset
         self.layout, self.action_dim, self.action_bound = tuple(layout), action_dim, action_bound
         self.dt, self.goal_period, self.time_limit = dt, config.goal_period, time_limit
+        self.crash_penalty = config.crash_penalty * largest_reward
         goal = self.goal_slice
         scale = next(field.scale for field in self.layout if field.name == "goal")
         scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim
@@ -62,7 +64,7 @@ class WarpEnv(Env):
         self.worlds = make_worlds(
             num_envs, warp_device(device), obs_dim=self.obs_dim, action_dim=action_dim, goal_start=goal.start,
             goal_scale=scales, goal_period=config.goal_period, time_limit=time_limit, stagger=stagger, seed=seed,
-            world_offset=env_offset, num_groups=groups if groups > 1 else 0,
+            world_offset=env_offset, crash_penalty=self.crash_penalty, num_groups=groups if groups > 1 else 0,
         )  # fmt: skip
         """What all environments have for their worlds."""
         views = {name: wp.to_torch(getattr(self.worlds, name)) for name in WORLDS.names}
@@ -146,7 +148,7 @@ class WarpEnv(Env):
         if action.shape != self.action.tensor.shape:
             expected = tuple(self.action.tensor.shape)
             raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
-        self.action.tensor.copy_(action)
+        self.action.tensor.copy_(action.detach())
         self.launch_step()
         self._steps_in_window += 1
         return self._step
@@ -155,7 +157,8 @@ class WarpEnv(Env):
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""
         self._views["mask"].copy_(mask)
-        torch.mul(self._whole_range, 1.0 if goal_scale is None else goal_scale, out=self._views["first_range"])
+        share = 1.0 if goal_scale is None else goal_scale.detach()
+        torch.mul(self._whole_range, share, out=self._views["first_range"])
         self._launch_reset()
 
     @final
@@ -165,7 +168,8 @@ class WarpEnv(Env):
             self._candidates[count] = self._record_candidates(count)
         candidates, launches = self._candidates[count]
         self._set_rows(rows)
-        torch.mul(self._seen_range, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
+        share = 1.0 if scale is None else scale.detach()
+        torch.mul(self._seen_range, share, out=self._candidate_scale.tensor)
         for launch in launches:
             launch.set_dim((len(rows), launch.bounds.shape[1]))  # as many threads per row as were recorded
             launch.launch()
@@ -183,7 +187,7 @@ class WarpEnv(Env):
     def set_goals(self, rows: Tensor, goal: Tensor) -> None:
         """See ``Env.set_goals``."""
         self._set_rows(rows)
-        self._new_goal.tensor[: len(rows)] = goal
+        self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
 

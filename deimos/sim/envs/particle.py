@@ -79,8 +79,8 @@ class Config(EnvConfig):
         """See ``EnvConfig.build``."""
         return Particle(self, num_envs, device, seed, env_offset)
 
-    def for_evaluation(self) -> "Config":
-        """See ``EnvConfig.for_evaluation``."""
+    def without_randomness(self) -> "Config":
+        """See ``EnvConfig.without_randomness``."""
         return replace(self, stagger_goals=False)
 
     def params(self) -> ParticleParams:

@@ -73,8 +73,8 @@ class LocomotionConfig(EnvConfig):
         if not 0.05 <= low <= high < math.inf:
             raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
 
-    def for_evaluation(self) -> "LocomotionConfig":
-        """See ``EnvConfig.for_evaluation``. World i stands on level (i // columns) % levels of column i % columns."""
+    def without_randomness(self) -> "LocomotionConfig":
+        """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns."""
         return replace(
             self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
         )
