@@ -15,7 +15,9 @@ PAGE = Path(__file__).parent.parent / "docs" / "add_an_environment.md"
 OURS = {
     "directional": particle.Config(),
     "absolute": particle.Config(variant="absolute", obs_scale="raw", reward="exponential"),
-    "relative": particle.Config(variant="relative", spawn_range=50.0, time_limit=30, stagger_goals=True),
+    "relative": particle.Config(
+        variant="relative", spawn_range=50.0, time_limit=30, stagger_goals=True, crash_penalty=2.0
+    ),
     "quad": quad.Config(),
     "quad-arm": quad_arm.Config(),
 }

@@ -18,15 +18,15 @@ FLAGS = ("terminated", "truncated", "goal_due", "invalid")
 def check_env(env: Env) -> None:
     """Raise ``ValueError`` if an environment breaks the contract of ``deimos.sim.env``; name what it forgot.
 
-    It builds small copies of the environment from its configuration, with a shorter goal period; ``env`` itself is left
-    alone. Actions are random, so what only rare states would show is not found.
+    It builds small copies of the environment from its configuration, with a shorter goal period and no penalty for
+    crashes; ``env`` itself is left alone. Actions are random, so what only rare states would show is not found.
 
     Args:
         env: The environment, as ``Config.build`` gave it.
     """
     if not isinstance(env.config, EnvConfig):
         raise ValueError(f"config must be the environment's EnvConfig, got {type(env.config).__name__}.")
-    config = env.config.with_goal_period(min(env.goal_period, LONGEST_PERIOD))
+    config = replace(env.config.with_goal_period(min(env.goal_period, LONGEST_PERIOD)), crash_penalty=0.0)
     trial = _Trial(type(env).__name__, config, env.device)
     for check in (
         _check_layout, _check_views, _check_start, _check_draws, _check_candidates, _check_step, _check_clocks,
