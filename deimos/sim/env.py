@@ -85,6 +85,11 @@ class EnvConfig(abc.ABC):
                 environments of 1000 worlds, the second with an offset of 1000, equal one of 2000.
         """
 
+    @property
+    def largest_reward(self) -> float:
+        """Largest reward of one step for matching the goal: the unit of ``crash_penalty``."""
+        return 1.0
+
     @final
     def with_goal_period(self, goal_period: int) -> Self:
         """The same task with another T."""

@@ -40,7 +40,6 @@ class WarpEnv(Env):
         dt: Duration of a step [s]; 1 where the world has no seconds.
         time_limit: Steps after which an episode is truncated; 0 for never.
         stagger: Whether the goal clock of every world's first episode starts at a random step.
-        largest_reward: Largest reward of one step for matching the goal: the unit of ``config.crash_penalty``.
     """
 
     quantities: tuple[str, ...] = ("action",)
@@ -49,14 +48,14 @@ class WarpEnv(Env):
     def __init__(
         self, config: EnvConfig, num_envs: int, device: torch.device, seed: int, env_offset: int, *,
         layout: Sequence[ObsField], goal_range: Sequence[float], action_dim: int, action_bound: float = math.inf,
-        dt: float = 1.0, time_limit: int = 0, stagger: bool = False, largest_reward: float = 1.0,
+        dt: float = 1.0, time_limit: int = 0, stagger: bool = False,
     ) -> None:  # fmt: skip
         self.config = config
         self.num_envs, self.device = num_envs, device
         self._seed, self._offset = seed, env_offset
         self.layout, self.action_dim, self.action_bound = tuple(layout), action_dim, action_bound
         self.dt, self.goal_period, self.time_limit = dt, config.goal_period, time_limit
-        self.crash_penalty = config.crash_penalty * largest_reward
+        self.crash_penalty = config.crash_penalty * config.largest_reward
         goal = self.goal_slice
         scale = next(field.scale for field in self.layout if field.name == "goal")
         scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim

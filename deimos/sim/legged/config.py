@@ -73,6 +73,12 @@ class LocomotionConfig(EnvConfig):
         if not 0.05 <= low <= high < math.inf:
             raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
 
+    @property
+    def largest_reward(self) -> float:
+        """See ``EnvConfig.largest_reward``: perfect tracking."""
+        per_second = max(self.rewards.linear_tracking, 0.0) + max(self.rewards.yaw_tracking, 0.0)
+        return per_second * self.physics.timestep * self.physics.substeps
+
     def without_randomness(self) -> "LocomotionConfig":
         """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns."""
         return replace(
