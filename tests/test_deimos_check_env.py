@@ -29,6 +29,14 @@ def test_our_environments_keep_the_contract(torch_device, name):
     check_env(OURS[name].build(2, torch_device, 0))
 
 
+def test_the_unit_of_the_penalty_is_matching_the_goal():
+    """A crash penalty of one costs what a step at the goal gives: 1 for a particle, for robots their tracking terms."""
+    units = {name: config.largest_reward for name, config in OURS.items()}
+    assert units.pop("quad") == pytest.approx(0.02 * (1.0 + 0.5))
+    assert units.pop("quad-arm") == pytest.approx(0.02 * (1.0 + 0.5 + 0.5 + 0.5))
+    assert set(units.values()) == {1.0}
+
+
 @pytest.fixture
 def plant(tmp_path):
     """A function that builds the page's cart with one piece of its source replaced."""
