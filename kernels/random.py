@@ -40,8 +40,7 @@ class Purpose(IntEnum):
     FRICTION = 6
     LEVEL = 7
     EXPLORATION = 16
-    """The learner's noise. This and what follows is drawn by torch (``deimos.nn.random``)."""
-    DIRECTOR = 17
+    """The learner's noise, which torch draws (``deimos.nn.random``), as it draws ``GOAL`` for a GoalDirector."""
 
 
 class vec4u(wp.types.vector(length=4, dtype=wp.uint32)):
