@@ -85,6 +85,7 @@ class WarpEnv(Env):
         self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
         self.invalid_steps = 0
         """Invalid world-steps that ``check`` has found."""
+        self._no_fault = views["fault"].clone()
         self._steps_in_window = self._faults_known = 0
 
     @final
@@ -224,7 +225,7 @@ class WarpEnv(Env):
 
     def _clear_faults(self) -> None:
         """Begin a new window."""
-        self._views["fault"].copy_(torch.tensor([0, self.num_envs, self.num_envs], dtype=torch.int32))
+        self._views["fault"].copy_(self._no_fault)
         self._steps_in_window = self._faults_known = 0
 
     def _record_candidates(self, count: int) -> tuple[Shared, list[wp.Launch]]:
