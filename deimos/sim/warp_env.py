@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from deimos.checks import SimulationError
-from deimos.kernels.episodes import RESUMED, WORLDS, make_relative, make_worlds, record, set_goals
+from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_relative, make_worlds, record, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.kernels.structs import StructTable
@@ -44,6 +44,12 @@ class WarpEnv(Env):
 
     quantities: tuple[str, ...] = ("action",)
     """What may be broken in an invalid world, by the bits of the cause that the step's kernel gives ``end_step``."""
+    worlds: Worlds
+    """What all environments have for their worlds, for the kernels."""
+    action: Shared
+    """The actions of the step: ``worlds.action``."""
+    launch_step: Callable[[], None]
+    """Simulates one step under the actions that are in ``action``, for benchmarks too."""
 
     def __init__(
         self, config: EnvConfig, num_envs: int, device: torch.device, seed: int, env_offset: int, *,
@@ -65,7 +71,6 @@ class WarpEnv(Env):
             goal_scale=scales, goal_period=config.goal_period, time_limit=time_limit, stagger=stagger, seed=seed,
             world_offset=env_offset, crash_penalty=self.crash_penalty, num_groups=groups if groups > 1 else 0,
         )  # fmt: skip
-        """What all environments have for their worlds."""
         views = {name: wp.to_torch(getattr(self.worlds, name)) for name in WORLDS.names}
         self._views = views
         self._memory = [views[name] for name in (*Step.__dataclass_fields__, *RESUMED)]
