@@ -34,6 +34,7 @@ class Worlds:
     seed: wp.uint32  # of every draw
     world_offset: int  # global number of world 0
     goal_start: int  # where the goal starts in the observation
+    crash_penalty: float  # what a crash takes from the reward of its step, at least 0
     goal_scale: wp.array[float]  # (goal_dim,): what the policy sees goals multiplied by
     # What the host writes before a launch.
     action: wp.array2d[float]  # (num_envs, action_dim)
@@ -48,7 +49,7 @@ class Worlds:
     obs: wp.array2d[float]  # (num_envs, obs_dim)
     origin: wp.array2d[float]  # (num_envs, goal_dim), what goals are seen relative to; no rows where they are not
     # What a step gives back.
-    reward: wp.array[float]  # against the goal that was in force
+    reward: wp.array[float]  # against the goal that was in force, at least 0 but for the penalty of a crash
     tracking: wp.array2d[float]  # (num_envs, num_groups): how well each group of the goal is met, in [0, 1]
     terminated: wp.array[wp.bool]  # crashed
     truncated: wp.array[wp.bool]  # cut off without a crash
@@ -69,7 +70,7 @@ RESUMED = ("goal", "goal_clock", "episode_step", "episode_count", "goal_count", 
 def make_worlds(
     num_envs: int, device: str, *, obs_dim: int, action_dim: int, goal_start: int, goal_scale: Sequence[float],
     goal_period: int, time_limit: int = 0, stagger: bool = False, seed: int = 0, world_offset: int = 0,
-    num_groups: int = 0,
+    crash_penalty: float = 0.0, num_groups: int = 0,
 ) -> Worlds:  # fmt: skip
     """Allocate worlds in which no episode has begun; the arguments are fields of ``Worlds`` and sizes of its arrays."""
     worlds = WORLDS.allocate(
@@ -80,6 +81,7 @@ def make_worlds(
     worlds.num_threads = 1 if wp.get_device(device).is_cpu else num_envs
     worlds.goal_period, worlds.time_limit, worlds.stagger = goal_period, time_limit, stagger
     worlds.seed, worlds.world_offset, worlds.goal_start = seed, world_offset, goal_start
+    worlds.crash_penalty = crash_penalty
     worlds.goal_scale.assign(list(goal_scale))
     worlds.fault.assign([0, num_envs, num_envs])
     return worlds
@@ -133,6 +135,8 @@ def begin_episode(env: int, worlds: Worlds) -> int:
 def end_step(env: int, crashed: wp.bool, over: wp.bool, cause: int, worlds: Worlds):
     """Advance a world's clocks and write how its step ended: the last thing that a step does with a world.
 
+    The penalty of a crash is subtracted here, from the reward that was written before.
+
     Args:
         env: The world.
         crashed: Whether it crashed.
@@ -147,6 +151,8 @@ def end_step(env: int, crashed: wp.bool, over: wp.bool, cause: int, worlds: Worl
     worlds.episode_step[env] = age
     broken = cause != 0
     cut_off = over or broken or (worlds.time_limit > 0 and age >= worlds.time_limit)
+    if crashed:
+        worlds.reward[env] = worlds.reward[env] - worlds.crash_penalty
     worlds.terminated[env] = crashed
     worlds.truncated[env] = cut_off and not crashed
     worlds.goal_due[env] = clock >= worlds.goal_period and not broken

@@ -1,18 +1,23 @@
 """The particle's reward: how a distance to the goal becomes a number in (0, 1].
 
-To add a shape, write one ``@wp.func`` here, give it a member of ``RewardShape`` and a branch in
-``shape_reward``; the command line and the tests find it by the member's name.
+To add a shape, write one ``@wp.func`` here, name it in ``RewardName`` and ``RewardShape``, and give it a branch in
+``shape_reward``; the configuration, the command line and the tests find it by its name.
 """
 
 from enum import IntEnum
+from typing import Literal
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 
+RewardName = Literal["linear", "reciprocal", "exponential"]
+"""How a configuration names a shape."""
+
+
 class RewardShape(IntEnum):
-    """The shapes that ``shape_reward`` knows."""
+    """The shapes that ``shape_reward`` knows, by their names in capitals."""
 
     LINEAR = 0
     RECIPROCAL = 1

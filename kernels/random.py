@@ -39,6 +39,8 @@ class Purpose(IntEnum):
     PUSH = 5
     FRICTION = 6
     LEVEL = 7
+    EXPLORATION = 16
+    """The learner's noise, which torch draws (``deimos.nn.random``), as it draws ``GOAL`` for a GoalDirector."""
 
 
 class vec4u(wp.types.vector(length=4, dtype=wp.uint32)):

@@ -15,7 +15,9 @@ PAGE = Path(__file__).parent.parent / "docs" / "add_an_environment.md"
 OURS = {
     "directional": particle.Config(),
     "absolute": particle.Config(variant="absolute", obs_scale="raw", reward="exponential"),
-    "relative": particle.Config(variant="relative", spawn_range=50.0, time_limit=30, stagger_goals=True),
+    "relative": particle.Config(
+        variant="relative", spawn_range=50.0, time_limit=30, stagger_goals=True, crash_penalty=2.0
+    ),
     "quad": quad.Config(),
     "quad-arm": quad_arm.Config(),
 }
@@ -25,6 +27,14 @@ OURS = {
 def test_our_environments_keep_the_contract(torch_device, name):
     """Nothing is found in the environments of the tree."""
     check_env(OURS[name].build(2, torch_device, 0))
+
+
+def test_the_unit_of_the_penalty_is_matching_the_goal():
+    """A crash penalty of one costs what a step at the goal gives: 1 for a particle, for robots their tracking terms."""
+    units = {name: config.largest_reward for name, config in OURS.items()}
+    assert units.pop("quad") == pytest.approx(0.02 * (1.0 + 0.5))
+    assert units.pop("quad-arm") == pytest.approx(0.02 * (1.0 + 0.5 + 0.5 + 0.5))
+    assert set(units.values()) == {1.0}
 
 
 @pytest.fixture

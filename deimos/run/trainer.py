@@ -12,7 +12,7 @@ from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn.matmul import keep_freed_memory, on_threads
-from deimos.run.config import kind, to_dict
+from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import EnvConfig
@@ -154,16 +154,17 @@ class Trainer:
         except SimulationError as error:
             raise SimulationError(f"Iteration {self.iteration}: {error}") from error
         rollout = self.rollout
-        crashes, reward = rollout.terminated.sum(), rollout.reward.mean(dtype=torch.float64)
         transitions = rollout.reward.numel()
+        crashes = int(rollout.terminated.sum())
+        reward = rollout.reward.mean(dtype=torch.float64).item() + self.env.crash_penalty * crashes / transitions
         return {
             "iteration": self.iteration,
             "env_steps": self.iteration * rollout.num_steps,
             "transitions": self.iteration * transitions,
-            "reward": reward.item(),
-            "crashes": int(crashes),
-            "crashes_per_1000": 1000 * int(crashes) / transitions,
-            "selected_share": self.loop.interactions.active.float().mean().item(),
+            "reward": reward,
+            "crashes": crashes,
+            "crashes_per_1000": 1000 * crashes / transitions,
+            "selected_fraction": self.loop.interactions.active.float().mean().item(),
             **learner,
             **selector,
             **self.env.report(),
@@ -185,8 +186,9 @@ class Trainer:
             RunError: If it is that of another environment or another network size.
         """
         try:
-            if state["made_for"] != _identity(self.config):
-                raise ValueError(f"it was made for {state['made_for']}, this run is {_identity(self.config)}.")
+            made_for = _completed(state["made_for"])
+            if made_for != _identity(self.config):
+                raise ValueError(f"it was made for {made_for}, this run is {_identity(self.config)}.")
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -198,6 +200,12 @@ class Trainer:
 def _identity(config: TrainConfig) -> dict:
     """What a checkpoint must have in common with the run that goes on from it."""
     return {"env": to_dict(config.env), "selector": to_dict(config.goals), "num_envs": config.num_envs}
+
+
+def _completed(identity: dict) -> dict:
+    """The identity that an older version wrote, with the defaults of fields that configurations have got since."""
+    kinds = {"env": EnvConfig, "selector": SelectorConfig}
+    return identity | {name: to_dict(from_dict(cls, identity[name])) for name, cls in kinds.items()}
 
 
 def _check_obs(obs: Tensor) -> None:

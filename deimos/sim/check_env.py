@@ -18,15 +18,15 @@ FLAGS = ("terminated", "truncated", "goal_due", "invalid")
 def check_env(env: Env) -> None:
     """Raise ``ValueError`` if an environment breaks the contract of ``deimos.sim.env``; name what it forgot.
 
-    It builds small copies of the environment from its configuration, with a shorter goal period; ``env`` itself is left
-    alone. Actions are random, so what only rare states would show is not found.
+    It builds small copies of the environment from its configuration, with a shorter goal period and no penalty for
+    crashes; ``env`` itself is left alone. Actions are random, so what only rare states would show is not found.
 
     Args:
         env: The environment, as ``Config.build`` gave it.
     """
     if not isinstance(env.config, EnvConfig):
         raise ValueError(f"config must be the environment's EnvConfig, got {type(env.config).__name__}.")
-    config = env.config.with_goal_period(min(env.goal_period, LONGEST_PERIOD))
+    config = replace(env.config.with_goal_period(min(env.goal_period, LONGEST_PERIOD)), crash_penalty=0.0)
     trial = _Trial(type(env).__name__, config, env.device)
     for check in (
         _check_layout, _check_views, _check_start, _check_draws, _check_candidates, _check_step, _check_clocks,
@@ -72,8 +72,8 @@ def _rows(env: Env, *rows: int) -> Tensor:
     return torch.tensor(rows or range(env.num_envs), device=env.device)
 
 
-def _mask(env: Env, *rows: int) -> Tensor:
-    return torch.isin(_rows(env), _rows(env, *rows))
+def _at(tensors: dict[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    return {name: tensor[rows] for name, tensor in tensors.items()}
 
 
 def _results(step: Step) -> dict[str, Tensor]:
@@ -161,9 +161,8 @@ def _check_draws(trial: _Trial) -> None:
     """What a world draws depends on its global number alone."""
     whole, shard = trial.copy(), trial.copy(WORLDS // 2, env_offset=WORLDS // 2)
     rows = _rows(whole)[WORLDS // 2 :]
-    expected = {name: tensor[rows] for name, tensor in whole.tensors.items()}
     message = "draws must be addressed by world_offset + env: world 0 of a shard must be that of the whole ({name})."
-    trial.require_equal(shard.tensors, expected, message)
+    trial.require_equal(shard.tensors, _at(whole.tensors, rows), message)
     ours, theirs = whole.draw(rows), shard.draw(_rows(shard))
     trial.require_tensor("draw(rows)", ours, (len(rows), 4), torch.float32)
     trial.require_equal({"draw": theirs}, {"draw": ours}, message)
@@ -245,12 +244,10 @@ def _check_reset(trial: _Trial) -> None:
     for action, _ in zip(trial.actions(env), range(3), strict=False):
         env.step(action)
     before = env.state_dict()
-    env.reset(_mask(env, 1, 4))
-    others = _rows(env, 0, 2, 3, 5)
-    kept = {name: value[others] for name, value in before.items()}
-    found = {name: value[others] for name, value in env.tensors.items()}
-    trial.require_equal(found, kept, "reset must leave the worlds outside its mask alone, but {name} changed there.")
-    own = _rows(env, 1, 4)
+    own, others = _rows(env, 1, 4), _rows(env, 0, 2, 3, 5)
+    env.reset(torch.isin(_rows(env), own))
+    message = "reset must leave the worlds outside its mask alone, but {name} changed there."
+    trial.require_equal(_at(env.tensors, others), _at(before, others), message)
     begun = env.tensors["episode_count"][own] == before["episode_count"][own] + 1
     trial.require(begun.all(), "reset must count the episodes that it begins: the kernel must call begin_episode.")
     trial.require((env.episode_step[own] == 0).all(), "reset must start episode_step at 0.")
@@ -268,9 +265,8 @@ def _check_set_goals(trial: _Trial) -> None:
     rows, others = _rows(env, 4, 1), _rows(env, 0, 2, 3, 5)
     goals = env.sample_goals(rows, 3)[:, 2].clone()
     env.set_goals(rows, goals)
-    found = {name: value[others] for name, value in env.tensors.items()}
-    kept = {name: value[others] for name, value in before.items()}
-    trial.require_equal(found, kept, "set_goals must leave the other worlds alone, but {name} changed there.")
+    message = "set_goals must leave the other worlds alone, but {name} changed there."
+    trial.require_equal(_at(env.tensors, others), _at(before, others), message)
     shown = torch.isclose(env.goal[rows], goals, rtol=1e-4, atol=1e-5)
     trial.require(shown.all(), "set_goals must show the goals that it was given in the goal's slot of obs.")
     counted = env.tensors["goal_count"][rows] == before["goal_count"][rows] + 1
@@ -303,9 +299,9 @@ def _check_clones(trial: _Trial) -> None:
         copied = action.clone()
         copied[target] = action[source]
         ours, theirs = _results(env.step(action)), _results(other.step(copied))
-        found = {name: value[target] for name, value in theirs.items()}
-        expected = {name: value[source] for name, value in ours.items()}
-        trial.require_equal(found, expected, f"clones must move alike, but {{name}} differs: {needs}.")
+        trial.require_equal(
+            _at(theirs, target), _at(ours, source), f"clones must move alike, but {{name}} differs: {needs}."
+        )
 
 
 def _check_resume(trial: _Trial) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self, final
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least
+from deimos.checks import check_at_least, check_range
 from deimos.nn.layout import ObsField, goal_slice
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Step:
     obs: Tensor
     """Observations that the step ended in, float32, shape (num_envs, obs_dim)."""
     reward: Tensor
-    """Rewards, at least 0, float32, shape (num_envs,)."""
+    """Rewards, at least 0 but for ``Env.crash_penalty``, float32, shape (num_envs,)."""
     terminated: Tensor
     """True where the world crashed, bool, shape (num_envs,)."""
     truncated: Tensor
@@ -38,7 +38,7 @@ class Step:
     """True where the goal has been in force for its whole period and the state is valid, bool, shape (num_envs,)."""
     invalid: Tensor
     """True where the state is not physical any more, bool, shape (num_envs,). Such a world is truncated too, unless
-    it crashed, or the run stops (see ``Env.may_go_on_invalid``)."""
+    it crashed."""
     tracking: Tensor | None = None
     """How well each group of goal components is met, in [0, 1], float32, shape (num_envs, len(goal_groups));
     ``None`` where there is one group and the reward itself says it."""
@@ -53,9 +53,13 @@ class EnvConfig(abc.ABC):
 
     goal_period: int = 100
     """T: steps that a goal is in force, at least 1."""
+    crash_penalty: float = 0.0
+    """What the step of a crash costs the learner, in multiples of the largest goal-matching reward of one step, at
+    least 0. Scores and reported rewards do not see it."""
 
     def __post_init__(self) -> None:
         check_at_least("goal_period", self.goal_period, 1)
+        check_range("crash_penalty", self.crash_penalty, 0.0, 1e6)
 
     @abc.abstractmethod
     def build(self, num_envs: int, device: torch.device, seed: int, env_offset: int = 0) -> "Env":
@@ -69,12 +73,22 @@ class EnvConfig(abc.ABC):
                 environments of 1000 worlds, the second with an offset of 1000, equal one of 2000.
         """
 
+    @property
+    def largest_reward(self) -> float:
+        """Largest reward of one step for matching the goal: the unit of ``crash_penalty``."""
+        return 1.0
+
     @final
     def with_goal_period(self, goal_period: int) -> Self:
         """The same task with another T."""
         return replace(self, goal_period=goal_period)
 
+    @final
     def for_evaluation(self) -> Self:
+        """The same task without randomisation and without a penalty for crashes, all goal clocks in step."""
+        return replace(self.without_randomness(), crash_penalty=0.0)
+
+    def without_randomness(self) -> Self:
         """The same task with every randomisation switched off and all goal clocks in step."""
         return self
 
@@ -96,6 +110,8 @@ class Env(abc.ABC):
     """T: steps that a goal is in force."""
     time_limit: int
     """Steps after which an episode is truncated; 0 for never."""
+    crash_penalty: float = 0.0
+    """What was subtracted from the reward of a step that ended in a crash: add it to report rewards."""
     obs: Tensor
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
     may_go_on_invalid: bool = False

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from deimos.checks import SimulationError
-from deimos.kernels.episodes import RESUMED, WORLDS, make_relative, make_worlds, record, set_goals
+from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_relative, make_worlds, record, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.kernels.structs import StructTable
@@ -44,6 +44,12 @@ class WarpEnv(Env):
 
     quantities: tuple[str, ...] = ("action",)
     """What may be broken in an invalid world, by the bits of the cause that the step's kernel gives ``end_step``."""
+    worlds: Worlds
+    """What all environments have for their worlds, for the kernels."""
+    action: Shared
+    """The actions of the step: ``worlds.action``."""
+    launch_step: Callable[[], None]
+    """Simulates one step under the actions that are in ``action``, for benchmarks too."""
 
     def __init__(
         self, config: EnvConfig, num_envs: int, device: torch.device, seed: int, env_offset: int, *,
@@ -55,6 +61,7 @@ class WarpEnv(Env):
         self._seed, self._offset = seed, env_offset
         self.layout, self.action_dim, self.action_bound = tuple(layout), action_dim, action_bound
         self.dt, self.goal_period, self.time_limit = dt, config.goal_period, time_limit
+        self.crash_penalty = config.crash_penalty * config.largest_reward
         goal = self.goal_slice
         scale = next(field.scale for field in self.layout if field.name == "goal")
         scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim
@@ -62,9 +69,8 @@ class WarpEnv(Env):
         self.worlds = make_worlds(
             num_envs, warp_device(device), obs_dim=self.obs_dim, action_dim=action_dim, goal_start=goal.start,
             goal_scale=scales, goal_period=config.goal_period, time_limit=time_limit, stagger=stagger, seed=seed,
-            world_offset=env_offset, num_groups=groups if groups > 1 else 0,
+            world_offset=env_offset, crash_penalty=self.crash_penalty, num_groups=groups if groups > 1 else 0,
         )  # fmt: skip
-        """What all environments have for their worlds."""
         views = {name: wp.to_torch(getattr(self.worlds, name)) for name in WORLDS.names}
         self._views = views
         self._memory = [views[name] for name in (*Step.__dataclass_fields__, *RESUMED)]
@@ -84,6 +90,7 @@ class WarpEnv(Env):
         self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
         self.invalid_steps = 0
         """Invalid world-steps that ``check`` has found."""
+        self._no_fault = views["fault"].clone()
         self._steps_in_window = self._faults_known = 0
 
     @final
@@ -146,7 +153,7 @@ class WarpEnv(Env):
         if action.shape != self.action.tensor.shape:
             expected = tuple(self.action.tensor.shape)
             raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
-        self.action.tensor.copy_(action)
+        self.action.tensor.copy_(action.detach())
         self.launch_step()
         self._steps_in_window += 1
         return self._step
@@ -155,7 +162,8 @@ class WarpEnv(Env):
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""
         self._views["mask"].copy_(mask)
-        torch.mul(self._whole_range, 1.0 if goal_scale is None else goal_scale, out=self._views["first_range"])
+        share = 1.0 if goal_scale is None else goal_scale.detach()
+        torch.mul(self._whole_range, share, out=self._views["first_range"])
         self._launch_reset()
 
     @final
@@ -165,7 +173,8 @@ class WarpEnv(Env):
             self._candidates[count] = self._record_candidates(count)
         candidates, launches = self._candidates[count]
         self._set_rows(rows)
-        torch.mul(self._seen_range, 1.0 if scale is None else scale, out=self._candidate_scale.tensor)
+        share = 1.0 if scale is None else scale.detach()
+        torch.mul(self._seen_range, share, out=self._candidate_scale.tensor)
         for launch in launches:
             launch.set_dim((len(rows), launch.bounds.shape[1]))  # as many threads per row as were recorded
             launch.launch()
@@ -183,7 +192,7 @@ class WarpEnv(Env):
     def set_goals(self, rows: Tensor, goal: Tensor) -> None:
         """See ``Env.set_goals``."""
         self._set_rows(rows)
-        self._new_goal.tensor[: len(rows)] = goal
+        self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
 
@@ -221,7 +230,7 @@ class WarpEnv(Env):
 
     def _clear_faults(self) -> None:
         """Begin a new window."""
-        self._views["fault"].copy_(torch.tensor([0, self.num_envs, self.num_envs], dtype=torch.int32))
+        self._views["fault"].copy_(self._no_fault)
         self._steps_in_window = self._faults_known = 0
 
     def _record_candidates(self, count: int) -> tuple[Shared, list[wp.Launch]]:

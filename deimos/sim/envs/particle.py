@@ -11,7 +11,7 @@ from torch import Tensor
 
 from deimos.checks import check_at_least, check_choice, check_positive, check_range
 from deimos.kernels.particle import BROKEN, PARTICLES, ParticleParams, reset_particles, step_particles
-from deimos.kernels.particle_rewards import RewardShape
+from deimos.kernels.particle_rewards import RewardName, RewardShape
 from deimos.sim.env import EnvConfig, ObsField
 from deimos.sim.warp_env import WarpEnv
 
@@ -32,7 +32,7 @@ class Config(EnvConfig):
     goal_range: float | None = None
     """Half side of the box that goals are drawn from, positive. By default max_speed [u/step] for
     directional goals and 1250 u for positions, so that about half of them lie outside the cube."""
-    reward: Literal["linear", "reciprocal", "exponential"] = "linear"
+    reward: RewardName = "linear"
     """Reward of the distance d to the goal: 1 - d / (1.01 d_max), 1 / (1 + d / reward_length) or
     exp(-d / reward_length)."""
     reward_length: float | None = None
@@ -79,8 +79,8 @@ class Config(EnvConfig):
         """See ``EnvConfig.build``."""
         return Particle(self, num_envs, device, seed, env_offset)
 
-    def for_evaluation(self) -> "Config":
-        """See ``EnvConfig.for_evaluation``."""
+    def without_randomness(self) -> "Config":
+        """See ``EnvConfig.without_randomness``."""
         return replace(self, stagger_goals=False)
 
     def params(self) -> ParticleParams:

@@ -26,6 +26,12 @@ class Config(LocomotionConfig):
     hold_trunk: bool = False
     """Whether the trunk is held fixed in the air, its legs free: a test of the arm alone, no task."""
 
+    @property
+    def largest_reward(self) -> float:
+        """See ``EnvConfig.largest_reward``: perfect tracking, and the end effector at its goal."""
+        per_second = max(self.arm_rewards.reach, 0.0) + max(self.arm_rewards.precision, 0.0)
+        return super().largest_reward + per_second * self.physics.timestep * self.physics.substeps
+
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range("speed", self.speed, 0.0, 1.0)

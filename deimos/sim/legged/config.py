@@ -78,8 +78,14 @@ class LocomotionConfig(EnvConfig):
         if not 0.05 <= low <= high < math.inf:
             raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
 
-    def for_evaluation(self) -> "LocomotionConfig":
-        """See ``EnvConfig.for_evaluation``. World i stands on level (i // columns) % levels of column i % columns."""
+    @property
+    def largest_reward(self) -> float:
+        """See ``EnvConfig.largest_reward``: perfect tracking."""
+        per_second = max(self.rewards.linear_tracking, 0.0) + max(self.rewards.yaw_tracking, 0.0)
+        return per_second * self.physics.timestep * self.physics.substeps
+
+    def without_randomness(self) -> "LocomotionConfig":
+        """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns."""
         return replace(
             self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
         )
