@@ -178,6 +178,24 @@ def test_crash_is_the_trunk_on_the_ground(torch_device):
     assert stood
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("effort", [0.0, 1.0])
+def test_a_robot_that_lies_on_its_side_has_crashed(torch_device, side, effort):
+    """Whatever its legs do: it falls on its hips, which are parts of the base (thesis, 4.1.2: "any part" of it)."""
+    config = Config(goal_period=500).for_evaluation()
+    env, rng = config.build(32, torch_device, 0), np.random.default_rng(0)
+    yaw, roll = rng.uniform(0, 2 * np.pi, 32) / 2, side * np.pi / 4
+    c, s, a, b = np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
+    qpos = env.tensors["qpos"]
+    qpos[:, 2] = 0.25
+    qpos[:, 3:7] = torch.tensor(np.stack([c * a, c * b, s * b, s * a], axis=1), dtype=torch.float32)
+    env.tensors["qvel"].zero_()
+    crashed = torch.zeros(32, dtype=torch.bool, device=torch_device)
+    for _ in range(50):
+        crashed |= env.step(actions(32, torch_device, scale=effort)).terminated
+    assert bool(crashed.all())
+
+
 @both
 def test_warp_and_torch_see_one_allocation_and_views_stay(task, torch_device):
     """Every tensor keeps its address over steps, goals and resets, and a step gives back the very same views."""
