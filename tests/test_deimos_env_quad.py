@@ -607,6 +607,18 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
         env.step(torch.zeros(shape, device=torch_device))
 
 
+def test_actions_are_what_the_joints_can_do(torch_device):
+    """However large an action, targets end where the joints' ranges do, and the policy sees what was done."""
+    env = build(torch_device, num_envs=2, noise=False)
+    low, high = np.array([joint.range for joint in env.robot.joints]).T
+    ends = np.array([joint.action_range for joint in env.robot.joints])
+    np.testing.assert_allclose(POSE + 0.25 * ends.T, [low, high], atol=1e-12)
+    assert env.action_bound == pytest.approx(np.abs(ends).max())
+    step = env.step(torch.tensor([[1e6], [-1e6]], device=torch_device).expand(2, 12))
+    np.testing.assert_allclose(env.physics.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(step.obs[:, 36:48].cpu(), ends.T[::-1], rtol=1e-6)
+
+
 NEW_ROBOT = '''
 from dataclasses import replace
 from deimos.sim.legged.robots import go1

@@ -169,11 +169,12 @@ class World:
         heights = heights_reference() if heights is None else heights
         values = arrays | {
             "term": np.full((n, NUM_COLUMNS + len(ARM_TERMS)), GARBAGE), "value": np.zeros(n), "pose": np.zeros(J),
-            "action_scale": np.zeros(J), "low": np.zeros(J), "high": np.zeros(J), "heights": heights,
+            "action_scale": np.zeros(J), "low": np.zeros(J), "high": np.zeros(J),
+            "action_low": np.full(J, -100.0), "action_high": np.full(J, 100.0), "heights": heights,
             "origin": np.zeros((1, 1, 3)), "noise": np.zeros(OBS), "point": np.zeros((POINTS, 2)),
         }  # fmt: skip
         params = {name: getattr(LocomotionParams(), name) for name in LocomotionParams.vars} | {
-            "dt": DT, "action_bound": 100.0, "max_speed": 20.0, "max_rate": 500.0, "cell": CELL,
+            "dt": DT, "max_speed": 20.0, "max_rate": 500.0, "cell": CELL,
             "corner": wp.vec2(*CORNER),
         }  # fmt: skip
         self.legged = LeggedWorlds(

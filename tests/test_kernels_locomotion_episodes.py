@@ -19,7 +19,7 @@ LOW, HIGH = POSE - 0.5, POSE + 0.3
 GOAL_SCALE = np.array([2.0, 2.0, 0.25])
 CLOCKS = ("goal_clock", "episode_step", "episode_count", "goal_count")
 PARAMS = {
-    "dt": 0.02, "stagger": False, "action_bound": 100.0, "noise": False, "push_interval": 0, "push_speed": 1.0,
+    "dt": 0.02, "stagger": False, "noise": False, "push_interval": 0, "push_speed": 1.0,
     "weight": vecT(1.0), "air_time_target": 0.3, "soft_low": vec12(*LOW), "soft_high": vec12(*HIGH),
     "max_speed": 20.0, "max_rate": 500.0, "lost_contacts": 0, "scan_start": 48, "standing_height": 0.325,
     "spawn_height": 0.42, "spawn_range": 1.0, "spawn_speed": 0.5, "spawn_reach": 0.5,
@@ -45,7 +45,8 @@ class World:
             num_envs=N, num_joints=J, substeps=4, num_points=SCAN, heights=(121, 161), tiles=(LEVELS, COLUMNS)
         )
         values = {
-            "pose": POSE, "action_scale": np.full(J, 0.25), "low": LOW, "high": HIGH, "heights": self.heights,
+            "pose": POSE, "action_scale": np.full(J, 0.25), "low": LOW, "high": HIGH,
+            "action_low": np.full(J, -100.0), "action_high": np.full(J, 100.0), "heights": self.heights,
             "origin": self.origins, "noise": np.zeros(OBS), "point": np.zeros((SCAN, 2)),
         }  # fmt: skip
         structs = {}

@@ -61,7 +61,6 @@ class LocomotionParams:
 
     dt: float  # duration of a step [s]
     stagger: wp.bool  # whether the clocks of a world's first episode start at random steps
-    action_bound: float  # actions are clipped to [-action_bound, action_bound]
     noise: wp.bool  # whether observations are noisy
     push_interval: int  # steps from push to push, 0 for none
     push_speed: float  # bound of the velocity that a push sets [m/s]
@@ -95,6 +94,8 @@ class Joints:
     action_scale: wp.array[float]  # what an action of one adds to the target [rad]
     low: wp.array[float]  # range [rad]
     high: wp.array[float]
+    action_low: wp.array[float]  # actions are clipped to what takes the target to an end of the range
+    action_high: wp.array[float]
 
 
 @wp.struct
