@@ -147,7 +147,8 @@ def make_world(n, seed=0):
         "part_force": np.zeros((4, n, 13)), "overflow": np.zeros(n),
         "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": np.zeros((n, J)),
         "air_time": np.zeros((n, 4)), "tracked": np.zeros((n, 2)), "wanted": rng.normal(size=(n, J)),
-        "foot_contact": np.zeros(n), "level": np.zeros(n), "episode_count": rng.integers(1, 5, n),
+        "foot_contact": np.zeros(n), "level": np.zeros(n), "goal_start": np.zeros((n, 3)), "progress": np.zeros((n, 4)),
+        "episode_count": rng.integers(1, 5, n),
     }  # fmt: skip
 
 

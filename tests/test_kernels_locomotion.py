@@ -36,7 +36,7 @@ PARAMS = {
     "soft_high": vec12(*HIGH), "max_speed": 20.0, "max_rate": 500.0, "lost_contacts": 0b1011, "scan_start": OBS,
     "standing_height": 0.325, "spawn_height": 0.42, "spawn_range": 1.0, "spawn_speed": 0.5, "spawn_reach": 0.5,
     "level_rule": int(LevelRule.REWARD), "start_levels": 6, "cell": 0.1, "corner": wp.vec2(-50.0, -50.0),
-    "low": wp.vec2(-49.0, -48.0), "high": wp.vec2(47.0, 46.0), "half_tile": 4.0,
+    "low": wp.vec2(-49.0, -48.0), "high": wp.vec2(47.0, 46.0),
 }  # fmt: skip
 """Legged Gym's numbers on a plane."""
 
@@ -59,7 +59,7 @@ def make_world(n, seed=0):
         "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": rng.normal(size=(n, J)),
         "air_time": rng.integers(0, 40, (n, 4)) * DT, "tracked": np.stack([rng.uniform(0, 9, n), np.full(n, 9.0)], 1),
         **{name: np.zeros(n) for name in (*COUNTERS, "level")},
-        "foot_contact": rng.integers(0, 16, n),
+        "foot_contact": rng.integers(0, 16, n), "goal_start": np.zeros((n, 3)), "progress": np.zeros((n, 4)),
     }  # fmt: skip
     integers = (*COUNTERS, "level", "foot_contact", "overflow")
     return {name: value.astype(np.int32 if name in integers else np.float32) for name, value in w.items()}
@@ -451,6 +451,6 @@ def test_rejects_sizes_that_are_too_small(name, value, message):
 
 def test_parameters_are_given_all_and_by_name():
     """A parameter that is forgotten or misspelt is an error."""
-    with pytest.raises(ValueError, match=r"params must be dt, stagger, .*half_tile, got dt"):
+    with pytest.raises(ValueError, match=r"params must be dt, stagger, .*high, got dt"):
         make_params(**{name: PARAMS[name] for name in PARAMS if name != "noise"})
     assert PARAMS.keys() == LocomotionParams.vars.keys()

@@ -51,8 +51,7 @@ class LevelRule(IntEnum):
     REWARD = 1
     """Up if the mean linear tracking is at least 0.8 without a crash, down if it is below 0.5 or after a crash."""
     DISPLACEMENT = 2
-    """Legged Gym's: up if the robot is more than half a tile away from its start, down if it is less
-    than half of what its last goal asked for."""
+    """The same with the agreement of the robot's displacements and those of its goals' paths (``levels``)."""
 
 
 @wp.struct
@@ -83,7 +82,6 @@ class LocomotionParams:
     corner: wp.vec2  # its first sample [m]
     low: wp.vec2  # least and largest x and y of the terrain; beyond them an episode is truncated [m]
     high: wp.vec2
-    half_tile: float  # half side of a tile [m]
 
 
 @wp.struct
@@ -124,6 +122,8 @@ class LocomotionState:
     foot_contact: wp.array[int]  # bit i: foot i touched the ground on the last step
     tracked: wp.array[wp.vec2]  # sum of the linear tracking in this episode, and its steps
     level: wp.array[int]
+    goal_start: wp.array[wp.vec3]  # where the robot was when its goal began: x and y [m], and the goal's clock
+    progress: wp.array[wp.vec4]  # how well displacements agree with paths, see ``follow_path``
 
 
 @wp.struct

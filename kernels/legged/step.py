@@ -6,6 +6,7 @@ from ..episodes import Worlds, end_step
 from ..random import Purpose, uniform4
 from ..rotations import down_in_body
 from .contacts import peak_force
+from .levels import follow_path
 from .observation import base_quaternion, base_rate, base_velocity, write_proprioception
 from .rewards import LEG_JOINTS, TERMS, LegMotion, linear_tracking, vec12, weighted_terms, yaw_tracking
 from .state import (
@@ -19,6 +20,7 @@ from .state import (
     NUM_FEET,
     Joints,
     LeggedWorlds,
+    LevelRule,
     LocomotionParams,
     LocomotionState,
     LocomotionStep,
@@ -248,6 +250,8 @@ def _evaluate_step(
             write_reward(m, params, env, worlds, out)
             state.tracked[env] = state.tracked[env] + wp.vec2(worlds.tracking[env, 0], 1.0)
             remember(worlds, joints, sim, env, state)
+            if params.level_rule == wp.static(int(LevelRule.DISPLACEMENT)):
+                follow_path(env, worlds, params, sim, state)
             write_proprioception(env, worlds, joints, sim, state)
         end_step(env, crashed, is_off(params, sim, env), int(found[0]), worlds)
 

@@ -18,8 +18,9 @@ from torch import Tensor
 from deimos import terrain
 from deimos.kernels.legged import state as tables
 from deimos.kernels.legged.height_scan import scan_points
+from deimos.kernels.legged.levels import update_levels
 from deimos.kernels.legged.observation import finish_obs
-from deimos.kernels.legged.reset import reset_worlds, update_levels
+from deimos.kernels.legged.reset import reset_worlds
 from deimos.kernels.legged.rewards import LEG_JOINTS, vec12, vecT
 from deimos.kernels.legged.state import (
     BROKEN,
@@ -178,7 +179,6 @@ class Locomotion(WarpEnv):
             "start_levels": config.start_levels, "cell": land.cell, "corner": wp.vec2(*land.corner),
             "low": wp.vec2(*(corner + EDGE)) if ground else wp.vec2(-NOWHERE),
             "high": wp.vec2(*(far - EDGE)) if ground else wp.vec2(NOWHERE),
-            "half_tile": land.tile / 2,
         })  # fmt: skip
 
     def _begin(self) -> None:
