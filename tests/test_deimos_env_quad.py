@@ -8,9 +8,10 @@ import pytest
 import torch
 import warp as wp
 from deimos.kernels.legged.height_scan import scan_points
-from deimos.kernels.legged.reset import update_levels
+from deimos.kernels.legged.levels import update_levels
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import COLUMNS
+from deimos.kernels.legged.step import evaluate_step
 from deimos.kernels.random import Purpose
 from deimos.terrain import Grid, Share
 from deimos.terrain.shapes.stairs import Shape as Stairs
@@ -176,6 +177,24 @@ def test_crash_is_the_trunk_on_the_ground(torch_device):
     assert crashed_at is not None
     assert 8 <= crashed_at <= 22
     assert stood
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("effort", [0.0, 1.0])
+def test_a_robot_that_lies_on_its_side_has_crashed(torch_device, side, effort):
+    """Whatever its legs do: it falls on its hips, which are parts of the base (thesis, 4.1.2: "any part" of it)."""
+    config = Config(goal_period=500).for_evaluation()
+    env, rng = config.build(32, torch_device, 0), np.random.default_rng(0)
+    yaw, roll = rng.uniform(0, 2 * np.pi, 32) / 2, side * np.pi / 4
+    c, s, a, b = np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
+    qpos = env.tensors["qpos"]
+    qpos[:, 2] = 0.25
+    qpos[:, 3:7] = torch.tensor(np.stack([c * a, c * b, s * b, s * a], axis=1), dtype=torch.float32)
+    env.tensors["qvel"].zero_()
+    crashed = torch.zeros(32, dtype=torch.bool, device=torch_device)
+    for _ in range(50):
+        crashed |= env.step(actions(32, torch_device, scale=effort)).terminated
+    assert bool(crashed.all())
 
 
 @both
@@ -403,37 +422,77 @@ def test_who_passes_the_last_level_is_sent_anywhere(torch_device, hills):
     assert (counts - n / 3).abs().max() < 5 * math.sqrt(n * 2 / 9)
 
 
-@pytest.mark.parametrize("rule", ["reward", "displacement"])
-def test_perfect_tracker_of_turning_goals(torch_device, rule):
-    """Who follows turning goals perfectly walks in circles: it never goes down by ours, but often by Legged Gym's."""
-    rng = np.random.default_rng(0)
-    n, steps = 64, 1000
-    ground = build(torch_device, num_envs=1).terrain
-    assert ground.tile == 8.0
-    env = build(torch_device, num_envs=n, levels=rule, episode_steps=steps, goal_period=500, start_levels=1)
-    # A world of ten levels, all of them flat: what the robots do is written, not simulated.
+def walk(env, goals, follows):
+    """Play an episode in which robots do what two goals say, or stand; what they do is written, not simulated.
+
+    Gives the level that each begins the next episode on, all having begun on level 5 of ten, and the distance of the
+    ends of each goal's path, shape (2, num_envs).
+    """
+    n, t = env.num_envs, env.tensors
     env.legged.ground.origin = wp.zeros((10, 1), dtype=wp.vec3, device=env.worlds.mask.device)
-    t = env.tensors
     t["level"][:] = 5
-    position, yaw = np.zeros((n, 2)), np.zeros(n)
-    for goal in rng.uniform(-1, 1, size=(2, n, 3)):
+    position, yaw, lengths = np.zeros((n, 2)), np.zeros(n), []
+    for k, goal in enumerate(goals):
+        if k > 0:
+            env.set_goals(rows_of(env), torch.tensor(goal * [2.0, 2.0, 0.25], dtype=torch.float32))
+        else:
+            t["goal"][:] = torch.tensor(goal, dtype=torch.float32)
+        start = position.copy()
         for _ in range(500):
-            yaw += goal[:, 2] * 0.02
+            yaw = yaw + goal[:, 2] * 0.02 * follows
             c, s = np.cos(yaw), np.sin(yaw)
-            position += 0.02 * np.stack([c * goal[:, 0] - s * goal[:, 1], s * goal[:, 0] + c * goal[:, 1]], axis=1)
-    t["qpos"][:, :2] = torch.tensor(position, dtype=torch.float32)
-    t["goal"][:] = torch.tensor(goal, dtype=torch.float32)
-    t["tracked"][:] = torch.tensor([float(steps), float(steps)])
-    env._views["terminated"][:] = False
-    env._views["truncated"][:] = True
-    env._views["invalid"][:] = False
+            velocity = np.stack([c * goal[:, 0] - s * goal[:, 1], s * goal[:, 0] + c * goal[:, 1]], axis=1)
+            position = position + 0.02 * velocity * follows
+            t["qpos"][:, :2] = torch.tensor(position, dtype=torch.float32)
+            zero = np.zeros(n)
+            t["qpos"][:, 3:7] = torch.tensor(np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], 1))
+            t["qvel"].zero_()
+            t["qvel"][:, :2] = torch.tensor(velocity * follows)
+            t["qvel"][:, 5] = torch.tensor(goal[:, 2] * follows)
+            evaluate_step(env.legged)
+        lengths.append(np.linalg.norm(position - start, axis=1))
+    assert env._views["truncated"].all()
     env._views["mask"][:] = True
     update_levels(env.legged)
-    down = int((t["level"] < 5).sum())
-    if rule == "reward":
-        assert t["level"].tolist() == [6] * n
-    else:
-        assert down > n / 4
+    return t["level"].cpu().numpy(), np.array(lengths)
+
+
+@pytest.mark.parametrize("rule", ["reward", "displacement"])
+def test_perfect_tracker_of_turning_goals(torch_device, rule):
+    """Who follows turning goals perfectly walks in circles and never goes down by either rule; who stands does."""
+    goals = np.random.default_rng(0).uniform(-1, 1, size=(2, 64, 3))
+    config = {"levels": rule, "episode_steps": 1000, "goal_period": 500, "stagger": False}
+    level, lengths = walk(build(torch_device, num_envs=64, **config), goals, follows=1.0)
+    counts = (lengths > 0.31).any(axis=0) | (rule == "reward")
+    unclear = (np.abs(lengths - 0.3) < 0.02).any(axis=0)  # the path that counts begins a step later
+    np.testing.assert_array_equal(level[~unclear], np.where(counts, 6, 5)[~unclear])
+    assert counts.sum() > 60
+    level, _ = walk(build(torch_device, num_envs=64, **config), goals, follows=0.0)
+    still = np.exp(-(goals[..., :2] ** 2).sum(-1) / 0.25).mean(0)
+    down = counts if rule == "displacement" else still < 0.5
+    clear = ~unclear if rule == "displacement" else still < 0.8
+    np.testing.assert_array_equal(level[clear], np.where(down, 4, 5)[clear])
+
+
+def test_goals_that_lead_nowhere_do_not_count(torch_device):
+    """By displacements, goals that turn on the spot say nothing, and a goal that was missed halves one that was met."""
+    goals = np.zeros((2, 4, 3))
+    goals[:, 0, 2] = 1.0  # turns
+    goals[:, 1] = [0.025, 0.0, 0.0]  # leads 0.25 m away
+    goals[0, 2], goals[1, 2] = [0.5, 0.0, 0.0], [0.0, 0.0, 1.0]  # one counts
+    goals[:, 3] = [0.5, 0.0, 0.2]
+    config = {"levels": "displacement", "episode_steps": 1000, "goal_period": 500, "stagger": False}
+    assert walk(build(torch_device, num_envs=4, **config), goals, follows=1.0)[0].tolist() == [5, 5, 6, 6]
+    assert walk(build(torch_device, num_envs=4, **config), goals, follows=0.0)[0].tolist() == [5, 5, 4, 4]
+    env = build(torch_device, num_envs=4, **config)
+    env.tensors["progress"][:] = torch.tensor([0.9, 1.0, 0.3, 1.0])  # mean 0.6
+    env.tensors["level"][:] = 5
+    env._views["truncated"][:] = True
+    env._views["terminated"][:2] = torch.tensor([True, False])
+    env.legged.ground.origin = wp.zeros((10, 1), dtype=wp.vec3, device=env.worlds.mask.device)
+    env._views["mask"][:] = True
+    update_levels(env.legged)
+    assert env.tensors["level"].tolist() == [4, 5, 5, 5]
 
 
 def test_evaluation_puts_world_i_on_tile_i(torch_device, hills):
@@ -587,6 +646,18 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
     env = build(torch_device)
     with pytest.raises(ValueError, match=r"action must have the shape \(6, 12\), got"):
         env.step(torch.zeros(shape, device=torch_device))
+
+
+def test_actions_are_what_the_joints_can_do(torch_device):
+    """However large an action, targets end where the joints' ranges do, and the policy sees what was done."""
+    env = build(torch_device, num_envs=2, noise=False)
+    low, high = np.array([joint.range for joint in env.robot.joints]).T
+    ends = np.array([joint.action_range for joint in env.robot.joints])
+    np.testing.assert_allclose(POSE + 0.25 * ends.T, [low, high], atol=1e-12)
+    assert env.action_bound == pytest.approx(np.abs(ends).max())
+    step = env.step(torch.tensor([[1e6], [-1e6]], device=torch_device).expand(2, 12))
+    np.testing.assert_allclose(env.physics.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(step.obs[:, 36:48].cpu(), ends.T[::-1], rtol=1e-6)
 
 
 NEW_ROBOT = '''

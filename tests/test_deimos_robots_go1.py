@@ -204,14 +204,14 @@ def test_a_robot_is_what_its_data_say(name):
 
 
 def test_collision_geoms_are_spheres_and_capsules(robot, model):
-    """What collides are 15 spheres and capsules, each of them watched, and what is visual weighs nothing."""
+    """What collides are 19 spheres and capsules, each of them watched, and what is visual weighs nothing."""
     sphere_or_capsule = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
     hard = [i for i in range(model.ngeom) if model.geom_contype[i]]
     assert {int(model.geom_type[i]) for i in hard} <= sphere_or_capsule
     assert {model.geom_group[i] for i in hard} == {COLLISION_GROUP}
     assert {model.geom_group[i] for i in range(model.ngeom) if i not in hard} == {VISUAL_GROUP}
     assert sorted(model.geom(i).name for i in hard) == sorted(name for part in robot.parts for name in part)
-    assert len(hard) == 15
+    assert len(hard) == 19
     assert len(robot.parts) == 13
 
 

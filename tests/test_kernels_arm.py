@@ -147,7 +147,8 @@ def make_world(n, seed=0):
         "part_force": np.zeros((4, n, 13)), "overflow": np.zeros(n),
         "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": np.zeros((n, J)),
         "air_time": np.zeros((n, 4)), "tracked": np.zeros((n, 2)), "wanted": rng.normal(size=(n, J)),
-        "foot_contact": np.zeros(n), "level": np.zeros(n), "episode_count": rng.integers(1, 5, n),
+        "foot_contact": np.zeros(n), "level": np.zeros(n), "goal_start": np.zeros((n, 3)), "progress": np.zeros((n, 4)),
+        "episode_count": rng.integers(1, 5, n),
     }  # fmt: skip
 
 
@@ -169,11 +170,12 @@ class World:
         heights = heights_reference() if heights is None else heights
         values = arrays | {
             "term": np.full((n, NUM_COLUMNS + len(ARM_TERMS)), GARBAGE), "value": np.zeros(n), "pose": np.zeros(J),
-            "action_scale": np.zeros(J), "low": np.zeros(J), "high": np.zeros(J), "heights": heights,
+            "action_scale": np.zeros(J), "low": np.zeros(J), "high": np.zeros(J),
+            "action_low": np.full(J, -100.0), "action_high": np.full(J, 100.0), "heights": heights,
             "origin": np.zeros((1, 1, 3)), "noise": np.zeros(OBS), "point": np.zeros((POINTS, 2)),
         }  # fmt: skip
         params = {name: getattr(LocomotionParams(), name) for name in LocomotionParams.vars} | {
-            "dt": DT, "action_bound": 100.0, "max_speed": 20.0, "max_rate": 500.0, "cell": CELL,
+            "dt": DT, "max_speed": 20.0, "max_rate": 500.0, "cell": CELL,
             "corner": wp.vec2(*CORNER),
         }  # fmt: skip
         self.legged = LeggedWorlds(

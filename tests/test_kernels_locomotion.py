@@ -31,12 +31,12 @@ GOAL_SCALE = np.array([2.0, 2.0, 0.25], np.float32)
 POSE = np.tile([0.1, 0.8, -1.5], 4).astype(np.float32)
 LOW, HIGH = POSE - 0.5, POSE + 0.5
 PARAMS = {
-    "dt": DT, "stagger": False, "action_bound": 100.0, "noise": False, "push_interval": 0, "push_speed": 1.0,
+    "dt": DT, "stagger": False, "noise": False, "push_interval": 0, "push_speed": 1.0,
     "weight": vecT(*astuple(RewardWeights())), "air_time_target": 0.3, "soft_low": vec12(*LOW),
     "soft_high": vec12(*HIGH), "max_speed": 20.0, "max_rate": 500.0, "lost_contacts": 0b1011, "scan_start": OBS,
     "standing_height": 0.325, "spawn_height": 0.42, "spawn_range": 1.0, "spawn_speed": 0.5, "spawn_reach": 0.5,
     "level_rule": int(LevelRule.REWARD), "start_levels": 6, "cell": 0.1, "corner": wp.vec2(-50.0, -50.0),
-    "low": wp.vec2(-49.0, -48.0), "high": wp.vec2(47.0, 46.0), "half_tile": 4.0,
+    "low": wp.vec2(-49.0, -48.0), "high": wp.vec2(47.0, 46.0),
 }  # fmt: skip
 """Legged Gym's numbers on a plane."""
 
@@ -59,7 +59,7 @@ def make_world(n, seed=0):
         "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": rng.normal(size=(n, J)),
         "air_time": rng.integers(0, 40, (n, 4)) * DT, "tracked": np.stack([rng.uniform(0, 9, n), np.full(n, 9.0)], 1),
         **{name: np.zeros(n) for name in (*COUNTERS, "level")},
-        "foot_contact": rng.integers(0, 16, n),
+        "foot_contact": rng.integers(0, 16, n), "goal_start": np.zeros((n, 3)), "progress": np.zeros((n, 4)),
     }  # fmt: skip
     integers = (*COUNTERS, "level", "foot_contact", "overflow")
     return {name: value.astype(np.int32 if name in integers else np.float32) for name, value in w.items()}
@@ -68,7 +68,7 @@ def make_world(n, seed=0):
 class World:
     """The same on a device, with outputs that no kernel has written yet; ``changes`` are fields of the parameters."""
 
-    def __init__(self, arrays, device, garbage=np.nan, arm_terms=None, seed=0, world_offset=0, **changes):
+    def __init__(self, arrays, device, garbage=np.nan, arm_terms=None, bound=100.0, seed=0, world_offset=0, **changes):
         n = len(arrays["qpos"])
         self.worlds = make_worlds(
             n, device, obs_dim=OBS, action_dim=J, goal_start=9, goal_scale=GOAL_SCALE, goal_period=500,
@@ -86,7 +86,8 @@ class World:
             term = np.concatenate([term, arm_terms], axis=1)
         values = arrays | {
             "term": term, "value": np.full(n, garbage), "pose": POSE, "action_scale": np.full(J, 0.25), "low": LOW,
-            "high": HIGH, "heights": np.zeros((2, 2)), "origin": np.zeros((1, 1, 3)), "noise": np.zeros(OBS),
+            "high": HIGH, "action_low": np.full(J, -bound), "action_high": np.full(J, bound),
+            "heights": np.zeros((2, 2)), "origin": np.zeros((1, 1, 3)), "noise": np.zeros(OBS),
             "point": np.zeros((0, 2)),
         }  # fmt: skip
         structs = {label: build(table, device, **values) for label, table in TABLES.items() if label != "worlds"}
@@ -341,11 +342,11 @@ def test_solver_limits_are_no_fault(device):
 
 
 def test_actions_become_targets(device):
-    """Targets are pose plus scaled action, clipped at the bound, and the overflow bits are cleared."""
+    """Targets are pose plus scaled action, clipped at the joint's bounds, and the overflow bits are cleared."""
     arrays = make_world(50)
     arrays["overflow"][:] = 3
     arrays["wanted"] *= 10
-    world = World(arrays, device, action_bound=5.0)
+    world = World(arrays, device, bound=5.0)
     world.apply()
     expected = POSE + 0.25 * np.clip(arrays["wanted"], -5, 5)
     np.testing.assert_allclose(world.sim.ctrl.numpy(), expected, rtol=3 * 2.0**-24, atol=2.0**-24)
@@ -450,6 +451,6 @@ def test_rejects_sizes_that_are_too_small(name, value, message):
 
 def test_parameters_are_given_all_and_by_name():
     """A parameter that is forgotten or misspelt is an error."""
-    with pytest.raises(ValueError, match=r"params must be dt, stagger, .*half_tile, got dt"):
+    with pytest.raises(ValueError, match=r"params must be dt, stagger, .*high, got dt"):
         make_params(**{name: PARAMS[name] for name in PARAMS if name != "noise"})
     assert PARAMS.keys() == LocomotionParams.vars.keys()

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 from deimos.kernels.episodes import make_worlds, set_goals
+from deimos.kernels.legged.levels import change_of_level, commanded_displacement, update_levels
 from deimos.kernels.legged.observation import finish_obs
-from deimos.kernels.legged.reset import change_of_level, reset_worlds, update_levels
+from deimos.kernels.legged.reset import reset_worlds
 from deimos.kernels.legged.rewards import vec12, vecT
 from deimos.kernels.legged.state import STATE, TABLES, LeggedWorlds, LevelRule, build, make_params, sizes
 from deimos.kernels.random import Purpose
@@ -19,12 +20,12 @@ LOW, HIGH = POSE - 0.5, POSE + 0.3
 GOAL_SCALE = np.array([2.0, 2.0, 0.25])
 CLOCKS = ("goal_clock", "episode_step", "episode_count", "goal_count")
 PARAMS = {
-    "dt": 0.02, "stagger": False, "action_bound": 100.0, "noise": False, "push_interval": 0, "push_speed": 1.0,
+    "dt": 0.02, "stagger": False, "noise": False, "push_interval": 0, "push_speed": 1.0,
     "weight": vecT(1.0), "air_time_target": 0.3, "soft_low": vec12(*LOW), "soft_high": vec12(*HIGH),
     "max_speed": 20.0, "max_rate": 500.0, "lost_contacts": 0, "scan_start": 48, "standing_height": 0.325,
     "spawn_height": 0.42, "spawn_range": 1.0, "spawn_speed": 0.5, "spawn_reach": 0.5,
     "level_rule": int(LevelRule.REWARD), "start_levels": 2, "cell": CELL, "corner": wp.vec2(*CORNER),
-    "low": wp.vec2(-9.0), "high": wp.vec2(9.0), "half_tile": 2.0,
+    "low": wp.vec2(-9.0), "high": wp.vec2(9.0),
 }  # fmt: skip
 """Legged Gym's numbers on a small terrain."""
 
@@ -45,7 +46,8 @@ class World:
             num_envs=N, num_joints=J, substeps=4, num_points=SCAN, heights=(121, 161), tiles=(LEVELS, COLUMNS)
         )
         values = {
-            "pose": POSE, "action_scale": np.full(J, 0.25), "low": LOW, "high": HIGH, "heights": self.heights,
+            "pose": POSE, "action_scale": np.full(J, 0.25), "low": LOW, "high": HIGH,
+            "action_low": np.full(J, -100.0), "action_high": np.full(J, 100.0), "heights": self.heights,
             "origin": self.origins, "noise": np.zeros(OBS), "point": np.zeros((SCAN, 2)),
         }  # fmt: skip
         structs = {}
@@ -119,6 +121,7 @@ def test_reset_matches_reference(device, uniform_reference):
         np.testing.assert_array_equal(qpos[3:7], [1, 0, 0, 0])
         factor = 0.5 + np.concatenate([draw(4 + k) for k in range(3)])
         np.testing.assert_allclose(qpos[7:], np.clip(POSE * factor, LOW, HIGH), rtol=1e-6)
+        np.testing.assert_array_equal(after["goal_start"][i], [*qpos[:2], 0.0])
         speeds = np.concatenate([draw(1)[:3], draw(2)[:3]]) - 0.5
         np.testing.assert_allclose(qvel, np.append(speeds, np.zeros(J)), rtol=0, atol=1e-6)
         goal = (2 * draw(0, Purpose.FIRST_GOAL)[:3] - 1) * [1.0, 0.5, 2.0]
@@ -126,7 +129,16 @@ def test_reset_matches_reference(device, uniform_reference):
         body = np.concatenate([2 * qvel[:3], 0.25 * qvel[3:6], [0, 0, -1], goal * GOAL_SCALE, qpos[7:] - POSE])
         np.testing.assert_allclose(after["obs"][i, :48], np.append(body, np.zeros(24)), rtol=0, atol=1e-5)
         assert after["episode_count"][i] == episode + 1
-    for name in ("action", "joint_speed", "air_time", "tracked", "foot_contact", "goal_clock", "episode_step"):
+    for name in (
+        "action",
+        "joint_speed",
+        "air_time",
+        "tracked",
+        "progress",
+        "foot_contact",
+        "goal_clock",
+        "episode_step",
+    ):
         assert not after[name][mask].any(), name
     for name in after:
         np.testing.assert_array_equal(after[name][~mask], before[name][~mask], err_msg=name)
@@ -146,28 +158,42 @@ def test_only_first_episodes_are_staggered(device, uniform_reference):
 
 
 @wp.kernel
-def _changes(rule: int, crashed: wp.array[wp.bool], number: wp.array2d[float], change: wp.array[int]):
+def _changes(crashed: wp.array[wp.bool], worth: wp.array[float], change: wp.array[int]):
     i = wp.tid()
-    change[i] = change_of_level(rule, crashed[i], number[i, 0], number[i, 1], number[i, 2], number[i, 3])
+    change[i] = change_of_level(crashed[i], worth[i])
 
 
 @pytest.mark.parametrize(
-    ("rule", "crashed", "tracking", "distance", "wanted", "expected"),
-    [
-        (LevelRule.REWARD, False, 0.8, 0.0, 0.0, 1), (LevelRule.REWARD, False, 0.79, 9.0, 0.0, 0),
-        (LevelRule.REWARD, False, 0.5, 0.0, 0.0, 0), (LevelRule.REWARD, False, 0.49, 9.0, 0.0, -1),
-        (LevelRule.REWARD, True, 1.0, 9.0, 0.0, -1), (LevelRule.DISPLACEMENT, False, 0.0, 4.1, 20.0, 1),
-        (LevelRule.DISPLACEMENT, True, 0.0, 4.1, 20.0, 1), (LevelRule.DISPLACEMENT, False, 1.0, 3.9, 8.0, -1),
-        (LevelRule.DISPLACEMENT, False, 0.0, 3.9, 7.0, 0), (LevelRule.FROZEN, True, 0.0, 9.0, 9.0, 0),
-    ],
-)  # fmt: skip
-def test_change_of_level(device, rule, crashed, tracking, distance, wanted, expected):
-    """The table of the two rules, at and around their thresholds."""
-    number = wp.array([[tracking, distance, wanted, 4.0]], dtype=wp.float32, device=device)
+    ("crashed", "worth", "expected"),
+    [(False, 0.8, 1), (False, 0.79, 0), (False, 0.5, 0), (False, 0.49, -1), (True, 1.0, -1), (True, 0.0, -1)],
+)
+def test_change_of_level(device, crashed, worth, expected):
+    """The table of both rules, at and around their thresholds."""
+    number, flag = wp.array([worth], dtype=wp.float32, device=device), wp.array([crashed], dtype=wp.bool, device=device)
     change = wp.full(1, 7, dtype=wp.int32, device=device)
-    flag = wp.array([crashed], dtype=wp.bool, device=device)
-    wp.launch(_changes, dim=1, inputs=[int(rule), flag, number], outputs=[change], device=device)
+    wp.launch(_changes, dim=1, inputs=[flag, number], outputs=[change], device=device)
     assert change.numpy()[0] == expected
+
+
+@wp.kernel
+def _displacements(goal: wp.array[wp.vec3], time: wp.array[float], displacement: wp.array[float]):
+    i = wp.tid()
+    displacement[i] = commanded_displacement(goal[i], time[i])
+
+
+def test_commanded_displacement_is_that_of_the_path(device):
+    """The chord of line or arc equals the end of the path, integrated in a million steps."""
+    goals = np.array(
+        [[1.0, 0.0, 0.0], [0.6, -0.8, 0.0], [1.0, 0.0, 1e-5], [0.5, 0.5, 1.0], [-1.0, 0.2, -0.7], [0, 0, 1]]
+    )
+    times = np.array([3.0, 10.0, 10.0, 5.0, 20.0, 4.0])
+    found = wp.full(len(goals), np.nan, dtype=wp.float32, device=device)
+    inputs = [wp.array(goals, dtype=wp.vec3, device=device), wp.array(times, dtype=wp.float32, device=device)]
+    wp.launch(_displacements, dim=len(goals), inputs=inputs, outputs=[found], device=device)
+    for (x, y, w), t, displacement in zip(goals, times, found.numpy(), strict=True):
+        angle = w * t * (np.arange(1_000_000) + 0.5) / 1_000_000
+        end = np.hypot(np.mean(np.cos(angle) * x - np.sin(angle) * y), np.mean(np.sin(angle) * x + np.cos(angle) * y))
+        assert displacement == pytest.approx(end * t, rel=1e-5, abs=1e-6)
 
 
 def test_levels_of_first_episodes_and_frozen_ones(device, uniform_reference):

@@ -19,8 +19,17 @@ from .arm_goals import (
 )
 from .arm_rewards import ARM_TERMS, ArmMotion, reach, weighted_arm_terms
 from .rewards import LEG_JOINTS
-from .state import NUM_COLUMNS, Ground, LeggedWorlds, LocomotionParams, LocomotionState, LocomotionStep, Simulation
-from .step import find_fault
+from .state import (
+    NUM_COLUMNS,
+    Ground,
+    Joints,
+    LeggedWorlds,
+    LocomotionParams,
+    LocomotionState,
+    LocomotionStep,
+    Simulation,
+)
+from .step import bounded_action, find_fault
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,13 +46,13 @@ def write_end_effector(arm: Arm, seen: wp.vec3, env: int, obs: wp.array2d[float]
 
 
 @wp.func
-def arm_effort(worlds: Worlds, params: LocomotionParams, sim: Simulation, state: LocomotionState, env: int) -> wp.vec2:
+def arm_effort(worlds: Worlds, joints: Joints, sim: Simulation, state: LocomotionState, env: int) -> wp.vec2:
     """(power [W], squared change of the action), summed over the arm's joints."""
     power = float(0.0)
     change = float(0.0)
     for j in range(wp.static(LEG_JOINTS), worlds.action.shape[1]):
         power += wp.abs(sim.torque[env, j] * sim.qvel[env, 6 + j])
-        a = wp.clamp(worlds.action[env, j], -params.action_bound, params.action_bound) - state.action[env, j]
+        a = bounded_action(worlds, joints, env, j) - state.action[env, j]
         change += a * a
     return wp.vec2(power, change)
 
@@ -54,6 +63,7 @@ def _evaluate_arms(
     worlds: Worlds,
     # In
     params: LocomotionParams,
+    joints: Joints,
     arm: Arm,
     ground: Ground,
     sim: Simulation,
@@ -66,7 +76,7 @@ def _evaluate_arms(
             place = place_of_end_effector(params, arm, ground.heights, sim.qpos, env)
             seen = goal_of_place(place)
             goal = active_goal(worlds, env)
-            effort = arm_effort(worlds, params, sim, state, env)
+            effort = arm_effort(worlds, joints, sim, state, env)
             m = ArmMotion()
             m.error = seen - goal
             m.distance = wp.length(place - place_of_goal(goal))
@@ -89,7 +99,8 @@ def evaluate_arms(legged: LeggedWorlds, arm: Arm) -> None:
     the tracking in column ``GROUP``, the observation at ``arm.obs_start``.
     """
     legged.launch(
-        _evaluate_arms, legged.worlds.num_threads, arm, legged.ground, legged.sim, legged.state, legged.out
+        _evaluate_arms, legged.worlds.num_threads, legged.joints, arm, legged.ground, legged.sim, legged.state,
+        legged.out,
     )  # fmt: skip
 
 

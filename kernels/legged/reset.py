@@ -1,4 +1,4 @@
-"""The legged robots' resets, levels and goals: what happens between two steps."""
+"""The legged robots' resets: what happens between two steps."""
 
 import warp as wp
 
@@ -6,6 +6,7 @@ from ..episodes import Worlds, begin_episode
 from ..random import Purpose, uniform4
 from ..rotations import from_yaw
 from .height_scan import sample_height
+from .levels import begin_path
 from .observation import write_proprioception
 from .rewards import LEG_JOINTS
 from .state import (
@@ -13,7 +14,6 @@ from .state import (
     Ground,
     Joints,
     LeggedWorlds,
-    LevelRule,
     LocomotionParams,
     LocomotionState,
     Simulation,
@@ -21,68 +21,9 @@ from .state import (
 
 wp.set_module_options({"enable_backward": False})
 
-PROMOTED, DEMOTED = 0.8, 0.5  # mean linear tracking that lifts and that lowers a world's level
 ARM_SPREAD = 0.2  # [rad] about the pose that an arm's joints start in; more, and it may hit the trunk
 SPAWN_SAMPLES = 5  # heights along each side of the square below the base
 BLOCK_PLACE, BLOCK_SPEED, BLOCK_CLOCK, BLOCK_JOINTS = 0, 1, 3, 4  # of the draws of a reset
-
-
-@wp.func
-def change_of_level(
-    rule: int, crashed: wp.bool, tracking: float, distance: float, wanted_distance: float, half_tile: float
-) -> int:
-    """By how much an episode's outcome moves its world's level: 1, 0 or -1.
-
-    Args:
-        rule: One of ``LevelRule``.
-        crashed: Whether the episode ended in a crash.
-        tracking: Mean linear tracking of the episode, in [0, 1].
-        distance: From where the robot started to where it ended [m].
-        wanted_distance: What the last goal asks for within a whole episode [m].
-        half_tile: Half side of a tile [m].
-    """
-    if rule == wp.static(int(LevelRule.REWARD)):
-        if crashed or tracking < wp.static(DEMOTED):
-            return -1
-        if tracking >= wp.static(PROMOTED):
-            return 1
-    if rule == wp.static(int(LevelRule.DISPLACEMENT)):
-        if distance > half_tile:
-            return 1
-        if distance < 0.5 * wanted_distance:
-            return -1
-    return 0
-
-
-@wp.func
-def next_level(
-    worlds: Worlds, params: LocomotionParams, ground: Ground, sim: Simulation, state: LocomotionState, env: int
-) -> int:
-    """The level that a world's next episode is played on.
-
-    A reset in the middle of an episode, or of an invalid world, says nothing about how it went: the level stays.
-    """
-    world = worlds.world_offset + env
-    episode = worlds.episode_count[env]
-    num_levels = ground.origin.shape[0]
-    column = world % ground.origin.shape[1]
-    if params.level_rule == wp.static(int(LevelRule.FROZEN)):
-        return (world // ground.origin.shape[1]) % num_levels
-    u = uniform4(worlds.seed, wp.static(int(Purpose.LEVEL)), world, episode, 0, 0)
-    if episode == 0:
-        return wp.min(int(u[0] * float(params.start_levels)), num_levels - 1)
-    level = state.level[env]
-    seen = state.tracked[env]
-    crashed = worlds.terminated[env]
-    if worlds.invalid[env] or seen[1] == 0.0 or not (crashed or worlds.truncated[env]):
-        return level
-    start = ground.origin[wp.min(level, num_levels - 1), column]
-    distance = wp.length(wp.vec2(sim.qpos[env, 0] - start[0], sim.qpos[env, 1] - start[1]))
-    wanted = wp.length(wp.vec2(worlds.goal[env, 0], worlds.goal[env, 1])) * params.dt * float(worlds.time_limit)
-    level += change_of_level(params.level_rule, crashed, seen[0] / seen[1], distance, wanted, params.half_tile)
-    if level >= num_levels:  # who has passed the last level is not kept there
-        return wp.min(int(u[0] * float(num_levels)), num_levels - 1)
-    return wp.max(level, 0)
 
 
 @wp.func
@@ -150,30 +91,6 @@ def clear_memory(env: int, state: LocomotionState):
 
 
 @wp.kernel
-def _update_levels(
-    # In
-    worlds: Worlds,
-    params: LocomotionParams,
-    ground: Ground,
-    sim: Simulation,
-    # In and out
-    state: LocomotionState,
-):
-    env = wp.tid()
-    if not worlds.mask[env]:
-        return
-    state.level[env] = next_level(worlds, params, ground, sim, state, env)
-
-
-def update_levels(legged: LeggedWorlds) -> None:
-    """Give every world of ``worlds.mask`` the level that its last episode earned; call it before anything is reset.
-
-    Worlds whose last step did not end the episode, or was not physical, keep their level.
-    """
-    legged.launch(_update_levels, legged.worlds.num_envs, legged.ground, legged.sim, legged.state)
-
-
-@wp.kernel
 def _reset_worlds(
     # In and out
     worlds: Worlds,
@@ -198,6 +115,7 @@ def _reset_worlds(
         u = uniform4(worlds.seed, wp.static(int(Purpose.RESET)), world, episode, 0, wp.static(BLOCK_CLOCK))
         worlds.goal_clock[env] = int(u[0] * float(worlds.goal_period))
         worlds.episode_step[env] = int(u[1] * float(worlds.time_limit))
+    begin_path(env, worlds, sim, state)
     write_proprioception(env, worlds, joints, sim, state)
 
 

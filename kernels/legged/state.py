@@ -51,8 +51,7 @@ class LevelRule(IntEnum):
     REWARD = 1
     """Up if the mean linear tracking is at least 0.8 without a crash, down if it is below 0.5 or after a crash."""
     DISPLACEMENT = 2
-    """Legged Gym's: up if the robot is more than half a tile away from its start, down if it is less
-    than half of what its last goal asked for."""
+    """The same with the agreement of the robot's displacements and those of its goals' paths (``levels``)."""
 
 
 @wp.struct
@@ -61,7 +60,6 @@ class LocomotionParams:
 
     dt: float  # duration of a step [s]
     stagger: wp.bool  # whether the clocks of a world's first episode start at random steps
-    action_bound: float  # actions are clipped to [-action_bound, action_bound]
     noise: wp.bool  # whether observations are noisy
     push_interval: int  # steps from push to push, 0 for none
     push_speed: float  # bound of the velocity that a push sets [m/s]
@@ -84,7 +82,6 @@ class LocomotionParams:
     corner: wp.vec2  # its first sample [m]
     low: wp.vec2  # least and largest x and y of the terrain; beyond them an episode is truncated [m]
     high: wp.vec2
-    half_tile: float  # half side of a tile [m]
 
 
 @wp.struct
@@ -95,6 +92,8 @@ class Joints:
     action_scale: wp.array[float]  # what an action of one adds to the target [rad]
     low: wp.array[float]  # range [rad]
     high: wp.array[float]
+    action_low: wp.array[float]  # actions are clipped to what takes the target to an end of the range
+    action_high: wp.array[float]
 
 
 @wp.struct
@@ -123,6 +122,8 @@ class LocomotionState:
     foot_contact: wp.array[int]  # bit i: foot i touched the ground on the last step
     tracked: wp.array[wp.vec2]  # sum of the linear tracking in this episode, and its steps
     level: wp.array[int]
+    goal_start: wp.array[wp.vec3]  # where the robot was when its goal began: x and y [m], and the goal's clock
+    progress: wp.array[wp.vec4]  # how well displacements agree with paths, see ``follow_path``
 
 
 @wp.struct

@@ -6,6 +6,7 @@ from ..episodes import Worlds, end_step
 from ..random import Purpose, uniform4
 from ..rotations import down_in_body
 from .contacts import peak_force
+from .levels import follow_path
 from .observation import base_quaternion, base_rate, base_velocity, write_proprioception
 from .rewards import LEG_JOINTS, TERMS, LegMotion, linear_tracking, vec12, weighted_terms, yaw_tracking
 from .state import (
@@ -19,6 +20,7 @@ from .state import (
     NUM_FEET,
     Joints,
     LeggedWorlds,
+    LevelRule,
     LocomotionParams,
     LocomotionState,
     LocomotionStep,
@@ -37,6 +39,12 @@ def push_is_due(worlds: Worlds, params: LocomotionParams, env: int, age: int) ->
     return (age + int(u[0] * float(params.push_interval))) % params.push_interval == 0
 
 
+@wp.func
+def bounded_action(worlds: Worlds, joints: Joints, env: int, j: int) -> float:
+    """The action of a joint, within what the joint can do."""
+    return wp.clamp(worlds.action[env, j], joints.action_low[j], joints.action_high[j])
+
+
 @wp.kernel
 def _apply_actions(
     # In and out
@@ -53,8 +61,7 @@ def _apply_actions(
         for j in range(worlds.action.shape[1]):
             a = worlds.action[env, j]
             unsound += a - a  # 0, or NaN for NaN and infinity
-            bounded = wp.clamp(a, -params.action_bound, params.action_bound)
-            sim.ctrl[env, j] = joints.pose[j] + joints.action_scale[j] * bounded
+            sim.ctrl[env, j] = joints.pose[j] + joints.action_scale[j] * bounded_action(worlds, joints, env, j)
         if unsound != 0.0:
             wp.atomic_min(worlds.fault, 2, env)
         age = worlds.episode_step[env]
@@ -68,7 +75,7 @@ def _apply_actions(
 def apply_actions(legged: LeggedWorlds) -> None:
     """Turn actions into target angles, push the robots that are due, and clear the simulator's overflow bits.
 
-    Actions are clipped to ``params.action_bound``. A push sets the horizontal velocity of the base, as in Legged Gym.
+    Actions are clipped to what the joints can do. A push sets the horizontal velocity of the base, as in Legged Gym.
     ``worlds.fault[2]`` is lowered to the lowest world whose action is not finite.
     """
     legged.launch(_apply_actions, legged.worlds.num_threads, legged.joints, legged.sim)
@@ -158,7 +165,7 @@ def update_air_time(params: LocomotionParams, part_force: wp.array3d[float], env
 
 @wp.func
 def leg_motion(
-    worlds: Worlds, params: LocomotionParams, sim: Simulation, env: int, state: LocomotionState
+    worlds: Worlds, params: LocomotionParams, joints: Joints, sim: Simulation, env: int, state: LocomotionState
 ) -> LegMotion:
     """What the reward is made of; the air times move on."""
     m = LegMotion()
@@ -172,7 +179,7 @@ def leg_motion(
     m.torque = load12(sim.torque, env, 0)
     m.last_action = load12(state.action, env, 0)
     for j in range(wp.static(LEG_JOINTS)):
-        m.action[j] = wp.clamp(worlds.action[env, j], -params.action_bound, params.action_bound)
+        m.action[j] = bounded_action(worlds, joints, env, j)
     m.soft_low = params.soft_low
     m.soft_high = params.soft_high
     m.collisions = count_collisions(sim.part_force, env)
@@ -199,10 +206,10 @@ def write_reward(m: LegMotion, params: LocomotionParams, env: int, worlds: World
 
 
 @wp.func
-def remember(worlds: Worlds, params: LocomotionParams, sim: Simulation, env: int, state: LocomotionState):
+def remember(worlds: Worlds, joints: Joints, sim: Simulation, env: int, state: LocomotionState):
     """Keep this step's action and joint velocities for the next."""
     for j in range(worlds.action.shape[1]):
-        state.action[env, j] = wp.clamp(worlds.action[env, j], -params.action_bound, params.action_bound)
+        state.action[env, j] = bounded_action(worlds, joints, env, j)
         state.joint_speed[env, j] = sim.qvel[env, 6 + j]
 
 
@@ -239,10 +246,12 @@ def _evaluate_step(
                 worlds.tracking[env, k] = 0.0
             out.value[env] = found[1]
         else:
-            m = leg_motion(worlds, params, sim, env, state)
+            m = leg_motion(worlds, params, joints, sim, env, state)
             write_reward(m, params, env, worlds, out)
             state.tracked[env] = state.tracked[env] + wp.vec2(worlds.tracking[env, 0], 1.0)
-            remember(worlds, params, sim, env, state)
+            remember(worlds, joints, sim, env, state)
+            if params.level_rule == wp.static(int(LevelRule.DISPLACEMENT)):
+                follow_path(env, worlds, params, sim, state)
             write_proprioception(env, worlds, joints, sim, state)
         end_step(env, crashed, is_off(params, sim, env), int(found[0]), worlds)
 

@@ -29,8 +29,8 @@ class LocomotionConfig(EnvConfig):
     episode_steps: int = 1000
     """Steps after which an episode is truncated, at least 1."""
     levels: Literal["reward", "displacement", "frozen"] = "reward"
-    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far it got (Legged
-    Gym), or nothing."""
+    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far its goals led it
+    beside how far they should have (an arc where they ask for yaw; less than 0.3 m does not count), or nothing."""
     start_levels: int = 6
     """Levels that first episodes are drawn from, at least 1."""
     rewards: RewardWeights = field(default_factory=RewardWeights)

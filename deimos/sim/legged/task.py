@@ -18,8 +18,9 @@ from torch import Tensor
 from deimos import terrain
 from deimos.kernels.legged import state as tables
 from deimos.kernels.legged.height_scan import scan_points
+from deimos.kernels.legged.levels import update_levels
 from deimos.kernels.legged.observation import finish_obs
-from deimos.kernels.legged.reset import reset_worlds, update_levels
+from deimos.kernels.legged.reset import reset_worlds
 from deimos.kernels.legged.rewards import LEG_JOINTS, vec12, vecT
 from deimos.kernels.legged.state import (
     BROKEN,
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 
 SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
 MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
-ACTION_BOUND = 100.0  # Legged Gym's: far beyond what a policy does, so that only nonsense is clipped
 SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
 EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
 NOWHERE = 1e9  # [m]; a plane has no edge
@@ -61,7 +61,8 @@ NOISE = {
 class Locomotion(WarpEnv):
     """A legged robot in many worlds; see ``LocomotionConfig``.
 
-    Actions are differences from the default pose, in units of every joint's ``action_scale``.
+    Actions are differences from the default pose, in units of every joint's ``action_scale``, and clipped to what takes
+    the target angle to an end of the joint's range.
 
     Args:
         config: The task.
@@ -89,7 +90,7 @@ class Locomotion(WarpEnv):
         super().__init__(
             config, num_envs, device, seed, env_offset,
             layout=_layout(robot, parts, len(self.points)), goal_range=[half for part in parts for half in part.range],
-            action_dim=len(robot.joints), action_bound=ACTION_BOUND, dt=config.physics.control_period,
+            action_dim=len(robot.joints), action_bound=_action_bound(robot), dt=config.physics.control_period,
             time_limit=config.episode_steps,
         )  # fmt: skip
         ground = config.load_terrain()
@@ -134,13 +135,23 @@ class Locomotion(WarpEnv):
         )  # fmt: skip
         numbers = {name: size for name, size in sizes.items() if name != "num_envs"}
         low, high = np.array([joint.range for joint in joints]).T
+        action_low, action_high = np.array([joint.action_range for joint in joints]).T
         scale, device = [joint.action_scale for joint in joints], warp_device(self.device)
         simulation = {name: getattr(self.physics, name) for name in tables.SIMULATION.names}
         return LeggedWorlds(
             sizes=sizes,
             params=self._make_params(ground),
             worlds=self.worlds,
-            joints=tables.build(tables.JOINTS, device, pose=self.robot.pose, action_scale=scale, low=low, high=high),
+            joints=tables.build(
+                tables.JOINTS,
+                device,
+                pose=self.robot.pose,
+                action_scale=scale,
+                low=low,
+                high=high,
+                action_low=action_low,
+                action_high=action_high,
+            ),
             ground=tables.build(tables.GROUND, device, heights=land.heights, origin=land.origins),
             sensing=tables.build(tables.SENSING, device, noise=_noise(self.layout, self.parts), point=self.points),
             state=self.allocate(tables.STATE, **numbers),
@@ -156,7 +167,7 @@ class Locomotion(WarpEnv):
         corner = np.array(land.corner)
         far = corner + (np.array(land.heights.shape) - 1) * land.cell
         return tables.make_params(**{
-            "dt": self.dt, "stagger": config.stagger, "action_bound": ACTION_BOUND, "noise": config.noise,
+            "dt": self.dt, "stagger": config.stagger, "noise": config.noise,
             "push_interval": max(1, round(config.push_interval / self.dt)) if config.push_interval else 0,
             "push_speed": config.push_speed,
             "weight": vecT(*asdict(config.rewards).values()), "air_time_target": config.air_time_target,
@@ -168,7 +179,6 @@ class Locomotion(WarpEnv):
             "start_levels": config.start_levels, "cell": land.cell, "corner": wp.vec2(*land.corner),
             "low": wp.vec2(*(corner + EDGE)) if ground else wp.vec2(-NOWHERE),
             "high": wp.vec2(*(far - EDGE)) if ground else wp.vec2(NOWHERE),
-            "half_tile": land.tile / 2,
         })  # fmt: skip
 
     def _begin(self) -> None:
@@ -251,6 +261,11 @@ class Locomotion(WarpEnv):
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
         """See ``Env.reference_policy``. Nobody has written down how to walk."""
         return None
+
+
+def _action_bound(robot: Robot) -> float:
+    """The largest action that any joint can do; those of every joint are in the robot's data."""
+    return max(abs(end) for joint in robot.joints for end in joint.action_range)
 
 
 def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:

@@ -45,7 +45,7 @@ class PhysicsConfig:
     contacts: int = 0
     """Contact buffer size per world, shared by all worlds; 0 takes half of what touching with every geom would need, a
     quarter on a height field, but one for every pair of geoms that can touch at least, and all of it for 16 worlds
-    more. That is 63 % and 28 % for 512 Go1s."""
+    more. That is 69 % and 28 % for 512 Go1s."""
     rows: int = 0
     """Buffer size for constraint rows in each world; 0 takes what touching with every geom, all joints at limits,
     needs, four fifths of it on a height field."""
@@ -320,7 +320,7 @@ def _dress(spec: "mujoco.MjSpec", ground: "mujoco.MjsGeom") -> None:
 def _buffer_sizes(model: "mujoco.MjModel", num_envs: int, config: PhysicsConfig, *, plane: bool) -> tuple[int, int]:
     """Buffer sizes: contacts in all worlds, and constraint rows in each.
 
-    Buffers cost time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 120
+    Buffers cost time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 136
     rows a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown about by
     their own legs 93.
     """

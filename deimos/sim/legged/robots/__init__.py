@@ -37,6 +37,12 @@ class Joint:
     max_torque: float
     """[N m]."""
 
+    @property
+    def action_range(self) -> tuple[float, float]:
+        """The actions that take the target angle to the ends of the range; beyond them actions are clipped."""
+        low, high = self.range
+        return (low - self.pose) / self.action_scale, (high - self.pose) / self.action_scale
+
 
 @dataclass(frozen=True, kw_only=True)
 class Arm:

@@ -8,6 +8,10 @@ Where the numbers come from:
 * Collision: the feet's radius is Menagerie's and the limbs' capsules are thickened from its own. The
   trunk is two capsules that fill mjlab's box of (0.26, 0.18, 0.1) m: mujoco-warp keeps at most 50 contacts of a
   geom with the prisms of a height field, and on cells of 0.05 m a box, or longer capsules, have more.
+* The hips are balls of mjlab's radius, where they stick out of the trunk: a Go1 that lies on its side touches the
+  ground with them. They are watched as parts of the base, since the thesis counts "any part of the robot's base"
+  as a crash and a hip holds the trunk's motors; without them a robot on its side rested on thighs and calves and
+  went on.
 * Gains: those of the Unitree A1 in Legged Gym (20 N m/rad, 0.5 N m s/rad) raised by half, since a Go1
   is heavier; the default pose is the A1's, with the rear thighs as the front ones so that it stands level.
 """
@@ -28,6 +32,7 @@ HIP_X, HIP_Y = 0.1881, 0.04675  # [m], in the trunk
 THIGH_Y = 0.08  # [m], in the hip
 LINK = 0.213  # [m], length of thigh and of calf
 FOOT_RADIUS = 0.023  # [m]
+HIP_RADIUS = 0.05  # [m], mjlab's
 
 # Each is mass [kg], centre of mass [m], inertia about it (xx, yy, zz, xy, xz, yz) [kg m^2].
 TRUNK = (5.204, (0.0223, 0.002, -0.0005), (0.0168128, 0.0630095, 0.0716547, -2.297e-4, -2.946e-4, -4.19e-5))
@@ -89,7 +94,7 @@ def build(*, stiffness: float = STIFFNESS, damping: float = DAMPING, action_scal
         spec=spec,
         joints=joints,
         parts=(
-            ("trunk_left", "trunk_right", "head"),
+            ("trunk_left", "trunk_right", "head", *(f"{leg}_hip" for leg in LEGS)),
             *((f"{leg}_foot",) for leg in LEGS),
             *((f"{leg}_{link}",) for leg in LEGS for link in ("thigh", "calf")),
         ),
@@ -127,6 +132,7 @@ def _add_leg(trunk: "mujoco.MjsBody", leg: str) -> None:
     ):
         body.add_joint(name=f"{leg}_{joint}", axis=axis, range=RANGE[joint], limited=True, armature=ARMATURE[joint])
         _add_mirrored(body, numbers, *turned)
+    _collide(hip, f"{leg}_hip", HIP_RADIUS, (0.0, left * 0.053, 0.0))
     _collide(thigh, f"{leg}_thigh", 0.015, (-0.02, 0, -0.02), (-0.01, 0, -0.19))
     _collide(calf, f"{leg}_calf", 0.012, (0.01, 0, -0.03), (0.004, 0, -0.17))
     _collide(calf, f"{leg}_foot", FOOT_RADIUS, (0, 0, -LINK))
