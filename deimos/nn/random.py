@@ -33,15 +33,16 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[int, int])
     x0, x1, x2, x3 = counter
     k0, k1 = key
     for _ in range(10):
-        # int64 keeps the low 64 bits of a product, and its sign bit is taken off with all that is above a word.
+        # An int64 keeps the low 64 bits of a product; what is above a word is taken off where it would matter.
         p0, p1 = x0 * _MULTIPLIERS[0], x2 * _MULTIPLIERS[1]
-        x0, x1 = ((p1 >> 32) ^ x1).bitwise_xor_(k0).bitwise_and_(_WORD), p1.bitwise_and_(_WORD)
-        x2, x3 = ((p0 >> 32) ^ x3).bitwise_xor_(k1).bitwise_and_(_WORD), p0.bitwise_and_(_WORD)
+        x0 = ((p1 >> 32) ^ x1).bitwise_xor_(k0).bitwise_and_(_WORD)
+        x2 = ((p0 >> 32) ^ x3).bitwise_xor_(k1).bitwise_and_(_WORD)
+        x1, x3 = p1, p0
         k0, k1 = (k0 + _WEYL[0]) & _WORD, (k1 + _WEYL[1]) & _WORD
-    return x0, x1, x2, x3
+    return x0, x1 & _WORD, x2, x3 & _WORD
 
 
-def uniforms(seed: int, purpose: int, world: Tensor, count: Tensor, block: int | Tensor = 0) -> Tensor:
+def uniforms(seed: int, purpose: int, world: Tensor, count: Tensor) -> Tensor:
     """Four independent uniform numbers in [0, 1), multiples of 2^-24, for every address, shape (..., 4).
 
     Args:
@@ -49,12 +50,15 @@ def uniforms(seed: int, purpose: int, world: Tensor, count: Tensor, block: int |
         purpose: What they are for.
         world: Global numbers of the worlds, int64 in [0, 2^32), shape (...,).
         count: How often each has drawn for this purpose, int64 in [0, 2^32), of a shape that broadcasts.
-        block: Distinguishes several fours of one address, in [0, 2^32), of a shape that broadcasts.
     """
+    return torch.stack(_uniforms(seed, purpose, world, count, 0), dim=-1)
+
+
+def _uniforms(seed: int, purpose: int, world: Tensor, count: Tensor, block: int) -> list[Tensor]:
     zero = torch.zeros((), dtype=torch.int64, device=world.device)
     words = philox((world, count, zero, zero + block), (seed, purpose))
     # The top 24 bits fill a float32 exactly, so 1.0 is never reached.
-    return torch.stack([(word >> 8).float().mul_(2.0**-24) for word in torch.broadcast_tensors(*words)], dim=-1)
+    return [(word >> 8).float().mul_(2.0**-24) for word in words]
 
 
 def normals(seed: int, purpose: int, world: Tensor, count: Tensor, size: int) -> Tensor:
@@ -62,8 +66,11 @@ def normals(seed: int, purpose: int, world: Tensor, count: Tensor, size: int) ->
 
     By Box and Muller: two uniform numbers make two normal ones, none beyond sqrt(48 ln 2) = 5.77.
     """
-    block = torch.arange(-(-size // 4), device=world.device)
-    u = uniforms(seed, purpose, world.unsqueeze(-1), count.unsqueeze(-1), block)  # (..., blocks, 4)
-    radius = torch.log1p(-u[..., :2]).mul_(-2.0).sqrt_()  # 1 - u is never 0
-    angle = u[..., 2:] * (2.0 * math.pi)
-    return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=-1).flatten(-2)[..., :size]
+    numbers: list[Tensor] = []
+    for block in range(-(-size // 4)):
+        u0, u1, u2, u3 = _uniforms(seed, purpose, world, count, block)
+        for first, second in ((u0, u1), (u2, u3)):
+            radius = torch.log1p(-first).mul_(-2.0).sqrt_()  # 1 - u is never 0
+            angle = second.mul_(2.0 * math.pi)
+            numbers += [angle.cos().mul_(radius), angle.sin().mul_(radius)]
+    return torch.stack(numbers[:size], dim=-1)
