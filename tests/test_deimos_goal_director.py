@@ -49,12 +49,13 @@ class Theirs:
         return given, done
 
 
-def test_it_does_what_the_loop_does():
+@pytest.mark.parametrize("candidates", [1, 20])
+def test_it_does_what_the_loop_does(candidates):
     """On the same worlds it issues the same goals and keeps the same interactions, labels, scores and fear."""
-    config = director.Config(candidates=1, fear=FearConfig(min_per_class=8))
+    config = director.Config(percentile=75, candidates=candidates, fear=FearConfig(min_per_class=8))
     env = CONFIG.build(N, CPU, 0)
-    ours = GoalLoop(env, config.build(spaces(env), seed=3))
-    theirs = Theirs(GoalDirector(config, PERIOD, learn_every=12, seed=3))
+    ours = GoalLoop(env, config.build(spaces(env), seed=0))
+    theirs = Theirs(GoalDirector(config, PERIOD, learn_every=12, seed=0), candidates)
     labels = []
     for now in range(96):
         ours.advance(env.step(action(now)))

@@ -11,10 +11,13 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from deimos.checks import SimulationError
+from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn.adam import Adam
 from deimos.nn.networks import Backprop, flatten_parameters, mlp
 from deimos.nn.returns import advantages
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.envs import particle
 
 NUM_ENVS, NUM_STEPS = 50, 24
 
@@ -70,7 +73,7 @@ def test_advantages_reject_another_shape():
 def test_backprop_is_autograd(activation, rows):
     """The written-out passes give autograd's output and gradients, and add to what is there."""
     torch.manual_seed(0)
-    net = mlp(7, (16, 9), 3, activation)
+    net = mlp(7, (16, 9), 3, activation, torch.default_generator)
     x, delta = torch.randn(rows, 7), torch.randn(rows, 3)
     expected = torch.autograd.grad((net(x) * delta).sum(), list(net.parameters()))
     flatten_parameters(net)
@@ -87,7 +90,7 @@ def test_backprop_is_autograd(activation, rows):
 def test_flat_parameters_keep_the_network():
     """Laying parameters end to end changes no output, aligns each to 64 bytes and gives every module its gradient."""
     torch.manual_seed(0)
-    nets = [mlp(3, (5,), 2, "relu"), mlp(3, (4,), 1, "relu")]
+    nets = [mlp(3, (5,), 2, "relu", torch.default_generator), mlp(3, (4,), 1, "relu", torch.default_generator)]
     x = torch.randn(8, 3)
     before = [net(x) for net in nets]
     flat, slices = flatten_parameters(*nets)
@@ -300,6 +303,52 @@ def test_a_learner_goes_on_from_its_state_bit_for_bit():
     other.update(rollout)
     assert all(torch.equal(a, b) for a, b in zip(ppo.actor.parameters(), other.actor.parameters(), strict=True))
     assert torch.equal(ppo.learning_rate, other.learning_rate)
+
+
+def test_exploration_belongs_to_seed_world_and_step():
+    """Two shards explore as the whole does, a rollout goes on where the last one ended, and seeds differ."""
+    ppo, noise = small_learner(), torch.empty(2 * NUM_STEPS, NUM_ENVS, 3)
+    ppo.draw_noise(noise, 0)
+    later = torch.empty(NUM_STEPS, NUM_ENVS, 3)
+    ppo.draw_noise(later, NUM_STEPS)
+    assert torch.equal(later, noise[NUM_STEPS:])
+    shard = PPO(ppo.config, 20, 12, 3, torch.device("cpu"), 0)
+    part = torch.empty(2 * NUM_STEPS, 20, 3)
+    shard.draw_noise(part, 0, env_offset=30)
+    assert torch.equal(part, noise[:, 30:])
+    small_learner(seed=1).draw_noise(later, NUM_STEPS)
+    assert not (later == noise[NUM_STEPS:]).any()
+
+
+def test_whoever_truncates_ends_the_episode():
+    """No advantage runs across a reset that an environment without a time limit makes; its last state is valued."""
+    env = particle.Config().build(4, torch.device("cpu"), seed=0)
+    assert env.time_limit == 0
+    ppo = PPO(PPOConfig(num_steps=3, hidden=(8,)), 4, env.obs_dim, 3, env.device, 0)
+    loop, rollout = GoalLoop(env, uniform.Config().build(spaces(env), 0)), ppo.new_rollout()
+    for _ in range(2):  # what the first rollout cut off is forgotten in the second
+        for t in range(3):
+            rollout.obs[t] = env.obs
+            step = env.step(torch.ones(4, 3))
+            step.truncated[2] = t == 1
+            if t == 1:
+                final = step.obs.clone()
+            changes = loop.resolve(step)
+            rollout.record(
+                t, obs=step.obs, reward=step.reward, terminated=step.terminated, truncated=step.truncated,
+                invalid=step.invalid, weight=loop.weight, cut_off=changes.cut_off,
+            )  # fmt: skip
+            loop.renew(step, changes)
+        rollout.obs[3] = env.obs
+    assert rollout.truncated.nonzero().tolist() == [[1, 2]]
+    step, world, obs = rollout.cut_off()
+    assert (step.tolist(), world.tolist()) == ([1], [2])
+    assert torch.equal(obs, final[2:3])
+    assert not torch.equal(obs[0], rollout.obs[2, 2])
+    value = rollout.estimate(ppo.value)
+    scaled = rollout.reward * ppo.config.reward_scale
+    expected = scaled[1, 2] + ppo.config.discount * ppo.value(obs)[0] - value[1, 2]
+    torch.testing.assert_close(rollout.advantage[1, 2], expected, rtol=1e-5, atol=1e-6)
 
 
 def test_somebody_elses_critic_is_the_baseline():

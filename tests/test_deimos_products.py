@@ -78,7 +78,7 @@ def test_inexact_library_is_not_used(monkeypatch):
 def test_fused_scores_are_the_networks(torch_device, outputs):
     """One kernel gives what products give, for more and fewer decisions, other candidates, weights and whitening."""
     torch.manual_seed(0)
-    net = mlp(9, (64,), outputs, "relu").to(torch_device)
+    net = mlp(9, (64,), outputs, "relu", torch.default_generator).to(torch_device)
     mean, factor = torch.randn(3, device=torch_device), torch.ones(3, device=torch_device)
     whitening = Whitening(mean, factor, bound=1.0) if outputs > 1 else None
     fused, by_products = fuse(net, 3, whitening=whitening), ManyCandidates(net, 3)
@@ -128,7 +128,7 @@ def _refuse(*arguments):
 
 def test_fused_scores_need_warp(monkeypatch):
     """Without Warp no network has a kernel, and nothing is imported to find that out."""
-    net = mlp(9, (64,), 1, "relu")
+    net = mlp(9, (64,), 1, "relu", torch.default_generator)
     assert fused_scores(net, 3) is not None
     monkeypatch.setattr(fusion, "find_spec", lambda name: None)
     monkeypatch.delitem(sys.modules, "deimos.nn.fused")
@@ -139,7 +139,7 @@ def test_fused_scores_need_warp(monkeypatch):
 def test_fused_scores_take_any_view():
     """Candidates that do not lie end to end are read as what they are."""
     torch.manual_seed(0)
-    net = mlp(9, (64,), 1, "relu")
+    net = mlp(9, (64,), 1, "relu", torch.default_generator)
     candidates = torch.randn(100, 20, 3).transpose(0, 1)
     context = torch.randn(20, 6)
     expected = ManyCandidates(net, 3)(context, candidates).squeeze(2)
@@ -148,7 +148,10 @@ def test_fused_scores_take_any_view():
 
 def test_fused_scores_outlive_an_inference():
     """What was first asked for in inference mode, as rsl_rl's rollouts are, is asked for outside it later."""
-    fused, arguments = fuse(mlp(9, (64,), 1, "relu"), 3), (torch.randn(20, 6), torch.randn(20, 30, 3))
+    fused, arguments = (
+        fuse(mlp(9, (64,), 1, "relu", torch.default_generator), 3),
+        (torch.randn(20, 6), torch.randn(20, 30, 3)),
+    )
     with torch.inference_mode():
         first = fused(*arguments)
     assert torch.equal(fused(*arguments), first)
@@ -156,7 +159,7 @@ def test_fused_scores_outlive_an_inference():
 
 def test_fused_scores_check_their_shapes():
     """No decision has no score; contexts and candidates that do not fit raise ``ValueError`` before any launch."""
-    fused = fuse(mlp(9, (64,), 1, "relu"), 3)
+    fused = fuse(mlp(9, (64,), 1, "relu", torch.default_generator), 3)
     assert fused(torch.zeros(0, 6), torch.zeros(0, 100, 3)).shape == (0, 100)
     for context, candidates in (((4, 6), (2, 100, 3)), ((4, 5), (4, 100, 3)), ((4, 6), (4, 100, 2))):
         with pytest.raises(ValueError, match=r"must have the shapes \(B, 6\) and \(B, N, 3\)"):

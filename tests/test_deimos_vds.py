@@ -159,7 +159,7 @@ def test_critics_with_returns_of_their_own_do_not_agree():
 def test_a_stack_is_its_networks(count):
     """Values, gradients and the clip of each member are those of its network alone; weights lie in one vector."""
     torch.manual_seed(0)
-    nets = [mlp(5, (16, 9), 1, "tanh") for _ in range(count)]
+    nets = [mlp(5, (16, 9), 1, "tanh", torch.default_generator) for _ in range(count)]
     alone = copy.deepcopy(nets)
     stack = Stack(nets, kernels=False)
     x, delta = torch.randn(count, 50, 5), torch.randn(count, 50, 1)
@@ -188,7 +188,7 @@ def test_a_stack_is_its_networks(count):
 def test_kernels_and_batched_products_agree(units, count, clip):
     """Values, losses and gradients are the same to rounding, on all rows and on some, for shared inputs and others."""
     torch.manual_seed(1)  # no unit is so near to ReLU's kink that rounding decides
-    nets = [mlp(units[0], units[1:], 1, "relu") for _ in range(count)]
+    nets = [mlp(units[0], units[1:], 1, "relu", torch.default_generator) for _ in range(count)]
     plain, fused = Stack(copy.deepcopy(nets), kernels=False), Stack(nets)
     assert fused.fused is not None
     x = torch.randn(count, 200, units[0])
@@ -206,7 +206,7 @@ def test_kernels_and_batched_products_agree(units, count, clip):
 def test_what_a_member_computes_does_not_depend_on_the_threads():
     """One thread and three give the same values and gradients, bit for bit, again and again."""
     torch.manual_seed(0)
-    nets = [mlp(6, (70, 64), 1, "relu") for _ in range(7)]
+    nets = [mlp(6, (70, 64), 1, "relu", torch.default_generator) for _ in range(7)]
     stacks = []
     for threads in (1, 3):
         torch.set_num_threads(threads)
@@ -223,7 +223,7 @@ def test_what_a_member_computes_does_not_depend_on_the_threads():
 
 def test_updates_keep_what_they_learn_from():
     """Nobody else needs to hold the data of an update: kernels know addresses, and those stay the data's."""
-    nets = [mlp(4, (8, 8), 1, "relu") for _ in range(2)]
+    nets = [mlp(4, (8, 8), 1, "relu", torch.default_generator) for _ in range(2)]
     plain, fused = Stack(copy.deepcopy(nets), kernels=False), Stack(nets)
     x, targets = torch.randn(2, 50, 4), torch.randn(2, 50)
     plain.gradients(x, targets, targets, torch.ones(2, 50), 0.2)(range(50))
@@ -241,7 +241,7 @@ def test_updates_keep_what_they_learn_from():
 
 def test_kernels_see_weights_that_changed():
     """Values follow the weights, whoever changed them and however."""
-    nets = [mlp(4, (8, 8), 1, "relu") for _ in range(2)]
+    nets = [mlp(4, (8, 8), 1, "relu", torch.default_generator) for _ in range(2)]
     stack, x = Stack(nets), torch.randn(9, 4)
     for change in (nets[1][0].bias.data.add_, stack.parameters.data.mul_):
         change(1.5)

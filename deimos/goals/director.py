@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least
+from deimos.checks import check_at_least, check_range
 from deimos.goals.core import GoalCore
 from deimos.goals.fear_selector import fear_selector
 from deimos.goals.interactions import Interactions
 from deimos.goals.methods import method
 from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces
-from deimos.nn.seeds import generator, restore
+from deimos.nn.random import Purpose, uniforms
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class GoalDirector:
         goal_period: T: steps that a goal is active, at least 1.
         learn_every: Steps between two updates of the selector, at least 1; a rollout of the learner is a good choice.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
-        seed: Seed of the selector's networks and of every choice.
+        seed: Seed of the selector's networks and of every choice, in [0, 2^32).
     """
 
     def __init__(
@@ -47,6 +47,7 @@ class GoalDirector:
         check_at_least("goal_period", goal_period, 1)
         check_at_least("learn_every", learn_every, 1)
         check_at_least("total_steps", total_steps, 0)
+        check_range("seed", seed, 0, 2**32 - 1)
         self.goal_period, self.learn_every = goal_period, learn_every
         self.metrics: dict[str, float] = {}
         """What the selector's last update had to say."""
@@ -116,8 +117,9 @@ class GoalDirector:
         goals = torch.where(done.unsqueeze(1), candidates[:, 0], goal)
         rows = changes.due
         if len(rows):
-            draws = torch.rand(len(rows), 4, generator=self._generator, device=rows.device)
+            draws = uniforms(self._seed, Purpose.GOAL, rows, self._count[rows])
             goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], draws)
+            self._count[rows] += 1
         self._clock.masked_fill_(due | done, 0)
         if core.interactions.now % self.learn_every == 0:
             self.metrics = core.selector.learn(core.interactions, None)
@@ -130,8 +132,8 @@ class GoalDirector:
         selector = self._config.build(spaces, self._seed)
         if selector.needs_rollout:
             raise ValueError(f"selector must need no rollout of the learner, as vds and plr do; got {self._config}.")
-        self._clock = torch.zeros(len(state), dtype=torch.int64, device=state.device)
-        self._generator = generator(self._seed, "goal director", state.device)
+        # Steps that the goal of every world has been active, and goals that were chosen for it: its draws' addresses.
+        self._clock, self._count = torch.zeros(2, len(state), dtype=torch.int64, device=state.device)
         self._core = GoalCore(selector, spaces)
         return self._core
 
@@ -174,7 +176,7 @@ class GoalDirector:
         return {
             "core": self._known.state_dict(),
             "clock": self._clock.clone(),
-            "generator": self._generator.get_state(),
+            "count": self._count.clone(),
         }
 
     def load_state_dict(self, state: dict, observed: Tensor, goal: Tensor) -> None:
@@ -187,4 +189,4 @@ class GoalDirector:
         """
         self._begin(observed, goal).load_state_dict(state["core"])
         self._clock.copy_(state["clock"])
-        restore(self._generator, state["generator"])
+        self._count.copy_(state["count"])

@@ -11,7 +11,7 @@ from deimos.nn.adam import Adam
 from deimos.nn.fusion import fused_scores
 from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
 from deimos.nn.ranks import mean_over_ranks
-from deimos.nn.seeds import generator, weights_from
+from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
 
@@ -58,8 +58,8 @@ class Fear(Stateful):
 
     def __init__(self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int) -> None:
         self.config = config
-        with weights_from(seed, "fear weights"):
-            self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation).to(device)
+        weights = generator(seed, "fear weights")
+        self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation, weights).to(device)
         self._parameters, _ = flatten_parameters(self.network)
         self._pass = Backprop(self.network)
         self._candidates = ManyCandidates(self.network, goal_dim, config.workspace)

@@ -16,9 +16,10 @@ from deimos.checks import SimulationError, check_at_least, check_choice, check_h
 from deimos.learn.rollout import Rollout
 from deimos.nn.adam import Adam
 from deimos.nn.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
+from deimos.nn.random import Purpose, normals
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.returns import value_gradient
-from deimos.nn.seeds import generator, weights_from
+from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # what the adaptive schedule may reach; rsl_rl's
@@ -125,7 +126,7 @@ class PPO(Stateful):
         obs_dim: Components of an observation.
         action_dim: Components of an action.
         device: Where they live.
-        seed: Seed of the weights, the exploration and the order of the minibatches.
+        seed: Seed of the weights, the exploration and the order of the minibatches, in [0, 2^32).
 
     Raises:
         ValueError: If there are more minibatches than transitions in a rollout.
@@ -143,10 +144,10 @@ class PPO(Stateful):
             )
         self.config = config
         self._size = rows // config.minibatches
-        with weights_from(seed, "policy weights"):
-            self.actor = Actor(obs_dim, config.hidden, action_dim, config.activation, config.init_std).to(device)
-            self.critic = mlp(obs_dim, config.hidden, 1, config.activation).to(device)
-        self.generator = generator(seed, "policy noise", device)
+        weights = generator(seed, "policy weights")
+        self.actor = Actor(obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights).to(device)
+        self.critic = mlp(obs_dim, config.hidden, 1, config.activation, weights).to(device)
+        self.generator = generator(seed, "policy minibatches", device)
         self._parameters, self._grads = flatten_parameters(self.actor, self.critic)
         self.learning_rate = torch.tensor(config.learning_rate, device=device)
         self.optimizer = Adam(self._parameters, self.learning_rate)
@@ -154,6 +155,7 @@ class PPO(Stateful):
         self._actor_pass = Backprop(self.actor.mean)
         self._critic_pass = Backprop(self.critic)
         self._sizes = num_envs, obs_dim, action_dim, device
+        self._seed, self._worlds = seed, torch.arange(num_envs, device=device)
 
     def new_rollout(self) -> Rollout:
         """Memory for what ``update`` learns from."""
@@ -162,6 +164,17 @@ class PPO(Stateful):
             config.num_steps, *self._sizes, discount=config.discount, gae_lambda=config.gae_lambda,
             reward_scale=config.reward_scale,
         )  # fmt: skip
+
+    def draw_noise(self, noise: Tensor, first_step: int, env_offset: int = 0) -> None:
+        """Draw the exploration of a whole rollout; a world's number depends on the seed, the world and the step alone.
+
+        Args:
+            noise: Standard normal draws, shape (num_steps, num_envs, action_dim). Written.
+            first_step: Steps that every world has taken before, below 2^32 - num_steps.
+            env_offset: Global number of world 0.
+        """
+        steps = torch.arange(first_step, first_step + len(noise), device=noise.device).unsqueeze(1)
+        noise.copy_(normals(self._seed, Purpose.EXPLORATION, self._worlds + env_offset, steps, noise.shape[2]))
 
     @torch.no_grad()
     def act(self, obs: Tensor, noise: Tensor, action: Tensor, mean: Tensor) -> None:

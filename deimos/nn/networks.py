@@ -1,5 +1,6 @@
 """Multilayer perceptrons, their gradient without allocations, and the actor-critic."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -27,13 +28,36 @@ class Whitening:
     """Above 0."""
 
 
-def mlp(inputs: int, hidden: Sequence[int], outputs: int, activation: Activation) -> nn.Sequential:
-    """Linear layers with ``activation`` between them, in PyTorch's default initialisation."""
+def mlp(
+    inputs: int, hidden: Sequence[int], outputs: int, activation: Activation, generator: torch.Generator | None = None
+) -> nn.Sequential:
+    """Linear layers with ``activation`` between them.
+
+    Args:
+        inputs: Inputs.
+        hidden: Units of the hidden layers.
+        outputs: Outputs.
+        activation: Between the layers.
+        generator: Where the weights are drawn from, by PyTorch's default initialisation; ``None`` leaves them 0, to
+            be loaded. PyTorch itself would draw them from the process's generator, which is somebody else's.
+    """
     sizes = [inputs, *hidden]
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), _MODULES[activation]()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
+        layers += [_linear(size_in, size_out, generator), _MODULES[activation]()]
+    return nn.Sequential(*layers, _linear(sizes[-1], outputs, generator))
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    if generator is None:
+        nn.init.zeros_(layer.weight)
+        nn.init.zeros_(layer.bias)
+    else:  # as ``nn.Linear.reset_parameters`` does it
+        nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=generator)
+        bound = 1 / math.sqrt(inputs)
+        nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
+    return layer
 
 
 def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]:
@@ -182,13 +206,14 @@ class ManyCandidates:
 
 
 class Actor(nn.Module):
-    """A Gaussian policy: its mean is an MLP of the observation, its deviation one number per action."""
+    """A Gaussian policy: its mean is an MLP of the observation, its deviation one number per action; see ``mlp``."""
 
     def __init__(
-        self, obs_dim: int, hidden: Sequence[int], action_dim: int, activation: Activation, init_std: float
-    ) -> None:
+        self, obs_dim: int, hidden: Sequence[int], action_dim: int, activation: Activation, init_std: float,
+        generator: torch.Generator | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
-        self.mean = mlp(obs_dim, hidden, action_dim, activation)
+        self.mean = mlp(obs_dim, hidden, action_dim, activation, generator)
         self.std = nn.Parameter(torch.full((action_dim,), init_std))
 
     def forward(self, obs: Tensor) -> Tensor:

@@ -110,7 +110,7 @@ class Trainer:
 
     def _collect(self) -> None:
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
-        rollout.noise.normal_(generator=ppo.generator)
+        ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
         clock = _Clock(self)
         for t in range(rollout.num_steps):
             rollout.obs[t] = env.obs

@@ -14,7 +14,7 @@ from deimos.nn.adam import Adam
 from deimos.nn.fusion import fused_scores
 from deimos.nn.networks import Activation, Backprop, ManyCandidates, Whitening, flatten_parameters, mlp
 from deimos.nn.ranks import mean_over_ranks
-from deimos.nn.seeds import generator, weights_from
+from deimos.nn.seeds import generator
 
 CLIP = 5.0  # bound of whitened inputs, as in the paper
 
@@ -71,17 +71,19 @@ class RND(GoalSelector):
         self.config = config
         self.num_candidates = config.candidates
         inputs = spaces.state_dim + 2 * spaces.goal_dim
-        with weights_from(seed, "rnd weights"):
-            self.target = mlp(inputs, (config.target,), config.features, config.activation)
-            self.predictor = mlp(inputs, (config.predictor,), config.features, config.activation)
-            for layer in (*self.target, *self.predictor):
-                if isinstance(layer, nn.Linear):
-                    nn.init.orthogonal_(layer.weight, 2**0.5)
-            # The difference of two networks of one hidden layer is one such network, at half of the calls.
-            units = (config.target + config.predictor,)
-            self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
+        weights = generator(seed, "rnd weights")
+        self.target, self.predictor = (
+            mlp(inputs, (units,), config.features, config.activation, weights)
+            for units in (config.target, config.predictor)
+        )
+        for layer in (*self.target, *self.predictor):
+            if isinstance(layer, nn.Linear):
+                nn.init.orthogonal_(layer.weight, 2**0.5, generator=weights)
         self.target.to(spaces.device)
         self.predictor.to(spaces.device)
+        # The difference of two networks of one hidden layer is one such network, at half of the calls.
+        units = (config.target + config.predictor,)
+        self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
         self._parameters, _ = flatten_parameters(self.predictor)
         self._join()
         self._error = ManyCandidates(self._difference, spaces.goal_dim)

@@ -21,7 +21,7 @@ from deimos.nn.matmul import on_threads
 from deimos.nn.networks import Activation, mlp
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.returns import advantages
-from deimos.nn.seeds import generator, weights_from
+from deimos.nn.seeds import generator
 
 WORKSPACE = 2**24  # numbers that the inputs of the candidates of decisions made at once may take
 
@@ -96,11 +96,10 @@ class VDS(GoalSelector):
         self.config, self._spaces = config, spaces
         self.num_candidates = config.candidates
         inputs, device = spaces.state_dim + spaces.goal_dim, spaces.device
-        nets = []
-        for k in range(config.critics):
-            with weights_from(seed, f"vds critic {k}"):
-                nets.append(mlp(inputs, config.hidden, 1, config.activation).to(device))
-        self.stack = Stack(nets)
+        streams = (generator(seed, f"vds critic {k}") for k in range(config.critics))
+        self.stack = Stack([
+            mlp(inputs, config.hidden, 1, config.activation, weights).to(device) for weights in streams
+        ])  # fmt: skip
         self._parameters = self.stack.parameters
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = generator(seed, "vds minibatches", device)
