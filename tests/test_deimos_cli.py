@@ -17,7 +17,7 @@ import torch
 
 import deimos
 from deimos.app import cli
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import METHODS, method
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.config import from_dict
@@ -37,7 +37,7 @@ TRAIN_ERRORS = {
     # what is asked for, and what the one line says
     "--env.variant cubic": "'cubic' .*'absolute', 'directional', 'relative'",
     "env:moon": "There is no 'env:moon'; there are: env:particle",
-    "--method nope": f"There is no method 'nope'; there are: {re.escape(', '.join(METHODS))}",
+    "--method q33": f"There is no method 'q33'; there are: {re.escape(', '.join(METHODS))}",
     "--method=": f"There is no method ''; there are: {re.escape(', '.join(METHODS))}",
     "selector:nope": "There is no 'selector:nope'; there are: .*selector:director, .*selector:uniform",
     "--method p25 selector:uniform": "method 'p25' and a selector exclude each other",
@@ -82,7 +82,7 @@ TRAIN_ERRORS = {
     "selector:director --selector.rule best": r"'best' .*'percentile', 'argmin', 'argmax'",
     "selector:director --selector.probe 1.1": r"probe must be in \[0, 1\], got 1.1",
     "selector:schedule --selector.at 1": r"at must be in \(0, 1\), or the schedule never switches; got 1.0",
-    "selector:schedule --selector.first nope": "There is no method 'nope'",
+    "selector:schedule --selector.first q33": "There is no method 'q33'",
     "selector:cl --selector.threshold 1.2": r"threshold must be in \(0, 1\), got 1.2",
     "selector:grid --selector.threshold 0": r"threshold must be in \(0, 1\), got 0.0",
     "selector:plr --selector.fill 0": r"fill must be in \(0, 1\], got 0.0",
@@ -457,7 +457,7 @@ def test_help_explains_every_field(capsys):
 def test_help_explains_a_selector(capsys):
     """``selector:director --help`` shows its fields."""
     shown = shown_help(["train", "selector:director"], capsys)
-    for flag, text in described_fields(METHODS["p25"], "selector."):
+    for flag, text in described_fields(method("p25"), "selector."):
         assert f" {flag} " in shown.replace(",", " "), flag
         assert text in shown, flag
 
@@ -486,7 +486,7 @@ def test_flags_work_before_and_after_subcommands(monkeypatch, arguments):
     (options,) = parsed
     assert options.num_envs == 7
     assert options.env == particle.Config(variant="relative")
-    assert options.selector == dataclasses.replace(METHODS["p25"], percentile=60.0)
+    assert options.selector == dataclasses.replace(method("p25"), percentile=60.0)
     assert options.out is options.resume is options.init_from is None
 
 
@@ -496,7 +496,7 @@ def test_every_method_is_accepted(monkeypatch):
     monkeypatch.setattr("deimos.app.train._train", parsed.append)
     for name in METHODS:
         assert cli.main(["train", "--method", name]) == 0
-        assert (parsed[-1].label, parsed[-1].goals) == (name, METHODS[name])
+        assert (parsed[-1].label, parsed[-1].goals) == (name, method(name))
 
 
 def test_run_leaves_its_files(finished):
