@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -133,7 +133,7 @@ class Locomotion(WarpEnv):
             goal_dim=self.goal_dim, num_groups=len(self.goal_groups), num_terms=len(self.columns),
             arm_fields=sum(field.size for part in self.parts for field in part.fields),
         )  # fmt: skip
-        numbers = {name: size for name, size in sizes.items() if name != "num_envs"}
+        numbers: dict[str, Any] = {name: size for name, size in sizes.items() if name != "num_envs"}
         low, high = np.array([joint.range for joint in joints]).T
         action_low, action_high = np.array([joint.action_range for joint in joints]).T
         scale, device = [joint.action_scale for joint in joints], warp_device(self.device)
