@@ -42,7 +42,8 @@ def random_rollout(env, seed=0):
         rollout.truncated &= ~rollout.terminated
         for t, truncated in enumerate(rollout.truncated):
             rows = truncated.nonzero().squeeze(1)
-            rollout.ends.append((t, rows, torch.randn(len(rows), env.obs_dim, generator=generator)))
+            last = torch.randn(len(rows), env.obs_dim, generator=generator)
+            rollout.ends.append((torch.full_like(rows, t), rows, last))
     rollout.weight.bernoulli_(0.9, generator=generator)
     return rollout
 

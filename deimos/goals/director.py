@@ -109,6 +109,8 @@ class GoalDirector:
         """
         self._check(state, goal, terminated, truncated, candidates)
         core = self._core or self._begin(state, goal)
+        if core.interactions.now % self.goal_period == 0:  # no world's goal is due twice within T steps
+            self._draw()
         self._clock += 1
         due = self._clock >= self.goal_period
         reward = torch.zeros(len(state), device=state.device) if tracking is None else tracking.float()
@@ -117,8 +119,7 @@ class GoalDirector:
         goals = torch.where(done.unsqueeze(1), candidates[:, 0], goal)
         rows = changes.due
         if len(rows):
-            draws = uniforms(self._seed, Purpose.GOAL, rows, self._count[rows])
-            goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], draws)
+            goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], self._draws[rows])
             self._count[rows] += 1
         self._clock.masked_fill_(due | done, 0)
         if core.interactions.now % self.learn_every == 0:
@@ -136,6 +137,11 @@ class GoalDirector:
         self._clock, self._count = torch.zeros(2, len(state), dtype=torch.int64, device=state.device)
         self._core = GoalCore(selector, spaces)
         return self._core
+
+    def _draw(self) -> None:
+        """Draw for the next decision of every world; many worlds at once cost what one does."""
+        worlds = torch.arange(len(self._count), device=self._count.device)
+        self._draws = uniforms(self._seed, Purpose.GOAL, worlds, self._count)
 
     def _check(self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor) -> None:
         n, state_dim, goal_dim = self._sizes or (len(state), state.shape[-1], goal.shape[-1])
@@ -190,3 +196,4 @@ class GoalDirector:
         self._begin(observed, goal).load_state_dict(state["core"])
         self._clock.copy_(state["clock"])
         self._count.copy_(state["count"])
+        self._draw()

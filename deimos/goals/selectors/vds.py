@@ -161,7 +161,8 @@ class VDS(GoalSelector):
         elif shared:
             value = self.values(rollout.obs)
         else:
-            value = self._own_values(rollout.obs, worlds)
+            own = self._spaces.state_then_goal(rollout.obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds, inputs)
+            value = self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
         old, next_value = value.transpose(0, 1)[:-1], value.transpose(0, 1)[1:]  # (num_steps, K, worlds of each)
         reward, terminated, truncated = (
             tensor[:, worlds] for tensor in (rollout.reward, rollout.terminated, rollout.truncated)
@@ -177,11 +178,6 @@ class VDS(GoalSelector):
             discount=rollout.discount, gae_lambda=rollout.gae_lambda,
         )  # fmt: skip
         return old.transpose(0, 1), (advantage + old).transpose(0, 1)
-
-    def _own_values(self, obs: Tensor, worlds: Tensor) -> Tensor:
-        """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
-        own = self._spaces.state_then_goal(obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds of each, inputs)
-        return self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
 
     def _fit(self, rollout: Transitions, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
         """Adam on the clipped value loss; returns its mean over critics and minibatches.
