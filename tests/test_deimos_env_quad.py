@@ -655,6 +655,7 @@ def test_actions_are_what_the_joints_can_do(torch_device):
     ends = np.array([joint.action_range for joint in env.robot.joints])
     np.testing.assert_allclose(POSE + 0.25 * ends.T, [low, high], atol=1e-12)
     assert env.action_bound == pytest.approx(np.abs(ends).max())
+    np.testing.assert_allclose(torch.stack(env.action_range), ends.T, rtol=1e-6)
     step = env.step(torch.tensor([[1e6], [-1e6]], device=torch_device).expand(2, 12))
     np.testing.assert_allclose(env.physics.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
     np.testing.assert_allclose(step.obs[:, 36:48].cpu(), ends.T[::-1], rtol=1e-6)

@@ -103,7 +103,7 @@ class Env(abc.ABC):
     """What stands where in the observation; the field named ``goal`` is the goal slot."""
     action_dim: int
     action_bound: float
-    """Actions are clipped to [-action_bound, action_bound]; may be infinite."""
+    """Bound of every component of an action, in absolute value; may be infinite. See ``action_range``."""
     dt: float
     """Duration of a step [s]; 1 where the world has no seconds."""
     goal_period: int
@@ -208,6 +208,12 @@ class Env(abc.ABC):
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
         """A scripted policy (obs -> action) that fixes 1 on the normalised score; ``None`` where there is none."""
         return None
+
+    @property
+    def action_range(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest value of every component of an action, beyond which it is clipped, on the CPU."""
+        bound = torch.full((self.action_dim,), self.action_bound)
+        return -bound, bound
 
     @property
     def obs_dim(self) -> int:

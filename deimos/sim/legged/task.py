@@ -211,6 +211,12 @@ class Locomotion(WarpEnv):
             part.reset()
         finish_obs(self.legged, self.worlds.mask, wanted=True)
 
+    @property
+    def action_range(self) -> tuple[Tensor, Tensor]:
+        """See ``Env.action_range``: what takes the joints' targets to the ends of their ranges."""
+        low, high = torch.tensor([joint.action_range for joint in self.robot.joints]).T
+        return low, high
+
     def describe_fault(self, world: int) -> str:
         """See ``WarpEnv.describe_fault``."""
         cause = BROKEN[int(self._views["cause"][world]).bit_length() - 1]
