@@ -10,7 +10,7 @@ from rich.table import Table
 
 from benchmarks import training
 from benchmarks.timing import in_turn, ratio, short, wide_console
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import vds
 from deimos.run.presets import preset
@@ -21,7 +21,7 @@ from reproduction.thesis import TABLE_4_1
 
 WORLDS = 512
 PERIOD = 100  # T of the training that is timed: a fifth of the presets', so that selectors choose five times as often
-METHODS_TIMED: dict[str, SelectorConfig] = {name: METHODS[name] for name in ("uniform", "p25", "rnd", "vds", "cl")} | {
+METHODS_TIMED: dict[str, SelectorConfig] = {name: method(name) for name in ("uniform", "p25", "rnd", "vds", "cl")} | {
     "vds, own shares": vds.Config(data="share", epochs=3)
 }
 STEPS = 4  # control steps of a turn

@@ -11,15 +11,15 @@ from typing import Any
 import torch
 from rich.table import Table
 
+from benchmarks import flops
 from benchmarks.timing import in_turn, ratio, wide_console
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import vds
-from deimos.nn.networks import operations
 from deimos.run.training import TrainConfig, Trainer
 
 METHODS_TIMED: dict[str, SelectorConfig] = {
-    name: METHODS[name] for name in ("uniform", "p25", "rnd", "learnability", "plr", "grid", "vds", "vds-auxiliary")
+    name: method(name) for name in ("uniform", "p25", "rnd", "learnability", "plr", "grid", "vds", "vds-auxiliary")
 } | {"vds, own shares": vds.Config(data="share", epochs=3)}
 """What is timed: a method of each kind, and VDS with the price of each of its options."""
 OFTEN = 4  # times as many rounds for methods that differ from Uniform by less than a round does from the next
@@ -62,7 +62,8 @@ def measure_training(
         for name, values in single.items()
     }
     transitions = length * config.num_envs * config.ppo.num_steps
-    learner = update_operations(trainers["uniform"])
+    reference = trainers["uniform"]
+    learner = flops.of_learner(config.ppo, reference.env)
     rows = []
     for name, values in seconds.items():
         row: dict[str, Any] = {
@@ -73,12 +74,12 @@ def measure_training(
             "thesis": thesis[name] / thesis["uniform"] if name in thesis else None,
         }
         if name in trainers:
-            spent, extra = trainers[name].seconds, extra_operations(trainers[name])
+            spent, extra = trainers[name].seconds, flops.of_selector(methods[name], config.ppo, reference.env)
             row["shares"] = {part: value / sum(spent.values()) for part, value in spent.items()}
-            row["extra products [GFLOP]"] = extra / 1e9
+            row["extra [GFLOP]"] = extra / 1e9
             row["limit"] = learner / (learner + extra)
         rows.append(row)
-    result: dict[str, Any] = {"rows": rows, "learner's products [GFLOP]": learner / 1e9}
+    result: dict[str, Any] = {"rows": rows, "learner [GFLOP]": learner / 1e9}
     if "rsl_rl" in seconds:
         result["uniform / rsl_rl"] = ratio(seconds["rsl_rl"], seconds["uniform"])
     return result
@@ -103,22 +104,6 @@ def measure_in_groups(
     beside = measure_training(config, {"uniform": cheap["uniform"]} | dear, thesis, device, rounds)
     result["rows"] += [row for row in beside["rows"] if row["method"] in dear]
     return result
-
-
-def update_operations(trainer: Trainer) -> float:
-    """Multiplications and additions of the learner's matrix products in an iteration: they bound it from below."""
-    ppo, transitions = trainer.ppo, trainer.rollout.reward.numel()
-    per_row = operations(ppo.actor.mean) + operations(ppo.critic)
-    return 3.0 * per_row * transitions * ppo.config.epochs  # forward, by the weights, by the inputs
-
-
-def extra_operations(trainer: Trainer) -> float:
-    """What a selector's products add to that; negative where it takes the critic's work away."""
-    ppo, transitions = trainer.ppo, trainer.rollout.reward.numel()
-    selector = trainer.loop.selector
-    decisions = transitions / trainer.env.goal_period
-    spared = 3.0 * operations(ppo.critic) * transitions * ppo.config.epochs if selector.critic() is not None else 0.0
-    return selector.operations(decisions, transitions) - spared
 
 
 def machine(device: torch.device) -> dict[str, float]:
@@ -158,7 +143,7 @@ def print_training(title: str, result: dict[str, Any]) -> None:
     rows = result["rows"]
     parts = ("env", "goals", "update", "selector")
     table = Table(title=f"Training, {title}", title_justify="left")
-    columns = ("method", "FPS", "ms / iteration", "/ uniform", "by products", "thesis", *[f"{p} %" for p in parts])
+    columns = ("method", "FPS", "ms / iteration", "/ uniform", "FLOP bound", "thesis", *[f"{p} %" for p in parts])
     for name in columns:
         table.add_column(name, justify="left" if name == "method" else "right")
     for row in rows:

@@ -7,13 +7,18 @@ from typing import Any
 from deimos._version import __version__
 
 _OFFERED = {
+    "Env": "deimos.sim.env",
     "GoalDirector": "deimos.goals.director",
+    "GoalSelector": "deimos.goals.selector",
+    "TrainConfig": "deimos.run.trainer",
     "check_env": "deimos.sim.check_env",
+    "evaluate": "deimos.run.api",
     "load_policy": "deimos.learn.policy",
+    "train": "deimos.run.api",
 }
 """What the package offers, and the module that holds it."""
 
-__all__ = ["GoalDirector", "__version__", "check_env", "load_policy"]
+__all__ = ["__version__", *_OFFERED]
 
 # Installed, ``kernels`` and ``terrain`` lie inside this package; in a checkout they lie beside it.
 _HOME = Path(__file__).resolve().parent
@@ -25,4 +30,9 @@ def __getattr__(name: str) -> Any:
     """Import what the package offers when it is first asked for; importing ``deimos`` alone stays light."""
     if name not in _OFFERED:
         raise AttributeError(f"module 'deimos' has no attribute '{name}'")
-    return getattr(importlib.import_module(_OFFERED[name]), name)
+    try:
+        return getattr(importlib.import_module(_OFFERED[name]), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("deimos"):
+            raise
+        raise ImportError(f"deimos.{name} needs {error.name}: pip install 'deimos-rl[sim]'") from error

@@ -1,7 +1,11 @@
-"""Checks of configuration values; each message names the field, what it must be and what it was."""
+"""Checks of values, and the errors that stop a run; each message names the field, what it must be and what it was."""
 
 import math
 from collections.abc import Iterable
+
+
+class RunError(Exception):
+    """A run cannot go on for a reason outside the program: a folder, a file, a disk, a device."""
 
 
 class SimulationError(RuntimeError):

@@ -1,4 +1,19 @@
-"""What the thesis measured, for whoever compares with it."""
+"""The thesis's names and numbers, for whoever compares with it."""
+
+DIRECTORS = ("p10", "p25", "p50", "p75", "p90")
+DIRECTOR_METHODS = ("coop", *DIRECTORS, "antagonist")
+"""By rising fear."""
+PARTICLE_METHODS = (*DIRECTOR_METHODS, "rnd", "uniform", "vds")
+LEGGED_METHODS = (*PARTICLE_METHODS, "cl", "vds+p75")
+PARTICLE = ("absolute", "relative", "directional")
+LEGGED = ("quad", "quad_arm")
+ENVIRONMENTS = PARTICLE + LEGGED
+"""In the thesis's order."""
+
+ACHIEVED = {
+    "coop": 0.5, "uniform": 50.0, **{f"p{p}": (100 + p) / 2 for p in (10, 25, 50, 75, 90)}, "antagonist": 99.5,
+}  # fmt: skip
+"""Percentile of fear that a method's goals have on average among the candidates: p25 draws from the upper 75 %."""
 
 TABLE_4_1 = {  # thousands of frames per second of training; p25 stands for its Director
     "absolute": {"uniform": 331, "p25": 276, "rnd": 284, "vds": 125},
@@ -7,3 +22,8 @@ TABLE_4_1 = {  # thousands of frames per second of training; p25 stands for its 
     "quad": {"uniform": 101, "p25": 87, "rnd": 94, "vds": 70, "cl": 101},
     "quad_arm": {"uniform": 78, "p25": 75, "rnd": 70, "vds": 63, "cl": 75},
 }
+RATIOS_4_1 = {
+    place: {name: fps["p25" if name in DIRECTORS else name] / fps["uniform"] for name in (*fps, *DIRECTORS)}
+    for place, fps in TABLE_4_1.items()
+}
+"""Speed beside Uniform's; p25's is that of every p."""

@@ -1,6 +1,8 @@
-"""``python -m terrain`` in a checkout, ``python -m deimos.terrain`` everywhere."""
+"""``python -m terrain`` is ``deimos terrain``."""
 
-from deimos.terrain.cli import main
+import sys
+
+from deimos.app.cli import main
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main(["terrain", *sys.argv[1:]]))

@@ -4,15 +4,13 @@ import io
 import math
 import struct
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .files import write_whole
-from .grid import Terrain
+from deimos.files import write_whole
 
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from .grid import Terrain
+from .mesh import Mesh
 
 MESH_ENDINGS = (".glb", ".obj", ".ply", ".stl")
 ENDINGS = (*MESH_ENDINGS, ".npz", ".png")
@@ -40,7 +38,7 @@ _MJCF = """\
 """
 
 
-def save(path: Path, terrain: Terrain, mesh: "Trimesh") -> None:
+def save(path: Path, terrain: Terrain, mesh: Mesh) -> None:
     """Write a terrain to a file whose ending says how, whole or not at all.
 
     ``.stl``, ``.obj``, ``.ply`` and ``.glb`` hold the mesh [m]; z is up, but in ``.glb``, where y must be.
@@ -94,7 +92,7 @@ def save_mjcf(folder: Path, terrain: Terrain) -> None:
     write_whole(folder / MJCF_FILES[0], lambda file: file.write(text.encode()))
 
 
-def _mesh_bytes(mesh: "Trimesh", ending: str) -> bytes:
+def _mesh_bytes(mesh: Mesh, ending: str) -> bytes:
     if ending == ".glb":  # glTF 2.0, section 3.4: y is up
         mesh = mesh.copy()
         mesh.vertices = np.asarray(mesh.vertices)[:, [0, 2, 1]] * [1, 1, -1]

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .checks import cells, check_positive
-from .files import write_whole
+from deimos.checks import check_positive
+from deimos.files import write_whole
 
 SCHEMA = 1  # of the file that ``Terrain.save`` writes
 
@@ -33,8 +33,8 @@ class Terrain:
     """Difficulty of each level, in [0, 1], float32, shape (levels,)."""
 
     def __post_init__(self) -> None:
-        check_positive("cell", self.cell)
-        check_positive("tile", self.tile)
+        check_positive("cell", self.cell, finite=True)
+        check_positive("tile", self.tile, finite=True)
         levels, columns = len(self.difficulty), len(self.shapes)
         for name, shape in (("origins", (levels, columns, 3)), ("difficulty", (levels,)), ("heights", None)):
             array = getattr(self, name)
@@ -90,7 +90,7 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
     Raises:
         ValueError: If an argument is out of its range.
     """
-    check_positive("size", size)
+    check_positive("size", size, finite=True)
     samples = cells("size", size, cell) + 1
     return Terrain(
         heights=np.zeros((samples, samples), np.float32),
@@ -101,6 +101,20 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
         tile=size,
         difficulty=np.zeros(1, np.float32),
     )
+
+
+def cells(name: str, length: float, cell: float) -> int:
+    """Number of cells along ``length``.
+
+    Raises:
+        ValueError: Unless ``cell`` divides ``length``.
+    """
+    check_positive("cell", cell, finite=True)
+    number = round(length / cell)
+    if abs(number * cell - length) > 1e-6 * cell:
+        nearest = length / max(1, number)
+        raise ValueError(f"cell must divide {name} = {length:g} m, got {cell:g} m; {nearest:.6g} m would do.")
+    return number
 
 
 load = Terrain.load

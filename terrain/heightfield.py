@@ -1,22 +1,20 @@
 """A mesh becomes a height grid: one exact vertical ray for every sample."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 from deimos.kernels.ray_cast import LARGEST, SNAP, cast_rays
 
-from .checks import check_positive
+from deimos.checks import check_positive
 
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from .mesh import Mesh
 
 STRIP = 2**20  # samples per launch, about 0.2 s on a CPU
 
 
 def rasterise(
-    mesh: "Trimesh",
+    mesh: Mesh,
     corner: tuple[float, float],
     cell: float,
     shape: tuple[int, int],
@@ -44,7 +42,7 @@ def rasterise(
     Raises:
         ValueError: If an argument is out of its range, or the mesh does not cover the grid.
     """
-    check_positive("cell", cell)
+    check_positive("cell", cell, finite=True)
     if min(shape) < 2 or max(shape) > LARGEST + 1:
         raise ValueError(f"shape must be from 2 to {LARGEST + 1} samples along each axis, got {shape}.")
     vertices = np.array(mesh.vertices)

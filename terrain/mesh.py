@@ -1,16 +1,18 @@
 """What shapes are made of: triangle meshes from heights. Faces are seen from above counter-clockwise."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from trimesh import Trimesh
+    from trimesh import Trimesh as Mesh
+else:
+    Mesh = Any  # trimesh is imported when a mesh is made
 
 UPRIGHT = 1e-6  # a face whose unit normal has a smaller vertical part is a riser
 
 
-def from_quads(corners: np.ndarray) -> "Trimesh":
+def from_quads(corners: np.ndarray) -> Mesh:
     """Two triangles for every quadrilateral; nothing is shared, so that edges stay sharp when they are drawn.
 
     Args:
@@ -21,14 +23,14 @@ def from_quads(corners: np.ndarray) -> "Trimesh":
     return from_triangles(corners.reshape(-1, 3), faces)
 
 
-def from_triangles(vertices: np.ndarray, faces: np.ndarray) -> "Trimesh":
+def from_triangles(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """A mesh of these vertices [m], shape (n, 3), and faces, shape (m, 3), as they are."""
     from trimesh import Trimesh
 
     return Trimesh(vertices, faces, process=False, validate=False)
 
 
-def sheet(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> "Trimesh":
+def sheet(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
     """A surface through a lattice of points.
 
     Each cell is split along the diagonal that points to the middle of the sheet, as the edges of a pyramid do.
@@ -48,8 +50,8 @@ def sheet(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> "Trimesh":
     return from_triangles(vertices, faces.reshape(-1, 3))
 
 
-def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> "Trimesh":
-    """Level rectangles with vertical risers between those of different height.
+def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
+    """Flat rectangles with vertical risers between those of different height.
 
     Args:
         x: Where a rectangle ends and the next begins [m], rising, shape (n + 1,).
@@ -75,8 +77,8 @@ def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> "Trimesh":
     return from_quads(np.concatenate(quads))
 
 
-def rings(half_sides: np.ndarray, heights: np.ndarray) -> "Trimesh":
-    """Nested level squares around the origin, with vertical risers.
+def rings(half_sides: np.ndarray, heights: np.ndarray) -> Mesh:
+    """Nested flat squares around the origin, with vertical risers.
 
     Args:
         half_sides: Half side of each square [m], falling, shape (n,). A square as large as the one before hides it.
@@ -89,7 +91,7 @@ def rings(half_sides: np.ndarray, heights: np.ndarray) -> "Trimesh":
     return terraces(lines, lines, heights[innermost])
 
 
-def blocks(x: np.ndarray, y: np.ndarray, bottom: float, top: float) -> "Trimesh":
+def blocks(x: np.ndarray, y: np.ndarray, bottom: float, top: float) -> Mesh:
     """Upright blocks without an underside.
 
     Args:
@@ -107,7 +109,7 @@ def blocks(x: np.ndarray, y: np.ndarray, bottom: float, top: float) -> "Trimesh"
     return from_quads(np.concatenate(quads))
 
 
-def join(meshes: "list[Trimesh]", offsets: np.ndarray | None = None) -> "Trimesh":
+def join(meshes: list[Mesh], offsets: np.ndarray | None = None) -> Mesh:
     """One mesh of several, each moved by its row of ``offsets`` [m], shape (n, 3)."""
     moves = np.zeros((len(meshes), 3)) if offsets is None else offsets
     starts = np.cumsum([0, *[len(mesh.vertices) for mesh in meshes[:-1]]])
@@ -115,7 +117,7 @@ def join(meshes: "list[Trimesh]", offsets: np.ndarray | None = None) -> "Trimesh
     return from_triangles(vertices, np.concatenate([m.faces + k for m, k in zip(meshes, starts, strict=True)]))
 
 
-def normals(mesh: "Trimesh") -> np.ndarray:
+def normals(mesh: Mesh) -> np.ndarray:
     """Unit normals of the faces, shape (m, 3); NaN where a face has no area."""
     a, b, c = np.moveaxis(np.asarray(mesh.vertices)[mesh.faces], 1, 0)
     normal = np.cross(b - a, c - a)
@@ -123,14 +125,14 @@ def normals(mesh: "Trimesh") -> np.ndarray:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def steepest_slope(mesh: "Trimesh") -> float:
+def steepest_slope(mesh: Mesh) -> float:
     """Rise over run of the steepest face that is not a riser."""
     up = normals(mesh)[:, 2]
     up = up[up > UPRIGHT]
     return float(np.sqrt(1 / up.min() ** 2 - 1)) if len(up) else 0.0
 
 
-def highest_riser(mesh: "Trimesh") -> float:
+def highest_riser(mesh: Mesh) -> float:
     """Height of the highest vertical face [m]; 0 without any."""
     upright = np.abs(normals(mesh)[:, 2]) <= UPRIGHT
     z = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[upright], 2]

@@ -120,7 +120,7 @@ def rough(
         levels: Tiles along x, from the easiest to the hardest, at least 1.
         columns: Tiles along y, at least 1.
         cell: Distance of two samples of the height grid [m]; must divide the tile of 8 m and the border.
-        border: Width of the level border [m], at least 0.
+        border: Width of the flat border [m], at least 0.
         device: Warp device that rasterises the mesh.
 
     Raises:

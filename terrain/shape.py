@@ -1,15 +1,14 @@
 """What every shape of ground promises."""
 
 import abc
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import math
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from .checks import check_positive, check_range
+from deimos.checks import check_positive, check_range
 
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from .mesh import Mesh
 
 Ramp = tuple[float, float]
 """A number at difficulty 0 and at difficulty 1, linear in between."""
@@ -17,9 +16,10 @@ Ramp = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class TileShape(abc.ABC):
-    """A square of ground around the origin, at height 0 along its edge, with a level middle to stand on.
+    """A square of ground around the origin, at height 0 along its edge, with a flat middle to stand on.
 
-    A file of ``terrain.shapes`` holds one, named ``Shape``; its fields are its parameters. A field ``direction``
+    A file of ``terrain.shapes`` holds one, named ``Shape``; its fields are its parameters. Every number must be
+    positive, and both ends of a ramp at least 0; further checks belong into ``__post_init__``. A field ``direction``
     makes two shapes of it. It is seen by the robot, which starts in the middle: ``up`` is the way out of a
     hollow, ``down`` the way off a hill.
     """
@@ -27,28 +27,20 @@ class TileShape(abc.ABC):
     tile: float = 8.0
     """Side of the square [m], positive."""
     platform: float = 3.0
-    """Side of the level middle [m], positive and smaller than the tile."""
+    """Side of the flat middle [m], positive and smaller than the tile."""
 
     def __post_init__(self) -> None:
-        check_positive("tile", self.tile)
-        check_positive("platform", self.platform)
+        for field in fields(self):
+            if field.type is float:
+                check_positive(field.name, getattr(self, field.name), finite=True)
+            elif field.type == Ramp:
+                check_ramp(field.name, getattr(self, field.name))
         if self.platform >= self.tile:
             raise ValueError(f"platform must be smaller than tile = {self.tile:g} m, got {self.platform:g} m.")
 
     @abc.abstractmethod
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
-        """Make the mesh; use ``build``, which checks its arguments.
-
-        Args:
-            difficulty: From 0, the easiest, to 1.
-            generator: The only source of randomness.
-
-        Returns:
-            A mesh [m] that covers the square and nothing else, normals up or, on risers, outwards.
-        """
-
-    def build(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
-        """The mesh of this shape.
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
+        """Make the mesh; use ``build``, which checks the difficulty.
 
         Args:
             difficulty: From 0, the easiest, to 1.
@@ -56,10 +48,10 @@ class TileShape(abc.ABC):
 
         Returns:
             A mesh [m] that covers the square and nothing else, normals up or, on risers, outwards.
-
-        Raises:
-            ValueError: If ``difficulty`` is out of its range.
         """
+
+    def build(self, difficulty: float, generator: np.random.Generator) -> Mesh:
+        """See ``surface``; raises ``ValueError`` if ``difficulty`` is out of its range."""
         check_range("difficulty", difficulty, 0, 1)
         return self.surface(difficulty, generator)
 
@@ -77,3 +69,11 @@ def at(ramp: Ramp, difficulty: float) -> float:
     """Value of a ramp at a difficulty in [0, 1]."""
     easiest, hardest = ramp
     return (1.0 - difficulty) * easiest + difficulty * hardest
+
+
+def check_ramp(name: str, value: Ramp, least: float = 0.0) -> None:
+    """Raise ``ValueError`` unless ``value`` is a pair of finite numbers of at least ``least``."""
+    if len(value) != 2 or not all(least <= end < math.inf for end in value):
+        raise ValueError(
+            f"{name} must be two finite numbers of at least {least:g}, at difficulty 0 and at 1, got {value}."
+        )

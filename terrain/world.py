@@ -3,20 +3,17 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from deimos.kernels.ray_cast import LARGEST
 
-from . import catalog
-from .checks import cells, check_at_least, check_positive, check_range
-from .grid import Terrain
-from .heightfield import rasterise
-from .mesh import from_quads, join
-from .shape import TileShape
+from deimos.checks import check_at_least, check_positive, check_range
 
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from . import catalog
+from .grid import Terrain, cells
+from .heightfield import rasterise
+from .mesh import Mesh, from_quads, join
+from .shape import TileShape
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is done, in [0, 1]."""
@@ -37,7 +34,7 @@ class Share:
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Tiles of rising difficulty along x (levels), a column for each shape along y, and a level border around."""
+    """Tiles of rising difficulty along x (levels), a column for each shape along y, and a flat border around."""
 
     shapes: tuple[Share, ...]
     """What the columns are made of, in order, at least one."""
@@ -48,7 +45,7 @@ class Grid:
     tile: float = 8.0
     """Side of a tile [m], positive."""
     border: float = 25.0
-    """Width of the level border [m], at least 0."""
+    """Width of the flat border [m], at least 0."""
     cell: float = 0.05
     """Distance of two samples of the height grid [m]; must divide tile and border."""
     easiest: float = 0.0
@@ -64,7 +61,7 @@ class Grid:
         check_at_least("levels", self.levels, 1)
         check_at_least("columns", self.columns, 1)
         check_at_least("seed", self.seed, 0)
-        check_positive("tile", self.tile)
+        check_positive("tile", self.tile, finite=True)
         check_range("border", self.border, 0, 1e6)
         check_range("easiest", self.easiest, 0, 1)
         check_range("hardest", self.hardest, 0, 1)
@@ -73,7 +70,7 @@ class Grid:
         if not self.shapes:
             raise ValueError("shapes must have at least one entry.")
         for part in self.shapes:
-            check_positive("share", part.share)
+            check_positive("share", part.share, finite=True)
         for shape in self.column_shapes:
             highest = max(shape.step(self.easiest), shape.step(self.hardest))
             if highest > self.max_step + 1e-9:
@@ -127,7 +124,7 @@ def build(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) 
     return build_with_mesh(grid, device=device, progress=progress)[0]
 
 
-def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> "tuple[Terrain, Trimesh]":
+def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> tuple[Terrain, Mesh]:
     """Make a world and the mesh that it is the height grid of.
 
     The same grid gives the same bytes, on any number of threads.
@@ -154,7 +151,7 @@ def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | Non
     return terrain, mesh
 
 
-def build_mesh(grid: Grid, progress: Progress | None = None) -> "Trimesh":
+def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
     """The mesh of a world [m]: all tiles and the border.
 
     Every tile has a generator of its own, seeded by (seed, level, column): none depends on another.
@@ -199,7 +196,7 @@ def _free_memory() -> int:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def _border(grid: Grid) -> "Trimesh":
+def _border(grid: Grid) -> Mesh:
     outer = -np.asarray(grid.corner)
     inner = outer - grid.border
     ring = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)

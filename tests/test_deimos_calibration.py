@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from deimos.goals.calibration import BINS, TEMPERATURES, Calibration, judge, reliability
+from deimos.goals.calibration import BINS, TEMPERATURES, Calibration, evaluate, reliability
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.interactions import Resolved
 
@@ -26,7 +26,7 @@ def known_interactions(count):
     data = Resolved(
         env=torch.arange(count), state=state, goal=goal, next_goal=next_goal, score=numbers, reward=numbers,
         tracking=numbers.unsqueeze(1), probe=integers.bool(), note=integers, crashed=outcomes(probability),
-        issued=integers, resolved=integers,
+        issued=integers, resolved=integers, horizon=integers + 1,
     )  # fmt: skip
     return data, probability
 
@@ -49,12 +49,12 @@ def test_known_probabilities_are_recovered():
     fear.fit(train, epochs=5)
     score = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
     calibration = Calibration()
-    raw = judge(calibration.probability(score), held_out.crashed)
+    raw = evaluate(calibration.probability(score), held_out.crashed)
     calibration.set_share(fear.share)
-    corrected = judge(calibration.probability(score), held_out.crashed)
+    corrected = evaluate(calibration.probability(score), held_out.crashed)
     calibration.fit(score[:10_000] + calibration.prior, held_out.crashed[:10_000], steps=20)
     probability = calibration.probability(score[10_000:])
-    last = judge(probability, held_out.crashed[10_000:])
+    last = evaluate(probability, held_out.crashed[10_000:])
     assert raw["ece"] > 0.1
     assert corrected["ece"] <= 0.02
     assert last["ece"] <= 0.02
@@ -128,14 +128,14 @@ def test_the_parts_of_the_brier_score_add_up():
     """Where a bin holds one value, brier = reliability - resolution + uncertainty; else what bins hide is missing."""
     level = torch.linspace(0.05, 0.95, BINS, dtype=torch.float64)
     crashed = outcomes(level.repeat_interleave(40).flip(0))
-    parts = judge(level.repeat_interleave(40), crashed)
+    parts = evaluate(level.repeat_interleave(40), crashed)
     whole = parts["reliability"] - parts["resolution"] + parts["uncertainty"]
     assert parts["brier"] == pytest.approx(whole, abs=1e-12)
     assert parts["uncertainty"] == pytest.approx(crashed.double().var(correction=0).item(), abs=1e-12)
 
     probability = torch.rand(1500, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     crashed = outcomes(probability)
-    parts = judge(probability, crashed)
+    parts = evaluate(probability, crashed)
     hidden = 0.0
     for rows in probability.argsort().split(1500 // BINS):
         p, y = probability[rows], crashed[rows].double()
@@ -146,7 +146,7 @@ def test_the_parts_of_the_brier_score_add_up():
 
 def test_a_small_case_by_hand():
     """Four predictions, each in a bin of its own: every number as it is worked out on paper."""
-    parts = judge(torch.tensor([0.1, 0.2, 0.8, 0.6]), torch.tensor([False, True, True, False]))
+    parts = evaluate(torch.tensor([0.1, 0.2, 0.8, 0.6]), torch.tensor([False, True, True, False]))
     assert parts["brier"] == pytest.approx((0.01 + 0.64 + 0.04 + 0.36) / 4)
     assert parts["ece"] == pytest.approx((0.1 + 0.8 + 0.2 + 0.6) / 4)
     assert parts["uncertainty"] == 0.25
@@ -159,10 +159,10 @@ def test_a_small_case_by_hand():
 def test_the_ends_of_the_skill():
     """The base rate has no skill and a perfect oracle all of it; one class or nothing to judge gives NaN."""
     crashed = torch.arange(100) < 20
-    assert judge(torch.full((100,), 0.2), crashed)["log_loss_skill"] == pytest.approx(0.0, abs=1e-7)
-    assert judge(crashed.float(), crashed)["log_loss_skill"] == 1.0
-    assert math.isnan(judge(torch.full((100,), 0.2), crashed & False)["log_loss_skill"])
-    assert judge(torch.full((100,), 0.2), crashed & False)["ece"] == pytest.approx(0.2)
-    nothing = judge(torch.zeros(0), torch.zeros(0, dtype=torch.bool))
-    assert set(nothing) == set(judge(crashed.float(), crashed))
+    assert evaluate(torch.full((100,), 0.2), crashed)["log_loss_skill"] == pytest.approx(0.0, abs=1e-7)
+    assert evaluate(crashed.float(), crashed)["log_loss_skill"] == 1.0
+    assert math.isnan(evaluate(torch.full((100,), 0.2), crashed & False)["log_loss_skill"])
+    assert evaluate(torch.full((100,), 0.2), crashed & False)["ece"] == pytest.approx(0.2)
+    nothing = evaluate(torch.zeros(0), torch.zeros(0, dtype=torch.bool))
+    assert set(nothing) == set(evaluate(crashed.float(), crashed))
     assert all(math.isnan(value) for value in nothing.values())

@@ -17,7 +17,7 @@ import torch
 
 import deimos
 from deimos.app import cli
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import METHODS, method
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.config import from_dict
@@ -37,7 +37,7 @@ TRAIN_ERRORS = {
     # what is asked for, and what the one line says
     "--env.variant cubic": "'cubic' .*'absolute', 'directional', 'relative'",
     "env:moon": "There is no 'env:moon'; there are: env:particle",
-    "--method p33": f"There is no method 'p33'; there are: {re.escape(', '.join(METHODS))}",
+    "--method q33": f"There is no method 'q33'; there are: {re.escape(', '.join(METHODS))}",
     "--method=": f"There is no method ''; there are: {re.escape(', '.join(METHODS))}",
     "selector:nope": "There is no 'selector:nope'; there are: .*selector:director, .*selector:uniform",
     "--method p25 selector:uniform": "method 'p25' and a selector exclude each other",
@@ -82,7 +82,7 @@ TRAIN_ERRORS = {
     "selector:director --selector.rule best": r"'best' .*'percentile', 'argmin', 'argmax'",
     "selector:director --selector.probe 1.1": r"probe must be in \[0, 1\], got 1.1",
     "selector:schedule --selector.at 1": r"at must be in \(0, 1\), or the schedule never switches; got 1.0",
-    "selector:schedule --selector.first p33": "There is no method 'p33'",
+    "selector:schedule --selector.first q33": "There is no method 'q33'",
     "selector:cl --selector.threshold 1.2": r"threshold must be in \(0, 1\), got 1.2",
     "selector:grid --selector.threshold 0": r"threshold must be in \(0, 1\), got 0.0",
     "selector:plr --selector.fill 0": r"fill must be in \(0, 1\], got 0.0",
@@ -91,7 +91,7 @@ TRAIN_ERRORS = {
     "--device tpu": "'tpu' .*'auto', 'cpu', 'cuda'",
     "--bogus 3": "Unrecognized options: --bogus",
     "bogus": "Unrecognized options: bogus",
-    "--out there": "there exists and is not overwritten; choose another --out, or go on with --resume",
+    "--out there": "there exists and is not overwritten; choose another --out, or continue with --resume",
     "--out file": "file exists and is not overwritten",
     "--out file/run": r"file/run cannot be made \(Not a directory\)",
     "--resume nowhere": "nowhere is not a run folder: it holds no config.json",
@@ -102,15 +102,14 @@ TRAIN_ERRORS = {
     "--init-from there": "there is not a run folder: it holds no config.json",
 }
 OTHER_ERRORS = {
-    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, study, play, terrain, bench",
+    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, study, play, terrain",
     "--bogus": "There is no command '--bogus'",
     "evaluate": "Missing from deimos evaluate: .*Folder of the run",
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
     "evaluate there": "there is not a run folder: it holds no config.json",
-    "bench": "Missing from deimos bench: .*What to measure",
-    "bench pendulum": r"'pendulum' .*'particle'",
-    "bench particle --rounds 0": "rounds must be at least 1, got 0",
-    "bench particle --json nowhere/x.json": "The folder of nowhere/x.json does not exist",
+    "bench": "There is no command 'bench'",
+    "study walk": "There is no command 'study walk'; there are: run, show, merge, report, ",
+    "terrain walk": "There is no command 'terrain walk'; there are: list, shape, grid",
 }
 
 
@@ -189,7 +188,7 @@ def test_other_commands_refuse(here, capfd, arguments):
         ("--contexts -1", "contexts must be at least 0, got -1"),
         (
             "--contexts 5 --worlds 3",
-            "contexts judges the fear network .* excludes worlds",
+            "contexts evaluates the fear network .* cannot be combined with worlds",
         ),
     ],
 )
@@ -372,6 +371,30 @@ def test_true_process_says_one_line(copied, arguments):
     assert contents(copied.parent) == before
 
 
+@pytest.mark.parametrize(
+    ("arguments", "package"),
+    [
+        (["terrain", "shape", "flat"], "trimesh"),
+        (["play", "run", "--video", "x.mp4"], "mujoco"),
+        (["train", "env:quad", "--num-envs", "1"], "mujoco"),
+    ],
+)
+def test_legged_robots_name_their_extra(here, capfd, monkeypatch, arguments, package):
+    """Where MuJoCo or trimesh is not installed, the one line names the extra of the legged robots."""
+    monkeypatch.setitem(sys.modules, package, None)
+    line = f"deimos: This needs {package}, which is not installed: pip install 'deimos-rl[legged]'\n"
+    assert refused(arguments, capfd) == line
+
+
+def test_other_versions_of_tyro_speak_for_themselves(monkeypatch, capfd):
+    """Where tyro tells nothing of what is wrong, its own words stay, with the same exit code."""
+    monkeypatch.setitem(sys.modules, "tyro._errors", None)
+    assert cli.main(["terrain", "grid", "--levels", "three"]) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "'three'" in err
+
+
 def test_version(capsys):
     """``deimos --version`` prints the version and nothing else."""
     assert cli.main(["--version"]) == 0
@@ -383,7 +406,9 @@ def test_usage_lists_the_commands(capsys, arguments):
     """Without a command, the commands are listed."""
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
-    assert all(re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate", "bench"))
+    assert all(
+        re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate", "study", "play", "terrain")
+    )
 
 
 def described_fields(config, prefix=""):
@@ -432,15 +457,15 @@ def test_help_explains_every_field(capsys):
 def test_help_explains_a_selector(capsys):
     """``selector:director --help`` shows its fields."""
     shown = shown_help(["train", "selector:director"], capsys)
-    for flag, text in described_fields(METHODS["p25"], "selector."):
+    for flag, text in described_fields(method("p25"), "selector."):
         assert f" {flag} " in shown.replace(",", " "), flag
         assert text in shown, flag
 
 
-@pytest.mark.parametrize("command", ["evaluate", "bench"])
+@pytest.mark.parametrize("command", ["evaluate", "play", "study", "study run", "study show", "terrain", "terrain grid"])
 def test_other_commands_explain_themselves(capsys, command):
     """The other commands have a help too."""
-    assert "--help" in shown_help([command], capsys)
+    assert "--help" in shown_help(command.split(), capsys)
 
 
 @pytest.mark.parametrize(
@@ -456,22 +481,22 @@ def test_other_commands_explain_themselves(capsys, command):
 def test_flags_work_before_and_after_subcommands(monkeypatch, arguments):
     """The place of a flag does not matter."""
     parsed = []
-    monkeypatch.setattr(cli, "_train", parsed.append)
+    monkeypatch.setattr("deimos.app.train._train", parsed.append)
     assert cli.main(["train", *arguments.split()]) == 0
     (options,) = parsed
     assert options.num_envs == 7
     assert options.env == particle.Config(variant="relative")
-    assert options.selector == dataclasses.replace(METHODS["p25"], percentile=60.0)
+    assert options.selector == dataclasses.replace(method("p25"), percentile=60.0)
     assert options.out is options.resume is options.init_from is None
 
 
 def test_every_method_is_accepted(monkeypatch):
     """Every name of the table of methods is a value of --method, and is what chooses the goals."""
     parsed = []
-    monkeypatch.setattr(cli, "_train", parsed.append)
+    monkeypatch.setattr("deimos.app.train._train", parsed.append)
     for name in METHODS:
         assert cli.main(["train", "--method", name]) == 0
-        assert (parsed[-1].label, parsed[-1].goals) == (name, METHODS[name])
+        assert (parsed[-1].label, parsed[-1].goals) == (name, method(name))
 
 
 def test_run_leaves_its_files(finished):
@@ -567,5 +592,5 @@ def test_interrupt_at_the_last_iteration_skips_the_evaluation(here, monkeypatch,
     monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated"))
     once = [argument if argument != "48" else "24" for argument in TINY]
     assert cli.main(["train", *once, "--out", "run"]) == 130
-    assert "go on with --resume run" in capsys.readouterr().err
+    assert "resume with --resume run" in capsys.readouterr().err
     assert Path("run/checkpoint.pt").exists()

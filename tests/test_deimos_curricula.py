@@ -7,7 +7,7 @@ from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import cl, grid
 from deimos.run.loop import GoalLoop, spaces
-from deimos.sim.env import Env, Step
+from deimos.sim.env import Env
 from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
@@ -22,23 +22,18 @@ class Ledger:
         self.now = 0
         self.kept = Interactions(10, 2, 3, 5, 10, CPU, groups=2)
 
-    def lesson(self, selector, tracking, issued=None, goals=None):
-        """One lesson after 6 more steps, on ten interactions; ``tracking`` is that of the two groups."""
+    def update(self, selector, tracking, issued=None, goals=None):
+        """One update after 6 more steps, on ten interactions; ``tracking`` is that of the two groups."""
         kept, rows = self.kept, torch.arange(10)
         self.now += 1
         kept.now = self.now if issued is None else issued
         goals = torch.zeros(10, 3) if goals is None else torch.tensor(goals).expand(10, -1)
-        kept.open(rows, torch.zeros(10, 2), torch.zeros(10, 3), goals, torch.zeros(10))
+        kept.open(rows, torch.zeros(10, 2), torch.zeros(10, 3), goals, torch.zeros(10), horizon=5)
         kept.now = self.now
         no = torch.zeros(10, dtype=torch.bool)
-        due = torch.ones(10, dtype=torch.bool)
-        for t in range(5):
-            step = Step(
-                torch.zeros(10, 5), torch.zeros(10), no, no, due if t == 4 else no, no,
-                tracking=torch.tensor(tracking).expand(10, -1),
-            )  # fmt: skip
-            kept.advance(step)
-        kept.resolve(step, rows)
+        for _ in range(5):
+            kept.advance(torch.zeros(10), no, torch.tensor(tracking).expand(10, -1))
+        kept.resolve(rows, no, ~no)
         self.now = kept.now
         return selector.learn(kept, None)
 
@@ -54,12 +49,12 @@ def test_a_group_grows_when_it_is_tracked_well():
     assert selector.first_goals_scaled
     shares = []
     for _ in range(5):
-        row = ledger.lesson(selector, [0.9, 0.7])
+        row = ledger.update(selector, [0.9, 0.7])
         shares.append(selector.goal_range().tolist())
         assert row["cl/tracking_0"] == pytest.approx(0.9, abs=1e-6)
         assert row["cl/tracking_1"] == pytest.approx(0.7, abs=1e-6)
     assert shares == [[x, x, 0.25] for x in (0.5, 0.75, 1.0, 1.0, 1.0)]
-    ledger.lesson(selector, [0.1, 0.81])
+    ledger.update(selector, [0.1, 0.81])
     assert selector.goal_range().tolist() == [1.0, 1.0, 0.5]
 
 
@@ -68,31 +63,31 @@ def test_it_waits_for_enough_interactions():
     selector, ledger = curriculum(min_interactions=25), Ledger()
     grown = []
     for tracking in (1.0, 1.0, 0.5, 1.0, 1.0, 0.3, 0.9):
-        ledger.lesson(selector, [tracking, 0.0])
+        ledger.update(selector, [tracking, 0.0])
         grown.append(selector.share[0])
-    # Means of three lessons each: 0.83 reaches the threshold, 0.77 does not.
+    # Means of three updates each: 0.83 reaches the threshold, 0.77 does not.
     assert grown == [0.25, 0.25, 0.5, 0.5, 0.5, 0.5, 0.5]
 
 
 def test_goals_of_the_old_range_say_nothing_of_the_new():
     """After a growth, goals that were issued before it or on its very step do not count; later ones do."""
     selector, ledger = curriculum(), Ledger()
-    ledger.lesson(selector, [0.9, 0.0])
+    ledger.update(selector, [0.9, 0.0])
     grown_at = ledger.now
     assert selector.share[0] == 0.5
     for issued in (grown_at - 3, grown_at):
-        assert torch.tensor(ledger.lesson(selector, [1.0, 0.0], issued=issued)["cl/tracking_0"]).isnan()
+        assert torch.tensor(ledger.update(selector, [1.0, 0.0], issued=issued)["cl/tracking_0"]).isnan()
         assert selector.share[0] == 0.5
-    ledger.lesson(selector, [1.0, 0.0], issued=grown_at + 1)
+    ledger.update(selector, [1.0, 0.0], issued=grown_at + 1)
     assert selector.share[0] == 0.75
 
 
 def test_a_saved_curriculum_stays_what_it_was():
     """What happens after a state was taken does not reach into it, and from it the curriculum goes on."""
     selector, other, ledger = curriculum(), curriculum(), Ledger()
-    ledger.lesson(selector, [0.9, 0.0])
+    ledger.update(selector, [0.9, 0.0])
     state = selector.state_dict()
-    ledger.lesson(selector, [0.9, 0.9])
+    ledger.update(selector, [0.9, 0.9])
     other.load_state_dict(state)
     assert other.share == [0.5, 0.25]
     assert other.goal_range().tolist() == [0.5, 0.5, 0.25]
@@ -158,7 +153,7 @@ def test_groups_have_grids_of_their_own():
     """Only the group that reached the threshold is raised, at the cell of its own components of the goal as issued."""
     selector, ledger = adaptive(start=0.1, growth=0.05), Ledger()
     before = [weights.clone() for weights in selector._weights]
-    row = ledger.lesson(selector, [0.79, 0.85], goals=[0.9, 0.9, 0.9])
+    row = ledger.update(selector, [0.79, 0.85], goals=[0.9, 0.9, 0.9])
     assert (row["grid/good_0"], row["grid/good_1"]) == (0.0, 1.0)
     assert torch.equal(selector._weights[0], before[0])
     risen = selector._weights[1] - before[1]

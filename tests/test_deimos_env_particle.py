@@ -384,9 +384,7 @@ def test_policies_that_crash_at_different_times_meet_the_same_goals(torch_device
         rng = np.random.default_rng(seed)
         env = build(torch_device, variant=variant, seed=7)
         loop = build_loop(env)
-        chosen = {
-            (w, "first", int(env.tensors["episode_count"][w])): env.tensors["goal"][w].clone() for w in range(8)
-        }
+        chosen = {(w, "first", int(env.tensors["episode_count"][w])): env.tensors["goal"][w].clone() for w in range(8)}
         steps = []
         for n in range(200):
             put_outside(env, rows_of(env)[torch.tensor(rng.random(8) < 0.03, device=torch_device)])

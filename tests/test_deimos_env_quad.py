@@ -8,8 +8,10 @@ import pytest
 import torch
 import warp as wp
 from deimos.kernels.legged.height_scan import scan_points
+from deimos.kernels.legged.levels import update_levels
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import COLUMNS
+from deimos.kernels.legged.step import evaluate_step
 from deimos.kernels.random import Purpose
 from deimos.terrain import Grid, Share
 from deimos.terrain.shapes.stairs import Shape as Stairs
@@ -21,6 +23,7 @@ from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import Step
 from deimos.sim.envs import quad_arm
 from deimos.sim.envs.quad import Config
+from deimos.sim.legged import robots
 from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
 
 U = 2.0**-24
@@ -28,7 +31,7 @@ POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)
 TASKS = {"quad": Config, "quad-arm": quad_arm.Config}
 
 both = pytest.mark.parametrize("task", TASKS)
-"""Whatever the robot carries, it keeps what an environment promises."""
+"""With an arm or without, a robot keeps what an environment promises."""
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +98,7 @@ def test_observation_is_legged_gyms(torch_device):
     assert env.goal_slice == slice(9, 12)
     assert env.dt == pytest.approx(0.02)
     noise = [0.2] * 3 + [0.05] * 3 + [0.05] * 3 + [0.0] * 3 + [0.01] * 12 + [0.075] * 12 + [0.0] * 12 + [0.5] * 187
-    np.testing.assert_allclose(env._noise.numpy(), noise, rtol=1e-6)
+    np.testing.assert_allclose(env.legged.sensing.noise.numpy(), noise, rtol=1e-6)
 
 
 def test_observation_matches_numpy(torch_device, hills):
@@ -174,6 +177,24 @@ def test_crash_is_the_trunk_on_the_ground(torch_device):
     assert crashed_at is not None
     assert 8 <= crashed_at <= 22
     assert stood
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("effort", [0.0, 1.0])
+def test_a_robot_that_lies_on_its_side_has_crashed(torch_device, side, effort):
+    """Whatever its legs do: it falls on its hips, which are parts of the base (thesis, 4.1.2: "any part" of it)."""
+    config = Config(goal_period=500).for_evaluation()
+    env, rng = config.build(32, torch_device, 0), np.random.default_rng(0)
+    yaw, roll = rng.uniform(0, 2 * np.pi, 32) / 2, side * np.pi / 4
+    c, s, a, b = np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
+    qpos = env.tensors["qpos"]
+    qpos[:, 2] = 0.25
+    qpos[:, 3:7] = torch.tensor(np.stack([c * a, c * b, s * b, s * a], axis=1), dtype=torch.float32)
+    env.tensors["qvel"].zero_()
+    crashed = torch.zeros(32, dtype=torch.bool, device=torch_device)
+    for _ in range(50):
+        crashed |= env.step(actions(32, torch_device, scale=effort)).terminated
+    assert bool(crashed.all())
 
 
 @both
@@ -349,7 +370,7 @@ def test_noise_is_uniform_and_keyed(torch_device):
     for _ in range(2):
         difference = noisy.step(action).obs - quiet.step(action).obs
         differences.append(difference.cpu().numpy())
-    bound = noisy._noise.numpy()
+    bound = noisy.legged.sensing.noise.numpy()
     for difference in differences:
         assert np.all(np.abs(difference) <= bound + 1e-5)
         assert np.all(np.abs(difference[:, bound == 0]) == 0)
@@ -401,38 +422,77 @@ def test_who_passes_the_last_level_is_sent_anywhere(torch_device, hills):
     assert (counts - n / 3).abs().max() < 5 * math.sqrt(n * 2 / 9)
 
 
+def walk(env, goals, follows):
+    """Play an episode in which robots do what two goals say, or stand; what they do is written, not simulated.
+
+    Gives the level that each begins the next episode on, all having begun on level 5 of ten, and the distance of the
+    ends of each goal's path, shape (2, num_envs).
+    """
+    n, t = env.num_envs, env.tensors
+    env.legged.ground.origin = wp.zeros((10, 1), dtype=wp.vec3, device=env.worlds.mask.device)
+    t["level"][:] = 5
+    position, yaw, lengths = np.zeros((n, 2)), np.zeros(n), []
+    for k, goal in enumerate(goals):
+        if k > 0:
+            env.set_goals(rows_of(env), torch.tensor(goal * [2.0, 2.0, 0.25], dtype=torch.float32))
+        else:
+            t["goal"][:] = torch.tensor(goal, dtype=torch.float32)
+        start = position.copy()
+        for _ in range(500):
+            yaw = yaw + goal[:, 2] * 0.02 * follows
+            c, s = np.cos(yaw), np.sin(yaw)
+            velocity = np.stack([c * goal[:, 0] - s * goal[:, 1], s * goal[:, 0] + c * goal[:, 1]], axis=1)
+            position = position + 0.02 * velocity * follows
+            t["qpos"][:, :2] = torch.tensor(position, dtype=torch.float32)
+            zero = np.zeros(n)
+            t["qpos"][:, 3:7] = torch.tensor(np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], 1))
+            t["qvel"].zero_()
+            t["qvel"][:, :2] = torch.tensor(velocity * follows)
+            t["qvel"][:, 5] = torch.tensor(goal[:, 2] * follows)
+            evaluate_step(env.legged)
+        lengths.append(np.linalg.norm(position - start, axis=1))
+    assert env._views["truncated"].all()
+    env._views["mask"][:] = True
+    update_levels(env.legged)
+    return t["level"].cpu().numpy(), np.array(lengths)
+
+
 @pytest.mark.parametrize("rule", ["reward", "displacement"])
 def test_perfect_tracker_of_turning_goals(torch_device, rule):
-    """Who follows turning goals perfectly walks in circles: it never goes down by ours, but often by Legged Gym's."""
-    rng = np.random.default_rng(0)
-    n, steps = 64, 1000
-    ground = build(torch_device, num_envs=1).terrain
-    assert ground.tile == 8.0
-    env = build(torch_device, num_envs=n, levels=rule, episode_steps=steps, goal_period=500, start_levels=1)
-    # A world of ten levels, all of them flat: what the robots do is written, not simulated.
-    origins = np.zeros((10, 1, 3), np.float32)
-    env._ground.origin = wp.array(origins, dtype=wp.vec3, device=str(env._ground.heights.device))
-    env._capture()
-    t = env.tensors
-    t["level"][:] = 5
-    position, yaw = np.zeros((n, 2)), np.zeros(n)
-    for goal in rng.uniform(-1, 1, size=(2, n, 3)):
-        for _ in range(500):
-            yaw += goal[:, 2] * 0.02
-            c, s = np.cos(yaw), np.sin(yaw)
-            position += 0.02 * np.stack([c * goal[:, 0] - s * goal[:, 1], s * goal[:, 0] + c * goal[:, 1]], axis=1)
-    t["qpos"][:, :2] = torch.tensor(position, dtype=torch.float32)
-    t["goal"][:] = torch.tensor(goal, dtype=torch.float32)
-    t["tracked"][:] = torch.tensor([float(steps), float(steps)])
-    env._views["terminated"][:] = False
+    """Who follows turning goals perfectly walks in circles and never goes down by either rule; who stands does."""
+    goals = np.random.default_rng(0).uniform(-1, 1, size=(2, 64, 3))
+    config = {"levels": rule, "episode_steps": 1000, "goal_period": 500, "stagger": False}
+    level, lengths = walk(build(torch_device, num_envs=64, **config), goals, follows=1.0)
+    counts = (lengths > 0.31).any(axis=0) | (rule == "reward")
+    unclear = (np.abs(lengths - 0.3) < 0.02).any(axis=0)  # the path that counts begins a step later
+    np.testing.assert_array_equal(level[~unclear], np.where(counts, 6, 5)[~unclear])
+    assert counts.sum() > 60
+    level, _ = walk(build(torch_device, num_envs=64, **config), goals, follows=0.0)
+    still = np.exp(-(goals[..., :2] ** 2).sum(-1) / 0.25).mean(0)
+    down = counts if rule == "displacement" else still < 0.5
+    clear = ~unclear if rule == "displacement" else still < 0.8
+    np.testing.assert_array_equal(level[clear], np.where(down, 4, 5)[clear])
+
+
+def test_goals_that_lead_nowhere_do_not_count(torch_device):
+    """By displacements, goals that turn on the spot say nothing, and a goal that was missed halves one that was met."""
+    goals = np.zeros((2, 4, 3))
+    goals[:, 0, 2] = 1.0  # turns
+    goals[:, 1] = [0.025, 0.0, 0.0]  # leads 0.25 m away
+    goals[0, 2], goals[1, 2] = [0.5, 0.0, 0.0], [0.0, 0.0, 1.0]  # one counts
+    goals[:, 3] = [0.5, 0.0, 0.2]
+    config = {"levels": "displacement", "episode_steps": 1000, "goal_period": 500, "stagger": False}
+    assert walk(build(torch_device, num_envs=4, **config), goals, follows=1.0)[0].tolist() == [5, 5, 6, 6]
+    assert walk(build(torch_device, num_envs=4, **config), goals, follows=0.0)[0].tolist() == [5, 5, 4, 4]
+    env = build(torch_device, num_envs=4, **config)
+    env.tensors["progress"][:] = torch.tensor([0.9, 1.0, 0.3, 1.0])  # mean 0.6
+    env.tensors["level"][:] = 5
     env._views["truncated"][:] = True
-    env._views["invalid"][:] = False
-    env.reset(mask_of(env, *range(n)))
-    down = int((t["level"] < 5).sum())
-    if rule == "reward":
-        assert t["level"].tolist() == [6] * n
-    else:
-        assert down > n / 4
+    env._views["terminated"][:2] = torch.tensor([True, False])
+    env.legged.ground.origin = wp.zeros((10, 1), dtype=wp.vec3, device=env.worlds.mask.device)
+    env._views["mask"][:] = True
+    update_levels(env.legged)
+    assert env.tensors["level"].tolist() == [4, 5, 5, 5]
 
 
 def test_evaluation_puts_world_i_on_tile_i(torch_device, hills):
@@ -544,11 +604,13 @@ def test_a_goal_that_is_not_finite_breaks_its_world(torch_device):
 
 
 def test_buffers_too_small_say_how_large_they_had_to_be(torch_device):
-    """The message names the bit, the buffer, its size, what was needed and the flag, and no buffer that had room."""
+    """The message names the bit, the buffer, its size, what was needed and the flag, and no other buffer."""
     env = build(torch_device, physics=PhysicsConfig(rows=8))
     for _ in range(20):
         env.step(actions(6, torch_device))
-    message = r"lost contacts \(NEFC: up to \d+ constraint rows .* were needed, with room for 8; raise physics.rows\)"
+    message = (
+        r"lost contacts \(NEFC: up to \d+ constraint rows .* were needed, the buffer holds 8; raise physics.rows\)"
+    )
     with pytest.raises(SimulationError, match=message):
         env.check()
 
@@ -556,7 +618,7 @@ def test_buffers_too_small_say_how_large_they_had_to_be(torch_device):
 @pytest.mark.parametrize(("seconds", "steps"), [(0.0, 0), (0.009, 1), (0.02, 1), (0.3, 15)])
 def test_pushes_come_as_often_as_they_are_asked_for(torch_device, seconds, steps):
     """An interval shorter than a step is a push on every step, and only 0 is none."""
-    assert build(torch_device, num_envs=1, push_interval=seconds)._params.push_interval == steps
+    assert build(torch_device, num_envs=1, push_interval=seconds).legged.params.push_interval == steps
 
 
 def test_terrain_of_fine_cells_is_refused(torch_device, tmp_path):
@@ -586,6 +648,51 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
         env.step(torch.zeros(shape, device=torch_device))
 
 
+def test_actions_are_what_the_joints_can_do(torch_device):
+    """However large an action, targets end where the joints' ranges do, and the policy sees what was done."""
+    env = build(torch_device, num_envs=2, noise=False)
+    low, high = np.array([joint.range for joint in env.robot.joints]).T
+    ends = np.array([joint.action_range for joint in env.robot.joints])
+    np.testing.assert_allclose(POSE + 0.25 * ends.T, [low, high], atol=1e-12)
+    assert env.action_bound == pytest.approx(np.abs(ends).max())
+    np.testing.assert_allclose(torch.stack(env.action_range), ends.T, rtol=1e-6)
+    step = env.step(torch.tensor([[1e6], [-1e6]], device=torch_device).expand(2, 12))
+    np.testing.assert_allclose(env.physics.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(step.obs[:, 36:48].cpu(), ends.T[::-1], rtol=1e-6)
+
+
+NEW_ROBOT = '''
+from dataclasses import replace
+from deimos.sim.legged.robots import go1
+
+def build(*, stiffness=40.0, damping=1.0, action_scale=0.2):
+    """A Go1 with other gains that starts a little higher."""
+    return replace(go1.build(stiffness=stiffness, damping=damping, action_scale=action_scale), spawn_height=0.5)
+'''
+
+
+def test_a_robot_is_one_file(torch_device, tmp_path, monkeypatch):
+    """A file in the folder of robots is a robot: its name is known, its numbers are the task's, and it steps."""
+    (tmp_path / "newcomer.py").write_text(NEW_ROBOT)
+    monkeypatch.setattr(robots, "__path__", [*robots.__path__, str(tmp_path)])
+    env = build(torch_device, robot="newcomer")
+    assert [joint.stiffness for joint in env.robot.joints] == [40.0] * 12
+    assert bool((env.tensors["qpos"][:, 2] == 0.5).all())
+    assert bool(env.step(actions(6, torch_device)).obs.isfinite().all())
+    softer = build(torch_device, robot="newcomer", stiffness=20.0)
+    assert {(joint.stiffness, joint.damping) for joint in softer.robot.joints} == {(20.0, 1.0)}
+
+
+def test_the_data_hold_what_a_deployment_reads(torch_device):
+    """Joint names in order, default pose, action scale, gains, torque limits and the control period are at hand."""
+    env = build(torch_device)
+    assert [joint.name for joint in env.robot.joints[:3]] == ["FL_hip", "FL_thigh", "FL_calf"]
+    np.testing.assert_array_equal([joint.pose for joint in env.robot.joints], POSE)
+    assert {(joint.action_scale, joint.stiffness, joint.damping) for joint in env.robot.joints} == {(0.25, 30.0, 0.8)}
+    assert [joint.max_torque for joint in env.robot.joints[:3]] == [23.7, 23.7, 35.55]
+    assert env.config.physics.control_period == env.dt == pytest.approx(0.02)
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -596,6 +703,7 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
         ({"friction": (1.0, 0.5)}, "friction must be a range"),
         ({"payload": -1.0}, r"payload must be in \[0, 1e\+06\], got -1.0"),
         ({"stiffness": 0.0}, "stiffness must be finite and positive, got 0.0"),
+        ({"robot": "spot"}, "robot must be one of go1, go1_rx150, got 'spot'"),
         ({"rewards": RewardWeights(tilt=math.nan)}, "rewards.tilt must be finite, got nan"),
     ],
 )

@@ -20,7 +20,7 @@ from deimos.sim import envs, warp_env
 from deimos.sim.envs import particle, quad, quad_arm
 from deimos.sim.envs.quad_arm import Config
 from deimos.sim.legged import task as locomotion
-from deimos.sim.legged.robots import rx150
+from deimos.sim.legged.robots import go1_rx150 as rx150
 
 MIDDLE, HALF = (np.array(SHELL_HIGH) + SHELL_LOW) / 2, (np.array(SHELL_HIGH) - SHELL_LOW) / 2
 SCALE = torch.tensor([2.0, 2.0, 0.25, 1.0, 1.0, 1.0])
@@ -60,7 +60,7 @@ def test_observation_is_quads_with_the_arm_in_it(torch_device):
     assert (env.obs_dim, env.goal_dim, env.action_dim) == (256, 6, 17)
     assert env.goal_groups == (slice(0, 2), slice(2, 3), slice(3, 6))
     noise = [0.2] * 3 + [0.05] * 6 + [0.0] * 6 + [0.01] * 17 + [0.075] * 17 + [0.0] * 17 + [0.01] * 3 + [0.5] * 187
-    np.testing.assert_allclose(env._noise.numpy(), noise, rtol=1e-6)
+    np.testing.assert_allclose(env.legged.sensing.noise.numpy(), noise, rtol=1e-6)
 
 
 def test_end_effector_is_where_mujoco_has_it(torch_device):
@@ -93,7 +93,7 @@ def test_errors_are_a_view(torch_device):
     assert error.shape == (6,)
     address, before = error.data_ptr(), error.clone()
     env.step(actions(6, torch_device))
-    assert env.errors["end effector [m]"].data_ptr() == address == env._error.array.ptr
+    assert env.errors["end effector [m]"].data_ptr() == address
     assert not torch.equal(error, before)
     assert env.report()["end_effector_error"] == pytest.approx(float(error.mean()))
 
@@ -139,7 +139,7 @@ def test_goals_are_valid_and_cover_the_shell(torch_device):
     assert np.abs(goals).max() <= 1
     in_trunk = places_of(np.concatenate([goals, first])[:, 3:]) + rx150.SHOULDER
     margin = rx150.GRIPPER_RADIUS - 1e-6
-    low, high = np.array(quad_arm.BODY_LOW) - margin, np.array(quad_arm.BODY_HIGH) + margin
+    low, high = np.array(rx150.BODY[0]) - margin, np.array(rx150.BODY[1]) + margin
     assert not ((in_trunk > low) & (in_trunk < high)).all(axis=1).any()
     assert in_trunk[:, 2].min() + 0.325 > 0.15
     counts = np.histogramdd(goals[:, 3:], bins=4, range=[(-1, 1)] * 3)[0]
@@ -237,6 +237,9 @@ def test_presets():
         assert presets.preset(name).env.speed == (0.0 if name == "quad-arm-stand" else 1.0)
         assert not presets.preset(name).env.hold_trunk
     assert "quad_arm" not in presets.names()
+    stand = presets.preset("quad-arm-stand")
+    assert (stand.env.noise, stand.ppo.discount, stand.ppo.hidden) == (False, 0.95, (256, 128, 64))
+    assert (stand.eval.worlds, stand.eval.adversary_enough) == (256, "any")
     assert presets.preset("quad-arm-thesis").env.terrain == "rough"
 
 
@@ -257,6 +260,7 @@ def test_the_environments_share_their_code_not_their_lines():
         ({"speed": 1.5}, r"speed must be in \[0.*1.*\], got 1.5"),
         ({"speed": math.nan}, r"speed must be in \[0.*1.*\], got nan"),
         ({"arm_rewards": ArmWeights(reach=math.inf)}, "arm_rewards.reach must be finite, got inf"),
+        ({"robot": "nobody"}, "robot must be one of go1, go1_rx150, got 'nobody'"),
         ({"goal_period": 1001}, "goal_period must be at most an episode of 1000 steps, got 1001"),
     ],
 )
@@ -271,3 +275,9 @@ def test_actions_of_the_legs_alone_are_refused(torch_device):
     env = build(torch_device)
     with pytest.raises(ValueError, match=r"action must have the shape \(6, 17\), got \(6, 12\)"):
         env.step(torch.zeros(6, 12, device=torch_device))
+
+
+def test_a_robot_without_an_arm_is_refused(torch_device):
+    """Goals of an end effector need one."""
+    with pytest.raises(ValueError, match="robot must have an arm"):
+        build(torch_device, robot="go1")

@@ -138,6 +138,7 @@ def held_out(probe, crashed):
         env=nothing.long(), state=torch.stack([probe.float(), crashed.float()], dim=1), goal=nothing.unsqueeze(1),
         next_goal=nothing.unsqueeze(1), score=nothing, reward=nothing, tracking=nothing, probe=probe,
         note=nothing.long(), crashed=crashed, issued=nothing.long(), resolved=nothing.long(),
+        horizon=nothing.long() + 1,
     )  # fmt: skip
 
 
@@ -212,7 +213,7 @@ def test_a_policy_that_gives_nan_is_no_policy():
 def test_the_hash_tells_weights_apart():
     """Equal weights have equal hashes; the smallest change gives another."""
     torch.manual_seed(0)
-    net = mlp(3, (4,), 1, "relu")
+    net = mlp(3, (4,), 1, "relu", torch.default_generator)
     before = weights_hash(net)
     assert weights_hash(net) == before
     net[0].weight.data[0, 0] += 1e-6

@@ -24,6 +24,7 @@ def interactions(crashed, seed=0, state=None):
     return Resolved(
         env=torch.arange(n), state=state, goal=goal, next_goal=next_goal, score=zeros, reward=zeros,
         tracking=zeros.unsqueeze(1), probe=steps.bool(), note=steps, crashed=crashed, issued=steps, resolved=steps + 1,
+        horizon=steps + 1,
     )  # fmt: skip
 
 

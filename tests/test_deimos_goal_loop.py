@@ -1,5 +1,7 @@
 """What happens between two steps: how episodes begin under selectors that bound first goals."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -68,3 +70,17 @@ def test_starting_again_goes_on_to_new_episodes(torch_device):
     env.restart()
     for name, tensor in first.items():
         assert torch.equal(env.tensors[name], tensor), name
+
+
+def test_an_environment_that_miscounts_touches_no_other_world(torch_device):
+    """Goals and episodes begin where the masks say so; what a step says of their number is not even read."""
+    env = TASKS["particle"].build(16, torch_device, 2)
+    loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
+    step = env.step(torch.zeros(16, 3, device=torch_device))
+    for name, rows in (("goal_due", [3, 5]), ("terminated", [5, 7]), ("truncated", [])):
+        getattr(step, name).fill_(False)[rows] = True
+    before = {name: env.tensors[name].clone() for name in ("goal_count", "episode_count")}
+    loop.advance(SimpleNamespace(**(vars(step) | {"count": torch.tensor([9, 9], device=torch_device)})))
+    assert (env.tensors["goal_count"] - before["goal_count"]).nonzero().flatten().tolist() == [3]
+    assert (env.tensors["episode_count"] - before["episode_count"]).nonzero().flatten().tolist() == [5, 7]
+    assert loop.interactions.active.nonzero().flatten().tolist() == [3]

@@ -1,7 +1,8 @@
 """When an interaction begins, how it resolves, and how long it is remembered."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from deimos.goals.interactions import Interactions, Resolved
 from deimos.goals.selectors import uniform
 from deimos.learn.rollout import Rollout
 from deimos.run.loop import GoalLoop, spaces
-from deimos.sim.env import Step
 from deimos.sim.envs import particle
 
 STATE_DIM, GOAL_DIM = 4, 2
@@ -25,33 +25,32 @@ def make_step(num_envs, device, *, terminated=(), truncated=(), goal_due=(), rew
         flags[list(rows)] = True
         return flags
 
-    terminated, truncated, goal_due = mask(terminated), mask(truncated), mask(goal_due)
-    return Step(
-        obs=torch.zeros(num_envs, STATE_DIM + GOAL_DIM, device=device),
+    return SimpleNamespace(
         reward=torch.as_tensor(reward, dtype=torch.float32, device=device).expand(num_envs).clone(),
-        terminated=terminated,
-        truncated=truncated,
-        goal_due=goal_due,
-        invalid=mask([]),
+        terminated=mask(terminated),
+        truncated=mask(truncated),
+        goal_due=mask(goal_due),
+        tracking=None,
     )
 
 
 def make_interactions(num_envs, device, *, goal_period=3, window=None):
     """A fresh book, with the window that training has."""
     window = 2 * goal_period if window is None else window
-    return Interactions(num_envs, STATE_DIM, GOAL_DIM, goal_period, window, device)
+    return Interactions(num_envs, STATE_DIM, GOAL_DIM, math.ceil(window / goal_period) + 1, window, device)
 
 
 def advance(interactions, step):
     """Do with a step what the loop does, and return the worlds that are due and not done."""
-    interactions.advance(step)
+    interactions.advance(step.reward, step.terminated, step.tracking)
     done = step.terminated | step.truncated
     due = torch.nonzero(step.goal_due & ~done).flatten()
-    interactions.resolve(step, torch.cat([due, torch.nonzero(done).flatten()]))
+    rows = torch.cat([due, torch.nonzero(done).flatten()])
+    interactions.resolve(rows, step.terminated[rows], step.goal_due[rows])
     return due
 
 
-def issue(interactions, rows, marks, device):
+def issue(interactions, rows, marks, device, horizon=3):
     """Open interactions whose parts can be told from each other: mark + 0.25 k in part k."""
     marks = torch.as_tensor(marks, dtype=torch.float32, device=device).unsqueeze(1)
     interactions.open(
@@ -60,6 +59,7 @@ def issue(interactions, rows, marks, device):
         goal=marks.repeat(1, GOAL_DIM) + 0.25,
         next_goal=marks.repeat(1, GOAL_DIM) + 0.5,
         score=marks.squeeze(1) + 0.75,
+        horizon=horizon,
     )
 
 
@@ -199,13 +199,17 @@ def test_every_ending_by_hand(torch_device):
 def test_interaction_straddles_rollouts(torch_device):
     """Rollouts shorter than T cut nothing: an interaction goes on over as many of them as it takes."""
     loop = build_loop(torch_device, goal_period=10)
-    env, rollout = loop.env, Rollout(loop.env, num_steps=4)
+    env, rollout = loop.env, Rollout(4, 2, loop.env.obs_dim, 3, torch_device)
     found = []
     for _ in range(7):
         for t in range(rollout.num_steps):
             step = env.step(torch.zeros(2, 3, device=torch_device))
-            rollout.record(t, step, loop.weight)
-            loop.advance(step)
+            changes = loop.resolve(step)
+            rollout.record(
+                t, obs=step.obs, reward=step.reward, terminated=step.terminated, truncated=step.truncated,
+                invalid=step.invalid, weight=loop.weight, cut_off=changes.cut_off,
+            )  # fmt: skip
+            loop.renew(step, changes)
         loop.selector.learn(loop.interactions, rollout)
         found.append(loop.interactions.resolved())
     assert [len(resolved) for resolved in found] == [0, 0, 0, 0, 2, 2, 2]
@@ -219,7 +223,7 @@ def test_parts_stay_what_they_were(torch_device):
     tensors = [torch.rand(2, size, device=torch_device) for size in (STATE_DIM, GOAL_DIM, GOAL_DIM)]
     tensors.append(torch.tensor([0.5, torch.nan], device=torch_device))
     kept = [tensor.clone() for tensor in tensors]
-    interactions.open(torch.tensor([3, 1], device=torch_device), *tensors)
+    interactions.open(torch.tensor([3, 1], device=torch_device), *tensors, horizon=3)
     for tensor in tensors:
         tensor.fill_(-1.0)
     advance(interactions, make_step(4, torch_device, goal_due=[1, 3]))
@@ -422,13 +426,13 @@ def test_notes_and_probes_come_back(torch_device):
     score = torch.zeros(3, device=torch_device)
     note = torch.tensor([2**24 - 1, 0, 12_345_679], device=torch_device)
     probe = torch.tensor([False, True, True], device=torch_device)
-    interactions.open(rows, *parts, score, probe=probe, note=note)
+    interactions.open(rows, *parts, score, horizon=3, probe=probe, note=note)
     advance(interactions, make_step(4, torch_device, goal_due=[0, 2, 3]))
     resolved = interactions.resolved()
     assert resolved.env.tolist() == [0, 2, 3]
     assert resolved.note.tolist() == [0, 2**24 - 1, 12_345_679]
     assert resolved.probe.tolist() == [True, False, True]
-    interactions.open(rows, *parts, score)
+    interactions.open(rows, *parts, score, horizon=3)
     advance(interactions, make_step(4, torch_device, terminated=[0, 2, 3]))
     newest = interactions.resolved()
     newest = newest.where(newest.resolved == 2)
@@ -438,13 +442,14 @@ def test_notes_and_probes_come_back(torch_device):
 
 def test_tracking_is_the_mean_over_the_period(torch_device):
     """Each group has a column: its mean over all T steps, with 0 from the crash on; rewards are summed beside it."""
-    interactions = Interactions(3, STATE_DIM, GOAL_DIM, 4, 8, torch_device, groups=2)
-    issue(interactions, [0, 1], [0.0, 1.0], torch_device)
+    interactions = Interactions(3, STATE_DIM, GOAL_DIM, 3, 8, torch_device, groups=2)
+    issue(interactions, [0, 1], [0.0, 1.0], torch_device, horizon=4)
     tracking = torch.tensor([[1.0, 0.25], [0.5, 0.0], [1.0, 1.0]], device=torch_device)
     for t in range(4):
         terminated = [1] if t == 2 else []
         step = make_step(3, torch_device, terminated=terminated, goal_due=[0] if t == 3 else [], reward=2.0)
-        advance(interactions, replace(step, tracking=tracking * (t + 1) / 4))
+        step.tracking = tracking * (t + 1) / 4
+        advance(interactions, step)
     resolved = interactions.resolved()
     assert resolved.tracking.shape == (2, 2)
     assert resolved.tracking[0].tolist() == [0.625, 0.15625]  # (1 + 2 + 3 + 4) / 16 of each
@@ -455,7 +460,7 @@ def test_tracking_is_the_mean_over_the_period(torch_device):
 def test_without_groups_the_reward_is_the_tracking(torch_device):
     """Where a step tells no tracking, it is the mean reward over T steps, in one column."""
     interactions = make_interactions(1, torch_device, goal_period=4)
-    issue(interactions, [0], [0.0], torch_device)
+    issue(interactions, [0], [0.0], torch_device, horizon=4)
     for t in range(4):
         advance(interactions, make_step(1, torch_device, goal_due=[0] if t == 3 else [], reward=0.5 * t))
     assert interactions.resolved().tracking.tolist() == [[0.75]]
@@ -493,3 +498,69 @@ def test_a_view_without_scores_is_the_same_but_for_them(torch_device):
     for name in set(Resolved.__dataclass_fields__) - {"score"}:
         assert torch.equal(getattr(shown, name), getattr(true, name)), name
     assert torch.equal(view.resolved().crashed, true.crashed)  # it shares the memory
+
+
+def test_every_interaction_has_a_horizon_of_its_own(torch_device):
+    """Tracking is the mean over the horizon that an interaction was opened with, whatever those of the others are."""
+    interactions = make_interactions(3, torch_device)
+    issue(interactions, [0, 1, 2], [0.0, 1.0, 2.0], torch_device, horizon=torch.tensor([2, 4, 8], device=torch_device))
+    for _ in range(2):
+        advance(interactions, make_step(3, torch_device, reward=1.0))
+    advance(interactions, make_step(3, torch_device, goal_due=[0, 1], terminated=[2], reward=1.0))
+    resolved = interactions.resolved()
+    assert resolved.horizon.tolist() == [2, 4, 8]
+    assert resolved.tracking.flatten().tolist() == [1.5, 0.75, 0.25]  # the step of the crash does not count
+
+
+def test_what_was_executed_is_what_comes_back(torch_device):
+    """Where a world pursued another goal than was issued, that one is learnt from; the others keep theirs."""
+    interactions = make_interactions(3, torch_device)
+    issue(interactions, [0, 1, 2], [0.0, 1.0, 2.0], torch_device)
+    executed = torch.tensor([[7.0, 8.0]], device=torch_device)
+    interactions.execute(torch.tensor([1], device=torch_device), executed)
+    advance(interactions, make_step(3, torch_device, goal_due=[0, 1, 2]))
+    resolved = interactions.resolved()
+    assert resolved.next_goal.tolist() == [[0.5, 0.5], [7.0, 8.0], [2.5, 2.5]]
+    assert resolved.goal.tolist() == [[0.25, 0.25], [1.25, 1.25], [2.25, 2.25]]
+
+
+def test_the_oldest_makes_way_where_a_ring_is_full(torch_device):
+    """A world keeps as many interactions as its ring holds, however long the window is."""
+    interactions = Interactions(1, STATE_DIM, GOAL_DIM, 2, 1000, torch_device)
+    for mark in (1.0, 2.0, 3.0):
+        issue(interactions, [0], [mark], torch_device)
+        advance(interactions, make_step(1, torch_device, goal_due=[0]))
+    assert sorted(interactions.resolved().state[:, 0].tolist()) == [2.0, 3.0]
+
+
+def test_what_is_stored_carries_no_gradient(torch_device):
+    """States, goals, scores and rewards of a caller who records gradients are kept without them."""
+    interactions = make_interactions(2, torch_device)
+    rows, score = torch.arange(2, device=torch_device), torch.zeros(2, device=torch_device, requires_grad=True)
+    sizes = (STATE_DIM, GOAL_DIM, GOAL_DIM)
+    parts = [torch.zeros(2, size, device=torch_device, requires_grad=True) for size in sizes]
+    interactions.open(rows, *parts, 2 * score, horizon=3)
+    interactions.execute(rows, 2 * parts[2])
+    step = make_step(2, torch_device, goal_due=[0, 1])
+    step.reward.requires_grad_()
+    advance(interactions, step)
+    resolved = interactions.resolved()
+    assert len(resolved) == 2
+    assert not any(getattr(resolved, name).requires_grad for name in Resolved.__dataclass_fields__)
+
+
+def test_a_book_of_before_horizons_is_read(torch_device):
+    """A loop's state as version 0.1 wrote it, without horizons, resumes as what it says: T for every interaction."""
+    loops = [build_loop(torch_device), build_loop(torch_device)]
+    run(loops[0], 7, crash=[1])
+    state = loops[0].state_dict()
+    book = state["interactions"]
+    old = {name: book[name] for name in ("now", "active", "pending", "ring", "cursor")}
+    old |= {"issued": book["issued_at"], "marks": book["marks"][:, :, :3]}
+    loops[1].load_state_dict(state | {"interactions": old})
+    for loop in loops:
+        run(loop, 5)
+    first, second = (loop.interactions.resolved() for loop in loops)
+    assert len(first) == 2
+    for name in Resolved.__dataclass_fields__:
+        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=0, equal_nan=True)

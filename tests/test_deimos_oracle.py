@@ -119,7 +119,7 @@ def test_calibration_is_judged_on_whole_periods(afraid):
     for probability, crashed, quality in judged.values():
         assert len(probability) == len(crashed) == quality["interactions"] >= 100
         assert ((probability > 0) & (probability < 1)).all()
-        assert 0 < quality["crash_share"] < 1
+        assert 0 < quality["crash_rate"] < 1
         assert quality["brier"] <= 1
 
 

@@ -13,7 +13,8 @@ from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
 from deimos.sim.legged.engines.mujoco_warp import Captured, Physics, PhysicsConfig
-from deimos.sim.legged.robots import go1, rx150
+from deimos.sim.legged.robots import go1
+from deimos.sim.legged.robots import go1_rx150 as rx150
 
 ROBOT = go1.build()
 ROBOTS = {"go1": ROBOT, "go1_rx150": rx150.mount(go1.build())}
@@ -261,8 +262,8 @@ def test_buffers_tell_their_use(device):
     physics.step()
     use = physics.buffer_use()
     assert 0 < use["contacts"] <= use["max_contacts"]
-    # Four feet with four rows each, a head, ten capsules with two contacts each, and twelve limits.
-    assert 0 < use["rows"] <= use["max_rows"] == 4 * 4 + 1 + 10 * 2 + 12
+    # Four feet with four rows each, a head and four hips, ten capsules with two contacts each, and twelve limits.
+    assert 0 < use["rows"] <= use["max_rows"] == 4 * 4 + 5 + 10 * 2 + 12
     assert physics.buffer_use()["rows"] == 0  # since the last call
     small = make(2, device, config=PhysicsConfig(rows=8))
     place(small, 0.25)
@@ -273,8 +274,8 @@ def test_buffers_tell_their_use(device):
 @pytest.mark.parametrize(
     ("bits", "message"),
     [
-        (1, r"^NEFC: up to \d+ constraint rows in a world were needed, with room for 49; raise physics.rows$"),
-        (16, r"^CCD: up to \d+ contacts in all worlds were needed, with room for 80; raise physics.contacts$"),
+        (1, r"^NEFC: up to \d+ constraint rows in a world were needed, the buffer holds 53; raise physics.rows$"),
+        (16, r"^CCD: up to \d+ contacts in all worlds were needed, the buffer holds 96; raise physics.contacts$"),
         (32, "^HFIELD: a geom covered more of the height field than is tested; take a terrain of larger cells$"),
         (256, "^EPA_HORIZON: a contact was deeper than the collision test can resolve$"),
         (33 + 512, "^NEFC: .*; HFIELD: "),
@@ -294,14 +295,14 @@ def test_every_loss_has_an_explanation(device):
 
 
 def test_buffers_hold_an_arm_that_touches_everything(device, stairs):
-    """Room is made for the arm's contacts with ground and guards, and an arm that swings into both loses none."""
+    """The buffers hold the arm's contacts with ground and guards, and an arm that swings into both loses none."""
     robot = ROBOTS["go1_rx150"]
     physics = make(4, device, robot=robot)
-    # Beside the Go1's 49: five limits, two capsules on the ground and on two guards, twice each, and on a ball.
+    # Beside the Go1's 53: five limits, two capsules on the ground and on two guards, twice each, and on a ball.
     among_itself = 2 * 2 * 2 + 2
-    assert physics.max_rows == 49 + 5 + 2 * 2 + among_itself
-    # On a height field four fifths of what four contacts of each need: four rows for four feet, one for 13 others.
-    assert make(1, device, stairs, robot).max_rows == math.ceil(0.8 * (4 * 4 * 4 + 13 * 4 + 12 + 5 + among_itself))
+    assert physics.max_rows == 53 + 5 + 2 * 2 + among_itself
+    # On a height field four fifths of what four contacts of each need: four rows for four feet, one for 17 others.
+    assert make(1, device, stairs, robot).max_rows == math.ceil(0.8 * (4 * 4 * 4 + 17 * 4 + 12 + 5 + among_itself))
     place(physics, 0.1, (0, 1, 0, 0), robot=robot)  # on its back, upon the arm
     touched = set()
     for target in swing(60, 5, seed=1):

@@ -9,7 +9,6 @@ import torch
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import plr
-from deimos.sim.env import Step
 
 CPU = torch.device("cpu")
 NUM_ENVS, PERIOD, STEPS = 24, 5, 8
@@ -39,10 +38,9 @@ class Loop:
         self.clock += 1
         crashed = torch.from_numpy(self.rng.random(NUM_ENVS) < 0.05)
         due = torch.from_numpy(self.clock >= PERIOD)
-        zeros, no = torch.zeros(NUM_ENVS), torch.zeros(NUM_ENVS, dtype=torch.bool)
-        step = Step(torch.zeros(NUM_ENVS, 6), zeros, crashed, no, due, no)
-        self.interactions.advance(step)
-        self.interactions.resolve(step, torch.nonzero(due | crashed).squeeze(1))
+        ended = torch.nonzero(due | crashed).squeeze(1)
+        self.interactions.advance(torch.zeros(NUM_ENVS), crashed)
+        self.interactions.resolve(ended, crashed[ended], due[ended])
         for env in torch.nonzero(due | crashed).flatten().tolist():
             if self.open[env]:
                 self.closed.append((env, self.open[env][0], self.now, self.open[env][1]))
@@ -53,7 +51,7 @@ class Loop:
             candidates = self.random(len(rows), self.selector.num_candidates, 2)
             proposal = self.selector.propose(rows, state, goal, candidates, self.random(len(rows), 4))
             self.interactions.open(
-                rows, state, goal, proposal.goal, proposal.score, probe=proposal.probe, note=proposal.note
+                rows, state, goal, proposal.goal, proposal.score, PERIOD, probe=proposal.probe, note=proposal.note
             )
             for i, env in enumerate(rows.tolist()):
                 self.open[env] = (self.now, (proposal.goal[i], int(proposal.note[i]), not proposal.probe[i]))
@@ -102,13 +100,12 @@ def test_an_interaction_longer_than_rollouts_is_summed_over_them():
     selector = plr.Config(capacity=1, fill=1.0, candidates=1).build(spaces, 0)
     interactions = Interactions(1, 1, 1, 10, 20, CPU)
     one, no = torch.zeros(1, 1), torch.zeros(1, dtype=torch.bool)
-    interactions.open(torch.zeros(1, dtype=torch.int64), one, one, one, torch.zeros(1), probe=~no)
+    interactions.open(torch.zeros(1, dtype=torch.int64), one, one, one, torch.zeros(1), horizon=10, probe=~no)
     gains = torch.tensor([1.0, -3.0, 2.0, 0.5, -1.0, 4.0, 0.25, 0.0, 8.0, -2.0])
     for t in range(10):
-        step = Step(torch.zeros(1, 2), torch.zeros(1), no, no, torch.tensor([t == 9]), no)
-        interactions.advance(step)
+        interactions.advance(torch.zeros(1), no)
         if t == 9:
-            interactions.resolve(step, torch.zeros(1, dtype=torch.int64))
+            interactions.resolve(torch.zeros(1, dtype=torch.int64), no, ~no)
         if t % 2:
             row = selector.learn(interactions, SimpleNamespace(num_steps=2, advantage=gains[t - 1 : t + 1].view(2, 1)))
     assert row["plr/value_loss"] == pytest.approx((1 + 2 + 0.5 + 4 + 0.25 + 8) / 10)

@@ -11,10 +11,12 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from deimos.checks import SimulationError
-from deimos.learn.ppo import PPO, PPOConfig, advantages
-from deimos.learn.rollout import Rollout
+from deimos.goals.selectors import uniform
+from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn.adam import Adam
 from deimos.nn.networks import Backprop, flatten_parameters, mlp
+from deimos.nn.returns import advantages
+from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.envs import particle
 
 NUM_ENVS, NUM_STEPS = 50, 24
@@ -71,7 +73,7 @@ def test_advantages_reject_another_shape():
 def test_backprop_is_autograd(activation, rows):
     """The written-out passes give autograd's output and gradients, and add to what is there."""
     torch.manual_seed(0)
-    net = mlp(7, (16, 9), 3, activation)
+    net = mlp(7, (16, 9), 3, activation, torch.default_generator)
     x, delta = torch.randn(rows, 7), torch.randn(rows, 3)
     expected = torch.autograd.grad((net(x) * delta).sum(), list(net.parameters()))
     flatten_parameters(net)
@@ -88,7 +90,7 @@ def test_backprop_is_autograd(activation, rows):
 def test_flat_parameters_keep_the_network():
     """Laying parameters end to end changes no output, aligns each to 64 bytes and gives every module its gradient."""
     torch.manual_seed(0)
-    nets = [mlp(3, (5,), 2, "relu"), mlp(3, (4,), 1, "relu")]
+    nets = [mlp(3, (5,), 2, "relu", torch.default_generator), mlp(3, (4,), 1, "relu", torch.default_generator)]
     x = torch.randn(8, 3)
     before = [net(x) for net in nets]
     flat, slices = flatten_parameters(*nets)
@@ -119,11 +121,11 @@ def test_adam_is_torchs():
     torch.testing.assert_close(ours.data, theirs.data, rtol=1e-5, atol=1e-6)
 
 
-def filled(env, ppo, seed=1, *, truncations=False):
+def filled(ppo, seed=1, *, truncations=False):
     """A rollout of random transitions that the policy might have made."""
     generator = torch.Generator().manual_seed(seed)
-    rollout = Rollout(env, ppo.config.num_steps)
-    for tensor in (rollout.obs, rollout.final_obs, rollout.noise):
+    rollout = ppo.new_rollout()
+    for tensor in (rollout.obs, rollout.noise):
         tensor.normal_(generator=generator)
     for t in range(rollout.num_steps):
         ppo.act(rollout.obs[t], rollout.noise[t], rollout.action[t], rollout.mean[t])
@@ -132,7 +134,14 @@ def filled(env, ppo, seed=1, *, truncations=False):
     if truncations:
         rollout.truncated.bernoulli_(0.05, generator=generator)
         rollout.truncated &= ~rollout.terminated
+        end_in(rollout, torch.randn(rollout.obs[1:].shape, generator=generator))
     return rollout
+
+
+def end_in(rollout, final_obs):
+    """Let the truncated steps end in these observations, shape (num_steps, num_envs, obs_dim)."""
+    rows = [truncated.nonzero().squeeze(1) for truncated in rollout.truncated]
+    rollout.ends = [(t, worlds, final_obs[t, worlds]) for t, worlds in enumerate(rows)]
 
 
 def rsl_rl_like(ppo, rollout):
@@ -166,16 +175,15 @@ def rsl_rl_like(ppo, rollout):
     return learner
 
 
-def small_learner(time_limit=0, **changes):
-    env = particle.Config(time_limit=time_limit).build(NUM_ENVS, torch.device("cpu"), seed=0)
+def small_learner(seed=0, **changes):
     config = PPOConfig(num_steps=NUM_STEPS, hidden=(32, 16), activation="elu", **changes)
-    return env, PPO(config, env, seed=0)
+    return PPO(config, NUM_ENVS, 12, 3, torch.device("cpu"), seed)
 
 
 def test_returns_and_advantages_are_rsl_rls():
     """Returns and normalised advantages agree with rsl_rl's to float32 rounding where nothing is truncated."""
-    env, ppo = small_learner()
-    rollout = filled(env, ppo)
+    ppo = small_learner()
+    rollout = filled(ppo)
     storage = rsl_rl_like(ppo, rollout).storage
     batch, _ = ppo.batch(rollout)
     torch.testing.assert_close(batch.returns, storage.returns.flatten(), rtol=1e-5, atol=1e-5)
@@ -185,21 +193,21 @@ def test_returns_and_advantages_are_rsl_rls():
 
 def test_returns_differ_from_rsl_rls_at_time_limits_only_by_the_value():
     """rsl_rl continues a truncated episode with V of the observation before; given that one, returns agree."""
-    env, ppo = small_learner(time_limit=100)
-    rollout = filled(env, ppo, truncations=True)
+    ppo = small_learner()
+    rollout = filled(ppo, truncations=True)
     storage = rsl_rl_like(ppo, rollout).storage
     assert rollout.truncated.any()
     apart = (ppo.batch(rollout)[0].returns - storage.returns.flatten()).abs().max()
     assert apart > 1e-3
-    rollout.final_obs.copy_(rollout.obs[:-1])
+    end_in(rollout, rollout.obs[:-1])
     torch.testing.assert_close(ppo.batch(rollout)[0].returns, storage.returns.flatten(), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("clip_value", [True, False])
 def test_a_full_update_is_rsl_rls(monkeypatch, clip_value):
     """After 5 x 4 minibatches in the same order, losses, step size and all weights agree to float32 rounding."""
-    env, ppo = small_learner(clip_value=clip_value)
-    rollout = filled(env, ppo)
+    ppo = small_learner(clip_value=clip_value)
+    rollout = filled(ppo)
     learner = rsl_rl_like(ppo, rollout)
     order = torch.randperm(NUM_ENVS * NUM_STEPS, generator=torch.Generator().manual_seed(3))
     monkeypatch.setattr(torch, "randperm", lambda *args, **kwargs: order)
@@ -221,8 +229,8 @@ def test_transitions_of_weight_zero_teach_nothing():
     """What stands in a transition of weight 0 changes no weight of the networks."""
     results = []
     for garbage in (1.0, 50.0):
-        env, ppo = small_learner()
-        rollout = filled(env, ppo)
+        ppo = small_learner()
+        rollout = filled(ppo)
         rollout.weight[:, 7] = 0.0
         rollout.reward[:, 7] = garbage
         order = torch.arange(NUM_ENVS * NUM_STEPS)
@@ -235,9 +243,9 @@ def test_transitions_of_weight_zero_teach_nothing():
 @pytest.mark.parametrize("counting", [0, 1, NUM_ENVS * NUM_STEPS // 4 - 1])  # a minibatch has one more
 def test_too_few_transitions_teach_nothing(counting):
     """Where fewer transitions count than a minibatch has, weights and step size stay, whatever Adam remembers."""
-    env, ppo = small_learner()
-    ppo.update(filled(env, ppo))
-    rollout = filled(env, ppo, seed=2)
+    ppo = small_learner()
+    ppo.update(filled(ppo))
+    rollout = filled(ppo, seed=2)
     rollout.weight.zero_()
     rollout.weight.view(-1)[:counting] = 1.0
     before = copy.deepcopy(ppo.state_dict() | {"generator": None})
@@ -250,22 +258,22 @@ def test_too_few_transitions_teach_nothing(counting):
 
 def test_rows_that_do_not_divide_are_left_out():
     """A rollout that does not split evenly is learnt from without its remainder, on equal minibatches."""
-    env, ppo = small_learner(minibatches=7)
-    metrics = ppo.update(filled(env, ppo))
+    ppo = small_learner(minibatches=7)
+    metrics = ppo.update(filled(ppo))
     assert all(math.isfinite(value) for value in metrics.values())
 
 
 @pytest.mark.parametrize(("kl", "factor"), [(0.021, 1 / 1.5), (0.0049, 1.5), (0.01, 1.0), (0.0, 1.0)])
 def test_the_step_size_follows_the_divergence(kl, factor):
     """Above twice the desired divergence the step shrinks, below half of it grows, and at 0 it stays."""
-    _, ppo = small_learner()
+    ppo = small_learner()
     ppo._adapt_learning_rate(torch.tensor(kl))
     assert ppo.learning_rate.item() == pytest.approx(1e-3 * factor)
 
 
 def test_the_step_size_stays_in_its_range():
     """However often it is adapted, the step size stays in [1e-5, 1e-2]."""
-    _, ppo = small_learner()
+    ppo = small_learner()
     for kl, limit in ((1.0, 1e-5), (1e-6, 1e-2)):
         for _ in range(40):
             ppo._adapt_learning_rate(torch.tensor(kl))
@@ -274,42 +282,87 @@ def test_the_step_size_stays_in_its_range():
 
 def test_weights_depend_on_the_seed_alone():
     """Two learners of one seed start alike whatever torch's global generator has done; another seed differs."""
-    env, first = small_learner()
+    first = small_learner()
     torch.rand(17)
-    second, third = PPO(first.config, env, seed=0), PPO(first.config, env, seed=1)
+    second, third = small_learner(), small_learner(seed=1)
     assert all(torch.equal(a, b) for a, b in zip(first.actor.parameters(), second.actor.parameters(), strict=True))
     assert not torch.equal(first.actor.mean[0].weight, third.actor.mean[0].weight)
 
 
 def test_a_learner_goes_on_from_its_state_bit_for_bit():
     """Saved, loaded into a fresh learner and updated, it has the weights of the one that never stopped."""
-    env, ppo = small_learner()
-    rollout = filled(env, ppo)
+    ppo = small_learner()
+    rollout = filled(ppo)
     ppo.update(rollout)
     state = ppo.state_dict()
     state = {k: v if not isinstance(v, dict) else {n: w.clone() if isinstance(w, torch.Tensor) else w
              for n, w in v.items()} for k, v in state.items()}  # fmt: skip
     ppo.update(rollout)
-    other = PPO(ppo.config, env, seed=9)
+    other = small_learner(seed=9)
     other.load_state_dict(state)
     other.update(rollout)
     assert all(torch.equal(a, b) for a, b in zip(ppo.actor.parameters(), other.actor.parameters(), strict=True))
     assert torch.equal(ppo.learning_rate, other.learning_rate)
 
 
+def test_exploration_belongs_to_seed_world_and_step():
+    """Two shards explore as the whole does, a rollout goes on where the last one ended, and seeds differ."""
+    ppo, noise = small_learner(), torch.empty(2 * NUM_STEPS, NUM_ENVS, 3)
+    ppo.draw_noise(noise, 0)
+    later = torch.empty(NUM_STEPS, NUM_ENVS, 3)
+    ppo.draw_noise(later, NUM_STEPS)
+    assert torch.equal(later, noise[NUM_STEPS:])
+    shard = PPO(ppo.config, 20, 12, 3, torch.device("cpu"), 0)
+    part = torch.empty(2 * NUM_STEPS, 20, 3)
+    shard.draw_noise(part, 0, env_offset=30)
+    assert torch.equal(part, noise[:, 30:])
+    small_learner(seed=1).draw_noise(later, NUM_STEPS)
+    assert not (later == noise[NUM_STEPS:]).any()
+
+
+def test_whoever_truncates_ends_the_episode():
+    """No advantage runs across a reset that an environment without a time limit makes; its last state is valued."""
+    env = particle.Config().build(4, torch.device("cpu"), seed=0)
+    assert env.time_limit == 0
+    ppo = PPO(PPOConfig(num_steps=3, hidden=(8,)), 4, env.obs_dim, 3, env.device, 0)
+    loop, rollout = GoalLoop(env, uniform.Config().build(spaces(env), 0)), ppo.new_rollout()
+    for _ in range(2):  # what the first rollout cut off is forgotten in the second
+        for t in range(3):
+            rollout.obs[t] = env.obs
+            step = env.step(torch.ones(4, 3))
+            step.truncated[2] = t == 1
+            if t == 1:
+                final = step.obs.clone()
+            changes = loop.resolve(step)
+            rollout.record(
+                t, obs=step.obs, reward=step.reward, terminated=step.terminated, truncated=step.truncated,
+                invalid=step.invalid, weight=loop.weight, cut_off=changes.cut_off,
+            )  # fmt: skip
+            loop.renew(step, changes)
+        rollout.obs[3] = env.obs
+    assert rollout.truncated.nonzero().tolist() == [[1, 2]]
+    step, world, obs = rollout.cut_off()
+    assert (step.tolist(), world.tolist()) == ([1], [2])
+    assert torch.equal(obs, final[2:3])
+    assert not torch.equal(obs[0], rollout.obs[2, 2])
+    value = rollout.estimate(ppo.value)
+    scaled = rollout.reward * ppo.config.reward_scale
+    expected = scaled[1, 2] + ppo.config.discount * ppo.value(obs)[0] - value[1, 2]
+    torch.testing.assert_close(rollout.advantage[1, 2], expected, rtol=1e-5, atol=1e-6)
+
+
 def test_somebody_elses_critic_is_the_baseline():
     """With a critic of a selector its values give the advantages, the actor learns and PPO's own critic does not."""
 
-    class Constant:
-        def value(self, obs):
-            return torch.full(obs.shape[:-1], 0.25)
+    def constant(obs):
+        return torch.full(obs.shape[:-1], 0.25)
 
-    env, ppo = small_learner()
-    rollout = filled(env, ppo)
-    batch, _ = ppo.batch(rollout, Constant())
+    ppo = small_learner()
+    rollout = filled(ppo)
+    batch, _ = ppo.batch(rollout, constant)
     assert (batch.value == 0.25).all()
     before = [parameter.clone() for parameter in (*ppo.actor.parameters(), *ppo.critic.parameters())]
-    metrics = ppo.update(rollout, critic=Constant())
+    metrics = ppo.update(rollout, critic=constant)
     same = [torch.equal(a, b) for a, b in zip(before, (*ppo.actor.parameters(), *ppo.critic.parameters()), strict=True)]
     actors = len(list(ppo.actor.parameters()))
     assert not any(same[:actors])
@@ -319,7 +372,7 @@ def test_somebody_elses_critic_is_the_baseline():
 
 def test_a_weight_that_is_not_finite_is_named():
     """The check names the weight."""
-    _, ppo = small_learner()
+    ppo = small_learner()
     ppo.check()
     ppo.critic[0].bias.data[3] = torch.nan
     with pytest.raises(SimulationError, match=r"critic\.0\.bias is not finite"):

@@ -1,16 +1,18 @@
 """Matrix products by the faster library, and scores of candidates by one kernel: neither changes a result."""
 
 import copy
+import sys
 
 import pytest
 import torch
 from torch import nn
 
-from deimos.goals.selector import Whitening
+from deimos.nn import fusion
 from deimos.nn import matmul as products
 from deimos.nn.fused import fuse
+from deimos.nn.fusion import fused_scores
 from deimos.nn.matmul import add_product_, fast_linear, onednn
-from deimos.nn.networks import ManyCandidates, mlp
+from deimos.nn.networks import ManyCandidates, Whitening, mlp
 
 CPU = torch.device("cpu")
 MATMUL = torch.backends.mkldnn.matmul
@@ -76,7 +78,7 @@ def test_inexact_library_is_not_used(monkeypatch):
 def test_fused_scores_are_the_networks(torch_device, outputs):
     """One kernel gives what products give, for more and fewer decisions, other candidates, weights and whitening."""
     torch.manual_seed(0)
-    net = mlp(9, (64,), outputs, "relu").to(torch_device)
+    net = mlp(9, (64,), outputs, "relu", torch.default_generator).to(torch_device)
     mean, factor = torch.randn(3, device=torch_device), torch.ones(3, device=torch_device)
     whitening = Whitening(mean, factor, bound=1.0) if outputs > 1 else None
     fused, by_products = fuse(net, 3, whitening=whitening), ManyCandidates(net, 3)
@@ -97,10 +99,47 @@ def test_fused_scores_are_the_networks(torch_device, outputs):
     assert all(torch.equal(scores, copied) for scores, copied in kept), "a later call overwrote earlier scores"
 
 
+@pytest.mark.parametrize("missing", ["none", "operator", "switch"])
+def test_private_operators_may_be_missing(monkeypatch, missing):
+    """Where PyTorch has no operator of oneDNN, another one, or no switch of precision, its plain products do it."""
+    if missing == "operator":
+        monkeypatch.setattr(torch.ops.mkldnn, "_linear_pointwise", _refuse)
+    if missing == "switch":
+        monkeypatch.setattr(products, "_MATMUL", None)
+    products._onednn_linear.cache_clear()
+    products._exact_through_onednn.cache_clear()
+    torch.manual_seed(0)
+    x, weight, total = torch.randn(6000, 64), torch.randn(64, 64), torch.zeros(64, 64)
+    try:
+        assert (products._onednn_linear() is None) == (missing == "operator")
+        found = fast_linear(x, weight, None, nn.ReLU())
+        add_product_(total, found, x)
+    finally:
+        products._onednn_linear.cache_clear()
+        products._exact_through_onednn.cache_clear()
+    expected = nn.functional.linear(x.double(), weight.double()).relu()
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(total.double(), expected.t() @ x.double(), rtol=1e-3, atol=1e-2)
+
+
+def _refuse(*arguments):
+    raise RuntimeError("another signature")
+
+
+def test_fused_scores_need_warp(monkeypatch):
+    """Without Warp no network has a kernel, and nothing is imported to find that out."""
+    net = mlp(9, (64,), 1, "relu", torch.default_generator)
+    assert fused_scores(net, 3) is not None
+    monkeypatch.setattr(fusion, "find_spec", lambda name: None)
+    monkeypatch.delitem(sys.modules, "deimos.nn.fused")
+    assert fused_scores(net, 3) is None
+    assert "deimos.nn.fused" not in sys.modules
+
+
 def test_fused_scores_take_any_view():
     """Candidates that do not lie end to end are read as what they are."""
     torch.manual_seed(0)
-    net = mlp(9, (64,), 1, "relu")
+    net = mlp(9, (64,), 1, "relu", torch.default_generator)
     candidates = torch.randn(100, 20, 3).transpose(0, 1)
     context = torch.randn(20, 6)
     expected = ManyCandidates(net, 3)(context, candidates).squeeze(2)
@@ -109,7 +148,10 @@ def test_fused_scores_take_any_view():
 
 def test_fused_scores_outlive_an_inference():
     """What was first asked for in inference mode, as rsl_rl's rollouts are, is asked for outside it later."""
-    fused, arguments = fuse(mlp(9, (64,), 1, "relu"), 3), (torch.randn(20, 6), torch.randn(20, 30, 3))
+    fused, arguments = (
+        fuse(mlp(9, (64,), 1, "relu", torch.default_generator), 3),
+        (torch.randn(20, 6), torch.randn(20, 30, 3)),
+    )
     with torch.inference_mode():
         first = fused(*arguments)
     assert torch.equal(fused(*arguments), first)
@@ -117,7 +159,7 @@ def test_fused_scores_outlive_an_inference():
 
 def test_fused_scores_check_their_shapes():
     """No decision has no score; contexts and candidates that do not fit raise ``ValueError`` before any launch."""
-    fused = fuse(mlp(9, (64,), 1, "relu"), 3)
+    fused = fuse(mlp(9, (64,), 1, "relu", torch.default_generator), 3)
     assert fused(torch.zeros(0, 6), torch.zeros(0, 100, 3)).shape == (0, 100)
     for context, candidates in (((4, 6), (2, 100, 3)), ((4, 5), (4, 100, 3)), ((4, 6), (4, 100, 2))):
         with pytest.raises(ValueError, match=r"must have the shapes \(B, 6\) and \(B, N, 3\)"):

@@ -1,8 +1,6 @@
 """Random network distillation over goals: what it is surprised by, and by what it is whitened."""
 
-import dataclasses
 import math
-import sys
 
 import pytest
 import torch
@@ -10,7 +8,7 @@ import torch
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import rnd
-from deimos.nn.fused import fuse
+from deimos.nn import fusion
 
 CPU = torch.device("cpu")
 NUM_ENVS, CANDIDATES = 200, 20
@@ -43,16 +41,16 @@ class World:
         proposal = self.selector.propose(*arguments)
         chosen = proposal.goal if choose is None else choose(arguments[3])
         self.interactions.now += 1
-        self.interactions.open(ROWS, arguments[1], arguments[2], chosen, proposal.score)
+        self.interactions.open(ROWS, arguments[1], arguments[2], chosen, proposal.score, horizon=5)
         return self.selector.learn(self.interactions, None)
 
 
-@pytest.mark.parametrize("kernel", [None, fuse])
+@pytest.mark.parametrize("kernel", [False, True])
 def test_scores_are_the_predictors_errors(monkeypatch, kernel):
     """A surprise is the mean squared error between the two networks on whitened (state, goal, candidate)."""
-    monkeypatch.setattr(sys.modules[__name__], "SPACES", dataclasses.replace(SPACES, fuse=kernel))
+    monkeypatch.setattr(fusion, "kernels_run_on", lambda device: kernel)
     world = World()
-    assert (world.selector._fused is None) == (kernel is None)
+    assert (world.selector._fused is not None) == kernel
     world.lesson()
     selector = world.selector
     _, state, goal, candidates, _ = world.decision()
@@ -154,11 +152,11 @@ def test_goals_that_somebody_else_chose_do_not_whiten():
     world = World()
     _, state, goal, candidates, draws = world.decision()
     world.interactions.now = 1
-    world.interactions.open(ROWS, state, goal, candidates[:, 0], draws[:, 0])
+    world.interactions.open(ROWS, state, goal, candidates[:, 0], draws[:, 0], horizon=5)
     assert math.isnan(world.selector.learn(world.interactions, None)["rnd/loss"])
     assert not world.selector.fitted
     world.interactions.now = 2
-    world.interactions.open(ROWS, state, goal, candidates[:, 0], draws[:, 0])
+    world.interactions.open(ROWS, state, goal, candidates[:, 0], draws[:, 0], horizon=5)
     world.selector.propose(ROWS[:50], state[:50], goal[:50], candidates[:50], draws[:50])
     assert math.isfinite(world.selector.learn(world.interactions, None)["rnd/loss"])
     assert world.selector._moments[0, 0] == 50

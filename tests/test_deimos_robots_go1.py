@@ -8,6 +8,8 @@ import warp as wp
 from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
+from deimos import plugins
+from deimos.sim.legged import robots
 from deimos.sim.legged.engines.mujoco_warp import Physics, PhysicsConfig
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1
 
@@ -184,15 +186,32 @@ def test_actuators_are_a_limited_pd_controller(robot, model):
     assert np.abs(data.actuator_force).max() == pytest.approx(35.55)
 
 
+@pytest.mark.parametrize("name", plugins.names(robots))
+def test_a_robot_is_what_its_data_say(name):
+    """Of every robot: names, order, ranges, gains and limits of the joints in the data are those of the model."""
+    robot = plugins.load(robots, name).build(stiffness=25.0, damping=0.7, action_scale=0.2)
+    model = robot.spec.compile()
+    assert [model.joint(i).name for i in range(1, model.njnt)] == [joint.name for joint in robot.joints]
+    assert [model.actuator(i).name for i in range(model.nu)] == [joint.name for joint in robot.joints]
+    for i, joint in enumerate(robot.joints):
+        assert tuple(model.jnt_range[1 + i]) == joint.range
+        assert model.actuator_gainprm[i, 0] == joint.stiffness == -model.actuator_biasprm[i, 1]
+        assert -model.actuator_biasprm[i, 2] == joint.damping
+        assert model.actuator_forcerange[i].tolist() == [-joint.max_torque, joint.max_torque]
+        assert joint.range[0] < joint.pose < joint.range[1]
+    legs = [(joint.stiffness, joint.damping, joint.action_scale) for joint in robot.joints[:12]]
+    assert legs == [(25.0, 0.7, 0.2)] * 12
+
+
 def test_collision_geoms_are_spheres_and_capsules(robot, model):
-    """What collides are 15 spheres and capsules, each of them watched, and what is for the eye weighs nothing."""
+    """What collides are 19 spheres and capsules, each of them watched, and what is visual weighs nothing."""
     sphere_or_capsule = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
     hard = [i for i in range(model.ngeom) if model.geom_contype[i]]
     assert {int(model.geom_type[i]) for i in hard} <= sphere_or_capsule
     assert {model.geom_group[i] for i in hard} == {COLLISION_GROUP}
     assert {model.geom_group[i] for i in range(model.ngeom) if i not in hard} == {VISUAL_GROUP}
     assert sorted(model.geom(i).name for i in hard) == sorted(name for part in robot.parts for name in part)
-    assert len(hard) == 15
+    assert len(hard) == 19
     assert len(robot.parts) == 13
 
 

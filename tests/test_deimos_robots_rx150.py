@@ -9,7 +9,9 @@ from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
 from deimos.sim.legged.engines.mujoco_warp import Physics, PhysicsConfig
-from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1, rx150
+from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1
+from deimos.sim.legged.robots import go1_rx150 as rx150
+from deimos.sim.legged.robots._primitives import hold_base
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +66,10 @@ def test_mass_and_tree(robot, model):
     assert [model.joint(i).name for i in range(1, 18)] == joints
     assert [model.actuator(i).name for i in range(17)] == joints
     assert model.actuator_trnid[:, 0].tolist() == list(range(1, 18))
-    assert len(robot.pose) == len(robot.action_scale) == 17
+    assert len(robot.pose) == len(robot.joints) == 17
     bare = go1.build()
     assert robot.pose[:12] == bare.pose
-    assert robot.action_scale[:12] == bare.action_scale
+    assert robot.joints[:12] == bare.joints
 
 
 # rx150.urdf.xacro of Interbotix, letter by letter: mass [kg], xyz [m], (ixx, iyy, izz, ixy, ixz, iyz) [kg m^2] in axes
@@ -238,7 +240,7 @@ def test_guards_fill_the_trunk(model):
 
 def test_arm_stays_out_of_the_trunk():
     """Driven into the trunk with all its torque, the arm rests on it within 2 mm, and never gets halfway through."""
-    robot = rx150.mount(go1.build(), hold_trunk=True)
+    robot = hold_base(rx150.build())
     model = robot.spec.compile()
     model.opt.timestep = 0.005
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -299,7 +301,7 @@ def test_no_geom_of_the_arm_covers_too_many_prisms(device):
 
 def test_trunk_is_held(device):
     """With the arm swinging between its limits for 2 s, a held trunk that was thrown stays where it was put."""
-    robot = rx150.mount(go1.build(), hold_trunk=True)
+    robot = hold_base(rx150.build())
     physics = Physics(robot, None, 2, torch.device(device), PhysicsConfig())
     assert physics.qpos.shape[1] == 24
     assert physics.qvel.shape[1] == 23
@@ -312,7 +314,7 @@ def test_trunk_is_held(device):
     physics.qpos.assign(start)
     physics.qvel.assign(throw)
     data = physics.to_mujoco(0)
-    low, high = physics.joint_range.T
+    low, high = np.array([joint.range for joint in robot.joints]).T
     for step in range(100):
         if step % 20 == 0:
             target = np.where(rng.random(17) < 0.5, low, high)

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import method
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces
 from deimos.goals.selectors import director, mix, plr, schedule, uniform
 from deimos.learn.ppo import PPOConfig
@@ -37,7 +37,7 @@ class Recorder(GoalSelector):
 
 @pytest.fixture
 def recorders(monkeypatch):
-    """Two methods, ``one`` and ``two``, that are recorders, and the recorders that were built."""
+    """Methods ``one``, ``two`` and ``noted`` that are recorders, and the recorders that were built."""
     built = {}
 
     class Config(SelectorConfig):
@@ -48,11 +48,10 @@ def recorders(monkeypatch):
             built[self.name] = Recorder(*self.arguments, **self.proposal)
             return built[self.name]
 
-    monkeypatch.setitem(METHODS, "one", Config("one", 0, 1.0))
-    monkeypatch.setitem(METHODS, "two", Config("two", 2, 2.0))
-    monkeypatch.setitem(
-        METHODS, "noted", Config("noted", 1, 3.0, note=torch.full((4000,), 7), probe=torch.zeros(4000).bool())
-    )
+    noted = {"note": torch.full((4000,), 7), "probe": torch.zeros(4000).bool()}
+    known = {"one": Config("one", 0, 1.0), "two": Config("two", 2, 2.0), "noted": Config("noted", 1, 3.0, **noted)}
+    for module in (mix, schedule):
+        monkeypatch.setattr(module, "method", lambda name: known[name] if name in known else method(name))
     return built
 
 
@@ -156,8 +155,8 @@ def test_a_mix_has_its_share_of_uniform_goals(recorders, share):
 
 def test_the_uniform_goals_of_a_mix_are_not_replayed_ones(recorders):
     """A learner that may learn from its method's goals alone learns from no uniform one."""
-    METHODS["noted"].proposal["learn"] = torch.ones(4000, dtype=torch.bool)
     selector = mix.Config(base="noted", share=0.5).build(SPACES, 0)
+    selector.parts[0].proposal["learn"] = torch.ones(4000, dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
     arguments = [torch.randn(4000, *shape, generator=generator) for shape in ((9,), (3,), (5, 3))]
     proposal = selector.propose(torch.arange(4000), *arguments, torch.rand(4000, 4, generator=generator))
@@ -173,7 +172,7 @@ def test_a_mix_is_its_method_in_all_else():
     assert mix.Config(base="cl").build(SPACES, 0).first_goals_scaled
     assert mix.Config(base="cl").build(SPACES, 0).goal_range().tolist() == [0.25] * 3
     critic = mix.Config(base="vds").build(SPACES, 0)
-    assert critic.critic() is critic.parts[0]
+    assert critic.critic() == critic.parts[0].value
     alone, mixed = (trainer(config) for config in (director.Config(percentile=75), mix.Config(base="p75", share=0.0)))
     for _ in range(4):
         assert repr(alone.iterate()) == repr(mixed.iterate())
@@ -186,7 +185,7 @@ def test_the_baseline_stays_with_the_first():
         run.iterate()
     selector = run.loop.selector
     assert selector.switched
-    assert selector.critic() is selector.parts[0]
+    assert selector.critic() == selector.parts[0].value
     before = selector.parts[0].stack.parameters.detach().clone()
     assert math.isfinite(run.iterate()["vds/loss"])
     assert not torch.equal(before, selector.parts[0].stack.parameters)

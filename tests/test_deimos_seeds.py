@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from deimos import GoalDirector
+from deimos.learn.ppo import PPOConfig
 from deimos.nn.networks import ManyCandidates, mlp
-from deimos.nn.seeds import derive, generator, restore, weights_from
+from deimos.nn.seeds import derive, generator, restore
+from deimos.run.training import TrainConfig, Trainer
+from deimos.sim.envs import particle
 
 USES = ("policy weights", "policy noise", "fear weights", "fear minibatches", "vds critic 0", "vds critic 1", "")
 
@@ -32,20 +36,50 @@ def test_streams_are_independent():
 
 
 def test_weights_leave_the_global_stream_alone():
-    """Networks built inside depend on seed and use alone, and torch's own stream goes on as if nothing had been."""
+    """Networks depend on their generator alone, and torch's own stream goes on as if nothing had been."""
 
     def weights(seed, use):
-        with weights_from(seed, use):
-            return mlp(4, (8,), 1, "relu")[0].weight.detach().clone()
+        return mlp(4, (8,), 1, "relu", generator(seed, use))[0].weight.detach().clone()
 
-    torch.manual_seed(0)
-    expected = torch.rand(3)
-    torch.manual_seed(0)
+    before = torch.get_rng_state()
     first = weights(1, "a")
-    assert torch.equal(torch.rand(3), expected)
     assert torch.equal(weights(1, "a"), first)
     assert not torch.equal(weights(1, "b"), first)
     assert not torch.equal(weights(2, "a"), first)
+    assert not any(parameter.any() for parameter in mlp(4, (8,), 1, "relu").parameters())  # they are to be loaded
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("sizes", [(4, (8,), 1), (12, (64, 64), 3), (1, (1,), 1)])
+def test_weights_are_those_that_pytorch_would_draw(sizes):
+    """A generator in the state of torch's own gives the weights and biases of ``nn.Linear``, bit for bit."""
+    inputs, hidden, outputs = sizes
+    found = mlp(inputs, hidden, outputs, "relu", torch.Generator().manual_seed(7))
+    torch.manual_seed(7)
+    units = [inputs, *hidden, outputs]
+    expected = [torch.nn.Linear(*pair) for pair in itertools.pairwise(units)]
+    for layer, own in zip(expected, found[::2], strict=True):
+        assert torch.equal(layer.weight, own.weight)
+        assert torch.equal(layer.bias, own.bias)
+
+
+def test_a_run_leaves_all_global_streams_alone():
+    """Building, training and saving under selectors with networks moves neither torch's nor NumPy's global stream."""
+    before = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+    for name in ("p75", "rnd", "vds"):
+        config = TrainConfig(
+            env=particle.Config(goal_period=4), method=name, ppo=PPOConfig(hidden=(8,)), num_envs=16, evaluation=False
+        )
+        trainer = Trainer(config, torch.device("cpu"))
+        for _ in range(2):
+            trainer.iterate()
+        trainer.load_state_dict(trainer.state_dict())
+    director = GoalDirector("p75", 2)
+    no = torch.zeros(4, dtype=torch.bool)
+    for _ in range(6):
+        director.step(torch.zeros(4, 3), torch.zeros(4, 2), no, no, torch.zeros(4, 9, 2))
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert str(np.random.get_state()) == str(before[1])  # noqa: NPY002
 
 
 def test_a_stream_goes_on_from_its_state():
@@ -76,7 +110,7 @@ def test_a_stream_of_another_kind_of_device_goes_on_as_one_of_its_own():
 def test_candidates_are_evaluated_as_the_network_would(activation, outputs):
     """Products shared by all candidates of a context change nothing but rounding, whatever the workspace."""
     torch.manual_seed(0)
-    net = mlp(9, (64, 32), outputs, activation)
+    net = mlp(9, (64, 32), outputs, activation, torch.default_generator)
     context, candidates = torch.randn(300, 6), torch.randn(300, 50, 3)
     inputs = torch.cat([context.unsqueeze(1).expand(-1, 50, -1), candidates], dim=2)
     with torch.no_grad():

@@ -21,13 +21,14 @@ from deimos.goals.selector import Spaces
 from deimos.goals.selectors import boltzmann, cl, director, grid, learnability, mix, plr, rnd, schedule, uniform, vds
 from deimos.learn.ppo import PPOConfig
 from deimos.learn.rollout import Rollout
+from deimos.nn import fusion
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.training import TrainConfig, Trainer
 from deimos.sim import envs
 
 CPU = torch.device("cpu")
 SPACES = Spaces(num_envs=40, state_dim=9, goal_dim=3, goal_period=5, device=CPU, total_steps=96)
-ALL = {name: plugins.load(selectors, name).Config() for name in plugins.names(selectors)} | METHODS
+ALL = {name: method(name) for name in [*plugins.names(selectors), *METHODS]}
 
 # Settings under which a few worlds of an environment crash often within a few steps; one that is not listed is
 # taken as it is.
@@ -109,7 +110,7 @@ def fitted(config, seed=0, spaces=SPACES):
     interactions = Interactions(400, 9, 3, 5, 10, CPU)
     rows, goal = torch.arange(400), torch.rand(400, 3, generator=generator) * 2 - 1
     state = torch.randn(400, 9, generator=generator)
-    interactions.open(rows, state, goal.flip(1), goal, torch.full((400,), torch.nan))
+    interactions.open(rows, state, goal.flip(1), goal, torch.full((400,), torch.nan), horizon=5)
     interactions._ring[:, 0], interactions._marks[:, 0, 0] = interactions._pending, goal[:, 0] > 0.5
     interactions._marks[:, 0, 2] = interactions.now = 5
     interactions.active.fill_(False)
@@ -141,14 +142,15 @@ def test_the_batch_does_not_matter(env_name, name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_a_kernel_chooses_what_products_choose(env_name, name):
+def test_a_kernel_chooses_what_products_choose(monkeypatch, env_name, name):
     """Where worlds have kernels, a trained selector proposes the goals and scores that it proposes by torch alone."""
     run = trained(env_name, name)[0]
     *_, (learnt, arguments) = fresh_and_trained(env_name, name)
     own = spaces(run.env, 96)
     proposals = []
-    for served in (own, dataclasses.replace(own, fuse=None)):
-        selector = small(ALL[name]).build(served, 0)
+    for kernels in (True, False):
+        monkeypatch.setattr(fusion, "kernels_run_on", lambda device, kernels=kernels: kernels)
+        selector = small(ALL[name]).build(own, 0)
         selector.load_state_dict(copy.deepcopy(learnt.state_dict()))
         proposals.append(selector.propose(*arguments))
     fused, bare = proposals
@@ -386,7 +388,7 @@ def test_predictions_are_judged_once_and_before_they_are_learnt_from(monkeypatch
     assert len(recent) > 50
     assert row["calibration/brier"] == pytest.approx((before - recent.crashed.float()).square().mean().item(), rel=1e-5)
     assert row["fear/resolved"] == (window.resolved > 144).sum()
-    assert row["fear/crash_share"] == pytest.approx(window.where(window.resolved > 144).crashed.float().mean().item())
+    assert row["fear/crash_rate"] == pytest.approx(window.where(window.resolved > 144).crashed.float().mean().item())
     assert selector.calibration.prior == pytest.approx(math.log(selector.fear.share / (1 - selector.fear.share)))
 
 
@@ -431,7 +433,7 @@ def test_predictions_are_judged_once_and_before_they_are_learnt_from(monkeypatch
         (plr.Config, "capacity", 2**24, r"capacity must be below 2\^24, got 16777216"),
         (schedule.Config, "at", 1.0, r"at must be in \(0, 1\), or the schedule never switches; got 1.0"),
         (schedule.Config, "at", 0.0, r"at must be in \(0, 1\), or the schedule never switches; got 0.0"),
-        (schedule.Config, "second", "p33", "no method 'p33'"),
+        (schedule.Config, "second", "p333", "no method 'p333'"),
         (mix.Config, "share", -0.1, r"share must be in \[0, 1\], got -0.1"),
         (mix.Config, "base", "best", "no method 'best'"),
     ],
@@ -445,9 +447,23 @@ def test_config_rejects(config, field, value, message):
 
 def test_an_unknown_method_lists_the_known_ones():
     """The message lists every method."""
-    with pytest.raises(ValueError, match="no method 'p33'; there are: uniform, coop, p10") as caught:
-        method("p33")
-    assert all(name in str(caught.value) for name in METHODS)
+    for name in ("p101", "p1e1", "p07", "p-1", "p", "nope", ""):
+        with pytest.raises(ValueError, match=f"no method '{name}'; there are: uniform, coop, p10") as caught:
+            method(name)
+        assert all(known in str(caught.value) for known in [*METHODS, "pNN", "boltzmann", "schedule"])
+
+
+@pytest.mark.parametrize(("name", "percentile"), [("p0", 0), ("p33", 33), ("p12.5", 12.5), ("p100", 100)])
+def test_every_percentile_is_a_method(name, percentile):
+    """A p and a percentile in [0, 100] is the Director at that percentile; the table stays what it is."""
+    assert method(name) == director.Config(percentile=percentile)
+    assert name not in METHODS
+
+
+def test_every_selector_is_a_method():
+    """A selector's own name is a method with its defaults, also where another package brings it."""
+    for name in plugins.names(selectors):
+        assert method(name) == plugins.load(selectors, name).Config()
 
 
 def test_the_thesis_has_twelve_methods():
@@ -471,12 +487,16 @@ def test_it_chooses_goals_for_robots(robots, name):
     selector = small(ALL[name]).build(spaces(robots, total_steps=96), 0)
     loop = GoalLoop(robots, selector)
     loop.start()
-    rollout = Rollout(robots, 12)
+    rollout = Rollout(12, robots.num_envs, robots.obs_dim, robots.action_dim, CPU)
     for t in range(rollout.num_steps):
         rollout.obs[t] = robots.obs
         step = robots.step(torch.zeros(robots.num_envs, robots.action_dim))
-        rollout.record(t, step, loop.weight)
-        loop.advance(step)
+        changes = loop.resolve(step)
+        rollout.record(
+            t, obs=step.obs, reward=step.reward, terminated=step.terminated, truncated=step.truncated,
+            invalid=step.invalid, weight=loop.weight, cut_off=changes.cut_off,
+        )  # fmt: skip
+        loop.renew(step, changes)
     rollout.obs[-1] = robots.obs
     row = selector.learn(loop.interactions, rollout)
     assert all(isinstance(value, float) for value in row.values())

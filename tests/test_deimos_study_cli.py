@@ -1,12 +1,14 @@
 """The command line of a study: what it understands, and what it refuses in one line."""
 
+from pathlib import Path
+
 import pytest
 
 from deimos.run.folder import RunError
 from deimos.study import cli, plan
-from deimos.study.folder import identity
-from deimos.study.presets import PRESETS
-from deimos.study.results import results
+from deimos.study.results import RESULT_COLUMNS, Results, identity
+
+SMALL = Path(__file__).parent.parent / "examples" / "study.toml"
 
 
 @pytest.mark.parametrize(
@@ -28,8 +30,7 @@ def test_other_seeds_are_refused(text):
     ("options", "message"),
     [
         ({"workers": 0}, "workers must be at least 1, got 0"),
-        ({"preset": "small", "file": "x.toml"}, "preset and file exclude each other"),
-        ({"seeds": "3", "methods": ["p25"]}, "seeds, methods change a preset or a file; give one of them too"),
+        ({"seeds": "3", "methods": ["p25"]}, "seeds, methods change a file; give one too"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(tmp_path, options, message):
@@ -45,15 +46,15 @@ def test_merge_needs_a_source(tmp_path):
 
 
 RUN_ERRORS = {
-    "no study": ({}, "study holds no study; begin one with --preset or --file"),
-    "unknown preset": ({"preset": "huge"}, "There is no preset 'huge'; there are: absolute"),
-    "unknown method": ({"preset": "small", "methods": ["p33"]}, "There is no method 'p33'"),
-    "doubled seed": ({"preset": "small", "seeds": "0,0"}, "Every seed must be given once; doubled: 0"),
+    "no study": ({}, "study holds no study; begin one with --file"),
+    "missing file": ({"file": Path("huge.toml")}, r"huge\.toml is not a study's TOML file .*No such file"),
+    "unknown method": ({"file": SMALL, "methods": ["q33"]}, "There is no method 'q33'"),
+    "doubled seed": ({"file": SMALL, "seeds": "0,0"}, "Every seed must be given once; doubled: 0"),
     "foreign environment": (
-        {"preset": "small", "environments": ["quad"]},
+        {"file": SMALL, "environments": ["quad"]},
         "This study has no environment quad; it has: directional",
     ),
-    "bad budget": ({"preset": "small", "env_steps": 0}, "env_steps must be at least 1, got 0"),
+    "bad budget": ({"file": SMALL, "env_steps": 0}, "env_steps must be at least 1, got 0"),
 }
 
 
@@ -70,7 +71,7 @@ def test_results_of_another_schema_stop_the_run(tmp_path):
     """A folder whose results are of another schema is refused before cells are added to it."""
     (tmp_path / "results.csv").write_text("method,seed\n")
     with pytest.raises(RunError, match="another schema; missing: environment, hash"):
-        cli.run(cli.RunOptions(folder=tmp_path, preset="small"))
+        cli.run(cli.RunOptions(folder=tmp_path, file=SMALL))
     assert not (tmp_path / "cells").exists()
 
 
@@ -83,39 +84,26 @@ def test_results_of_another_schema_stop_the_run(tmp_path):
 )
 def test_cells_that_do_not_compare_with_the_results_stop_the_run(tmp_path, change, message):
     """A study of another setting, or of another selector of the same name, is refused before its cells are made."""
-    (cell,) = plan.expand(PRESETS["small"], seeds=[7], methods=["p25"])
-    table, values = results(tmp_path), {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
-    table.append([{name: values[kind] for name, kind in table.columns.items()} | identity(cell) | change])
+    (cell,) = plan.expand(plan.read(SMALL), seeds=[7], methods=["p25"])
+    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
+    row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | identity(cell) | change
+    Results([row]).write(tmp_path)
     with pytest.raises(RunError, match=message):
-        cli.run(cli.RunOptions(folder=tmp_path, preset="small", methods=["p25"]))
+        cli.run(cli.RunOptions(folder=tmp_path, file=SMALL, methods=["p25"]))
     assert not (tmp_path / "cells").exists()
 
 
-@pytest.mark.parametrize("command", [cli.show, cli.report])
-def test_empty_folder_is_refused(tmp_path, command):
-    """There is nothing to show or report in an empty folder, and the line says so."""
-    options = cli.ShowOptions if command is cli.show else cli.ReportOptions
+@pytest.mark.parametrize("name", ["show", "export", "report"])
+def test_empty_folder_is_refused(tmp_path, name):
+    """There is nothing to show, export or report in an empty folder, and the line says so."""
+    options, command = cli.COMMANDS[name]
     with pytest.raises(RunError, match="holds no "):
         command(options(folder=tmp_path))
 
 
-def test_presets_are_listed(capsys, monkeypatch):
-    """Every preset is named with its methods."""
-    monkeypatch.setenv("COLUMNS", "200")
-    cli.presets(cli.PresetsOptions())
-    out = capsys.readouterr().out
-    assert all(name in out for name in PRESETS)
-
-
-def test_coverage_is_a_table(capsys, monkeypatch):
-    """The simulation of coverages prints every kind of interval."""
-    monkeypatch.setenv("COLUMNS", "120")
-    cli.coverage(cli.CoverageOptions(populations=100, resamples=1000))
-    out = capsys.readouterr().out
-    assert all(name in out for name in ("IQM", "median", "BCa", "bootstrap-t", "ratio of IQRs", "lognormal"))
-
-
-def test_every_command_has_its_options():
-    """The usage names exactly the commands that there are."""
-    for name in cli.COMMANDS:
-        assert f"\n  {name} " in cli.USAGE
+def test_every_command_explains_itself():
+    """Every command has options and a function, both with a sentence that says what it does."""
+    assert list(cli.COMMANDS) == ["run", "show", "merge", "export", "report"]
+    for options, command in cli.COMMANDS.values():
+        assert options.__doc__.strip().endswith(".")
+        assert command.__doc__

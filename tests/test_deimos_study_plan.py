@@ -11,7 +11,6 @@ from deimos.run.folder import RunError
 from deimos.run.presets import preset as training_preset
 from deimos.run.training import TrainConfig
 from deimos.study import plan
-from deimos.study.presets import LEGGED_METHODS, PARTICLE_METHODS, PRESETS
 
 TOML = """
 seeds = [3, 5]
@@ -63,36 +62,27 @@ def test_choices_come_before_the_file(tmp_path):
     assert cells[0].config.env_steps == 77
 
 
-def test_file_extends_a_preset(tmp_path):
-    """What a file does not say comes from the preset that it names."""
-    cells = plan.expand(described(tmp_path, 'preset = "directional"\nseeds = 1\n'))
-    assert [cell.config.method for cell in cells] == PRESETS["directional"]["methods"]
+def test_file_extends_another(tmp_path):
+    """What a file does not say comes from the one that it names as its base, and that one's base."""
+    (tmp_path / "first.toml").write_text(TOML)
+    (tmp_path / "second.toml").write_text('base = "first.toml"\nmethods = ["rnd"]\n')
+    cells = plan.expand(described(tmp_path, 'base = "second.toml"\nseeds = 1\n'))
+    found = [(cell.environment, cell.config.method, cell.config.seed) for cell in cells]
+    assert found == [("near", "rnd", 0), ("far", "coop", 0)]
 
 
-@pytest.mark.parametrize("name", [name for name in PRESETS if "quad" not in name])
-def test_presets_of_particle_gym_expand(name):
-    """Every preset of Particle Gym is a valid grid of different cells."""
-    cells = plan.expand(PRESETS[name], seeds=[0, 1])
-    assert len({cell.digest for cell in cells}) == len({cell.name for cell in cells}) == len(cells)
-    expected = sum(len(each.get("methods", PRESETS[name]["methods"])) for each in PRESETS[name]["environment"])
-    assert len(cells) == 2 * expected
-
-
-def test_presets_are_the_thesis():
-    """Particle Gym has ten methods, ten seeds and 2000 or 5000 steps; the legged ones twelve, thirty and two T."""
-    cells = plan.expand(PRESETS["particle"], seeds=[0])
-    steps = {cell.environment: cell.config.env_steps for cell in cells}
-    assert steps == {"directional": 2000, "relative": 2000, "absolute": 5000}
-    assert {cell.config.num_envs for cell in cells} == {2000}
-    assert PRESETS["particle"]["seeds"] == 10
-    assert (len(PARTICLE_METHODS), len(LEGGED_METHODS)) == (10, 12)
-    for name in ("quad", "quad_arm"):
-        assert (PRESETS[name]["seeds"], PRESETS[name]["environment"][0]["goal_periods"]) == (30, [100, 500])
+def test_any_percentile_can_be_asked_for(tmp_path):
+    """Whatever ``method`` knows by name is a method of a study."""
+    names = ["p25", "vds+p75", "learnability"]
+    text = TOML.replace('"uniform", "p25"', ", ".join(f'"{name}"' for name in names))
+    cells = plan.expand(described(tmp_path, text), seeds=[0], environments=["near"])
+    assert [cell.config.method for cell in cells] == names
 
 
 def test_environment_takes_a_training_preset(tmp_path):
     """An environment may name a preset of the training; what the study says itself comes before it."""
-    (cell,) = plan.expand(PRESETS["quad"], seeds=[2], methods=["p25"])
+    flat = '[[environment]]\nname = "quad"\npreset = "quad-thesis"\n'
+    (cell,) = plan.expand(described(tmp_path, flat), seeds=[2], methods=["p25"])
     base = training_preset("quad-thesis")
     assert cell.config == dataclasses.replace(base, method="p25", seed=2, threads=1)
     toml = """
@@ -143,7 +133,7 @@ def test_digests_know_what_a_method_stands_for(name, monkeypatch):
     """Another configuration behind a method's name is another selector and cell, also where a schedule names it."""
     cell = plan.Cell(environment="x", config=TrainConfig(method=name, threads=1), goal_periods=(100,))
     before = cell.selector, cell.digest, cell.setting
-    monkeypatch.setitem(METHODS, "p75", dataclasses.replace(METHODS["p75"], percentile=74))
+    monkeypatch.setitem(METHODS, "p75", ("director", {"percentile": 74}))
     cell = dataclasses.replace(cell)
     assert [new == old for new, old in zip((cell.selector, cell.digest, cell.setting), before, strict=True)] == [
         False, False, True,
@@ -162,7 +152,7 @@ def test_cell_survives_its_file(tmp_path):
 
 ERRORS = {
     # what is said in the file, and the one line that refuses it
-    TOML.replace('"uniform", "p25"', '"uniform", "p33"'): "There is no method 'p33'; there are: uniform, coop",
+    TOML.replace('"uniform", "p25"', '"uniform", "q33"'): "There is no method 'q33'; there are: uniform, coop",
     TOML.replace('"uniform", "p25"', '"uniform", "uniform"'): "Every method must be given once; doubled: uniform",
     TOML.replace("[3, 5]", "[3, 3]"): "Every seed must be given once; doubled: 3",
     TOML.replace("[3, 5]", "0"): "seeds must be a number of seeds or a list of them, got 0",
@@ -179,10 +169,12 @@ ERRORS = {
     TOML.replace("num_envs = 64", "num_envs = 0"): "num_envs must be at least 1, got 0",
     TOML.replace("[50, 100]", "[50, 5000]"): "eval.steps must be at least 2 T = 10000, got 2000",
     TOML.replace("[50, 100]", "[50, 50]"): r"goal_periods must be one or more different numbers, got \(50, 50\)",
-    TOML.replace("seeds", "seed"): "A study has no seed; it has: about, environment",
+    TOML.replace("seeds", "seed"): "A study has no seed; it has: base, environment",
     TOML.replace("goal_periods", "periods"): r"An \[\[environment\]\] has no periods; it has: env, goal_periods",
     "seeds = 3": r"A study must have an \[\[environment\]\]",
-    'preset = "huge"': "There is no preset 'huge'; there are: absolute, relative",
+    'base = "huge.toml"': r"huge\.toml is not a study's TOML file",
+    'base = "study.toml"': r"study\.toml is a base of itself",
+    "base = 3": r"study\.toml is not a study's TOML file",
     "seeds = = 3": r"study\.toml is not a study's TOML file",
 }
 

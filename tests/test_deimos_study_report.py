@@ -11,9 +11,11 @@ from PIL import Image
 
 from deimos.run.folder import RunError
 from deimos.study import document, figures, report, stats
-from deimos.study.claim_list import CLAIMS
-from deimos.study.data import Data
-from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, curves, results
+from deimos.study.data import Data, Style
+from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results
+from reproduction import report as thesis
+from reproduction.claim_list import CLAIMS
+from reproduction.figures import STYLE
 
 METHODS = ["coop", "p25", "p75", "antagonist", "uniform", "vds"]
 
@@ -43,18 +45,17 @@ def fill(folder, seeds=4, points=20):
                 line = dict.fromkeys(CURVE_COLUMNS, tuple(rng.uniform(0.1, 1, points))) | key
                 lines.append(line | {"num_envs": 100, "env_steps": tuple(24.0 * np.arange(1, points + 1))})
     folder.mkdir(exist_ok=True)
-    results(folder).append(rows)
-    curves(folder).append(lines)
+    Results(rows, lines).write(folder)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A study folder with its report."""
+    """A study folder with the thesis's report."""
     path = tmp_path_factory.mktemp("study")
     fill(path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stats, "RESAMPLES", 200)  # nothing here looks at the ends of an interval
-        report.write(path, path, resamples=200)
+        thesis.write(path, path)
     return path
 
 
@@ -150,18 +151,20 @@ def test_tracking_and_errors_stand_beside_the_crashes(folder):
 def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):
     """The bootstrap is seeded: another call writes the same Markdown."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
-    monkeypatch.setattr(report, "draw_all", lambda data, out: {})
-    report.write(folder, tmp_path, resamples=200)
+    monkeypatch.setattr(figures, "draw", lambda figures, out: {})
+    thesis.write(folder, tmp_path)
     text = re.sub(r"!\[.*\n\n", "", (folder / "report.md").read_text())
     assert (tmp_path / "report.md").read_text() == text
 
 
 def test_committed_studies_can_be_read():
-    """The tables under docs/results are of today's schema."""
+    """The tables under docs/results can be read, and their claims can be tested."""
     tables = sorted((Path(__file__).parent.parent / "docs" / "results").glob("*/results.csv"))
     assert len(tables) >= 1
     for table in tables:
-        assert Data.read(table.parent).environments
+        data = Data.read(table.parent)
+        assert data.environments
+        assert any(data.curves(environment, "uniform") for environment in data.environments)
 
 
 def test_empty_folder_has_no_report(tmp_path):
@@ -172,7 +175,8 @@ def test_empty_folder_has_no_report(tmp_path):
 
 def test_text_is_escaped():
     """What HTML or a Markdown table would take for markup is only text."""
-    blocks = [document.Heading("a < b"), document.Table(["x"], [["P(a | b) & <c>"]])]
+    blocks = ["# a < b", document.Table(["x"], [["P(a | b) & <c>"]])]
+    assert "<h1>a &lt; b</h1>" in document.to_html(blocks, None)
     assert "<td>P(a | b) &amp; &lt;c&gt;</td>" in document.to_html(blocks, None)
     assert "| P(a \\| b) & <c> |" in document.to_markdown(blocks, "figures")
 
@@ -180,11 +184,61 @@ def test_text_is_escaped():
 def test_methods_have_their_own_colours():
     """No two of the thesis's methods share a colour or a marker, nor are two colours close to each other."""
     names = [*METHODS, "p10", "p50", "p90", "rnd", "cl", "vds+p75", "learnability"]
-    assert len({figures.colour(name) for name in names}) == len(names)
-    assert len({figures.marker(name) for name in names}) == len(names)
-    codes = np.array([[int(figures.colour(name)[i : i + 2], 16) for i in (1, 3, 5)] for name in names])
+    assert len({STYLE.colour(name) for name in names}) == len(names)
+    assert len({STYLE.marker(name) for name in names}) == len(names)
+    codes = np.array([[int(STYLE.colour(name)[i : i + 2], 16) for i in (1, 3, 5)] for name in names])
     apart = np.abs(codes[:, None] - codes[None]).sum(axis=2) + 1000 * np.eye(len(names))
     assert apart.min() > 40
+
+
+def test_methods_without_a_style_are_told_apart():
+    """Methods that nobody gave a colour have one each; those that have one keep it, and it is not given again."""
+    style = Style(colours={"mine": "#0072B2"}).complete(["a", "b", "mine", "c"])
+    assert style.colour("mine") == "#0072B2"
+    assert len({style.colour(name) for name in ("a", "b", "c", "mine")}) == 4
+    assert len({style.marker(name) for name in ("a", "b", "c", "mine")}) == 4
+    many = Style().complete([f"method {i}" for i in range(40)])
+    assert many.colour("method 39").startswith("#")
+
+
+def test_order_is_the_callers_and_then_by_name(folder):
+    """What the caller orders comes first; other names follow, with their numbers as numbers."""
+    data = Data.read(folder, Style(order=["quad", "vds", "uniform"]))
+    assert data.environments == ["quad", "directional"]
+    assert data.methods("quad") == ["vds", "uniform", "antagonist", "coop", "p25", "p75"]
+    assert data._sorted({"p100", "p5", "p75"}) == ["p5", "p75", "p100"]
+
+
+def test_report_without_a_thesis(folder, tmp_path, monkeypatch):
+    """The report of any study has its tables and figures in one panel, compares with its own method, and no claims."""
+    monkeypatch.setattr(stats, "RESAMPLES", 200)
+    report.write(folder, tmp_path, style=Style(reference="vds"))
+    text = (tmp_path / "report.md").read_text()
+    assert "P(more crashes than vds)" in text
+    assert "ratio to vds" in text
+    assert not re.search("thesis|claim|published|C1", text)
+    names = {f"{kind}-{e}-T100" for kind in ("evaluation", "profile") for e in ("directional", "quad")}
+    assert {path.stem for path in (tmp_path / "figures").glob("*.png")} == names | {
+        "training-directional", "training-quad",
+    }  # fmt: skip
+    headings = re.findall("^## (.*)$", text, re.MULTILINE)
+    assert headings == ["What was run", "directional", "quad", "Over all environments", "Speed", "Limits"]
+
+
+def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
+    """A page of the caller's own is what is written, figures that it names included."""
+    monkeypatch.setattr(stats, "RESAMPLES", 200)
+
+    def page(data, captions):
+        assert list(captions) == ["own-directional", "own-quad"]
+        pictures = [document.Picture(name, caption) for name, caption in captions.items()]
+        return ["# Mine", *pictures]
+
+    def draw(data, environment):
+        return {f"own-{environment}": ("A caption.", lambda: figures.boxes(data, environment, 100))}
+
+    report.write(folder, tmp_path, page=page, draw=draw)
+    assert (tmp_path / "report.md").read_text().startswith("# Mine\n\n![A caption.](figures/own-directional.png)")
 
 
 def test_rolling_mean_is_short_at_the_start():

@@ -1,121 +1,175 @@
-"""The tables of a study: they only grow, survive kills, take several writers, and are merged."""
+"""The results of a study: read from cells and from tables, exported whole, and merged."""
 
+import json
 import math
 import os
-import subprocess
-import sys
+from pathlib import Path
 
 import pytest
 
 from deimos.run.folder import RunError
-from deimos.study.results import RESULT_COLUMNS, GrowingTable, curves, merge, results
+from deimos.study import results
+from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results, merge, read_table, write_table
 
 COLUMNS = {"name": str, "count": int, "rate": float, "weak": bool, "points": tuple, "errors": dict}
 
-WRITER = """
-import sys
-from pathlib import Path
-from deimos.study.results import GrowingTable
-table = GrowingTable(Path(sys.argv[1]), {"name": str, "count": int}, ("name",))
-for i in range(20):
-    table.append([{"name": f"both-{i}", "count": i}, {"name": f"{sys.argv[2]}-{i}", "count": i}])
-"""
-
 
 @pytest.fixture
-def table(tmp_path):
-    """A table with a column of every kind."""
-    return GrowingTable(tmp_path / "table.csv", COLUMNS, ("name",))
+def path(tmp_path):
+    """Where a table is."""
+    return tmp_path / "table.csv"
 
 
 def row(name, **more):
-    """A row of that table."""
+    """A row of a table with a column of every kind."""
     return {"name": name, "count": 3, "rate": 0.1 + 0.2, "weak": False, "points": (1.0, 0.25),
             "errors": {"end effector [m]": 0.1 + 0.2, "a, b": math.inf}} | more  # fmt: skip
 
 
 def result(hash, goals="naive", **more):
-    """A row of the table of evaluations."""
+    """A row of an evaluation."""
     values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
     own = {"hash": hash, "seed": int(hash), "goals": goals}
     return {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | own | more
 
 
-def test_rows_come_back_as_they_were(table):
+def curve(hash):
+    """The training curve of a cell."""
+    line = {"environment": "x", "method": "y", "seed": 0, "hash": hash, "setting": "x", "selector": "x", "num_envs": 1}
+    return line | dict.fromkeys(("env_steps", "reward", "crashes_per_1000", "selected_fraction"), (1.0,))
+
+
+def fill(folder, rows, curves=()):
+    """A folder of tables."""
+    folder.mkdir()
+    Results(list(rows), list(curves)).write(folder)
+
+
+def fill_cell(folder, rows, line):
+    """A folder with the result of one cell."""
+    path = folder / "cells" / "one"
+    path.mkdir(parents=True)
+    (path / "result.json").write_text(json.dumps({"schema": results.SCHEMA, "rows": rows, "curve": line}))
+
+
+def test_rows_come_back_as_they_were(path):
     """Numbers are exact, and what is missing is NaN or None."""
-    assert table.read() == []
-    assert table.append([row("a, b"), row("c", rate=math.nan, weak=None, points=(), errors={})]) == 2
-    first, second = table.read()
+    assert read_table(path, COLUMNS) == []
+    write_table(path, COLUMNS, [row("a, b"), row("c", rate=math.nan, weak=None, points=(), errors={})])
+    first, second = read_table(path, COLUMNS)
     assert first == row("a, b")
     assert math.isnan(second["rate"])
     assert (second["weak"], second["points"], second["errors"]) == (None, (), {})
 
 
-def test_key_is_entered_once(table):
-    """A row whose key is there already is left out, and the file keeps every byte that it had."""
-    table.append([row("a")])
-    before = table.path.read_bytes()
-    assert table.append([row("a", count=9), row("b"), row("b")]) == 1
-    assert table.path.read_bytes().startswith(before)
-    assert [(each["name"], each["count"]) for each in table.read()] == [("a", 3), ("b", 3)]
-
-
 @pytest.mark.parametrize("kept", [1, 10, 30])
-def test_torn_line_is_cut_off(table, kept):
-    """What a kill leaves of a line is not read, and does not harm the next row."""
-    table.append([row("a"), row("b")])
-    text = table.path.read_text()
+def test_torn_line_is_not_read(path, kept):
+    """What a kill of version 0.1.0 left of a line is not read."""
+    write_table(path, COLUMNS, [row("a"), row("b")])
+    text = path.read_text()
     whole = text[: text.rstrip("\n").rfind("\n") + 1]
-    table.path.write_text(text[: len(whole) + kept])
-    assert [each["name"] for each in table.read()] == ["a"]
-    assert table.append([row("b"), row("c")]) == 2
-    assert [each["name"] for each in table.read()] == ["a", "b", "c"]
+    path.write_text(text[: len(whole) + kept])
+    assert [each["name"] for each in read_table(path, COLUMNS)] == ["a"]
 
 
-def test_two_processes_append_at_once(tmp_path):
-    """Two writers lose no row and double none."""
-    path = tmp_path / "table.csv"
-    writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), name]) for name in ("one", "two")]
-    assert [writer.wait() for writer in writers] == [0, 0]
-    names = [each["name"] for each in GrowingTable(path, {"name": str, "count": int}, ("name",)).read()]
-    assert sorted(names) == sorted(f"{kind}-{i}" for kind in ("both", "one", "two") for i in range(20))
-
-
-def test_other_schema_is_refused(table):
-    """A file with other columns is refused with their names, and is not written to."""
-    table.path.write_text("name,count,speed\n")
+def test_other_schema_is_refused(path):
+    """A file with other columns is refused with their names; their order does not matter."""
+    path.write_text("name,count,speed\n")
     message = r"table\.csv is a table of another schema; missing: rate, weak, points, errors; unknown: speed"
-    for use in (table.read, lambda: table.append([row("a")])):
-        with pytest.raises(RunError, match=message):
-            use()
-    table.path.write_text("count,name,rate,weak,points,errors\n")
-    with pytest.raises(RunError, match="its columns stand in another order"):
-        table.read()
-    assert table.path.read_text() == "count,name,rate,weak,points,errors\n"
+    with pytest.raises(RunError, match=message):
+        read_table(path, COLUMNS)
+    path.write_text("count,name\n3,a\n")
+    assert read_table(path, {"name": str, "count": int}) == [{"name": "a", "count": 3}]
 
 
-def test_broken_value_is_refused(table):
-    """A value that does not fit its column is refused with its line."""
-    table.append([row("a")])
-    table.path.write_text(table.path.read_text().replace(",3,", ",three,"))
-    with pytest.raises(RunError, match=r"table\.csv, line 2, does not fit its columns"):
-        table.read()
+def test_broken_value_is_refused(path):
+    """A value that does not fit its column is refused with its line, and so is a line with too few."""
+    write_table(path, COLUMNS, [row("a")])
+    text = path.read_text()
+    for broken in (text.replace(",3,", ",three,"), text.replace("False", "no"), text + "b,1\n"):
+        path.write_text(broken)
+        with pytest.raises(RunError, match=r"table\.csv, line [23], does not fit its columns"):
+            read_table(path, COLUMNS)
+
+
+def test_table_that_cannot_be_written_leaves_the_old_one(path, monkeypatch):
+    """A table is whole at every moment: an error while it is written leaves the one of before."""
+    write_table(path, COLUMNS, [row("a")])
+    before = path.read_bytes()
+
+    def refuse(self, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(RunError, match=r"table\.csv could not be written \(No space left on device\)"):
+        write_table(path, COLUMNS, [row("b")])
+    assert path.read_bytes() == before
+
+
+def test_cells_come_before_tables(tmp_path):
+    """A folder's results are those of its cells, and of its tables what no cell has; null in a cell's is NaN."""
+    fill(tmp_path / "a", [result("1", crashes=9), result("2")], [curve("1"), curve("2")])
+    rows = [result("1", errors={"reach": None}, score=None), result("1", goals="adversary", tracking=[0.5, 1])]
+    fill_cell(tmp_path / "a", rows, curve("1") | {"reward": [2.0]})
+    found = Results.read(tmp_path / "a")
+    assert [(each["hash"], each["goals"], each["crashes"]) for each in found.rows] == [
+        ("1", "naive", 1), ("1", "adversary", 1), ("2", "naive", 1),
+    ]  # fmt: skip
+    assert math.isnan(found.rows[0]["score"])
+    assert math.isnan(found.rows[0]["errors"]["reach"])
+    assert found.rows[1]["tracking"] == (0.5, 1.0)
+    assert [(line["hash"], line["reward"]) for line in found.curves] == [("1", (2.0,)), ("2", (1.0,))]
+
+
+@pytest.mark.parametrize("text", ['{"schema": 99}', "[]", "{"])
+def test_result_of_another_schema_is_refused(tmp_path, text):
+    """A cell's result that is broken or of another version is refused in one line that names it."""
+    path = tmp_path / "cells" / "one" / "result.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(text)
+    with pytest.raises(RunError, match=r"one/result\.json (is not the result of a cell of schema 1|cannot be read)"):
+        Results.read(tmp_path)
+
+
+def test_tables_of_version_0_1_0_are_read(tmp_path):
+    """A column that had another name in version 0.1.0 is read under its name of today."""
+    fill(tmp_path / "a", [result("1")], [curve("1")])
+    path = tmp_path / "a" / "curves.csv"
+    path.write_text(path.read_text().replace("selected_fraction", "selected_share"))
+    assert Results.read(tmp_path / "a").curves == [curve("1")]
+
+
+def test_training_curve_is_cut_into_stretches():
+    """A curve has the means over stretches of the training and the steps at their ends, whatever the column's name."""
+    rows = [
+        {"env_steps": str(24 * i), "reward": str(i), "crashes_per_1000": "0.5", "selected_share": "1"}
+        for i in range(1, 6)
+    ]
+    found = results._curve(rows, 2)
+    assert found == {
+        "env_steps": [48.0, 120.0], "reward": [1.5, 4.0], "crashes_per_1000": [0.5, 0.5],
+        "selected_fraction": [1.0, 1.0],
+    }  # fmt: skip
 
 
 def test_merge_adds_what_is_new(tmp_path):
     """Merging adds the rows of every source once, counts what was there, and says what differs."""
-    results(tmp_path / "a").path.parent.mkdir()
-    results(tmp_path / "b").path.parent.mkdir()
-    results(tmp_path / "a").append([result("1"), result("2")])
-    results(tmp_path / "b").append([result("2"), result("3"), result("1", crashes=7)])
-    line = {"environment": "x", "method": "y", "seed": 0, "hash": "3", "setting": "x", "selector": "x", "num_envs": 1}
-    numbers = dict.fromkeys(("env_steps", "reward", "crashes_per_1000", "selected_share"), (1.0,))
-    curves(tmp_path / "b").append([line | numbers])
+    fill(tmp_path / "a", [result("1"), result("2")])
+    fill(tmp_path / "b", [result("2"), result("3"), result("1", crashes=7)], [curve("3")])
     assert merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"]) == (3, 2, 1)
-    assert [each["hash"] for each in results(tmp_path / "c").read()] == ["1", "2", "3"]
-    assert results(tmp_path / "c").read()[0]["crashes"] == 1
-    assert [each["hash"] for each in curves(tmp_path / "c").read()] == ["3"]
+    found = Results.read(tmp_path / "c")
+    assert [each["hash"] for each in found.rows] == ["1", "2", "3"]
+    assert found.rows[0]["crashes"] == 1
+    assert [each["hash"] for each in found.curves] == ["3"]
     assert merge(tmp_path / "c", [tmp_path / "a"]) == (0, 2, 0)
+
+
+def test_export_writes_the_tables_of_cells(tmp_path):
+    """A folder that is merged with itself has tables that give the results of its cells again."""
+    fill_cell(tmp_path / "a", [result("1")], curve("1"))
+    assert merge(tmp_path / "a", [tmp_path / "a"]) == (0, 1, 0)
+    assert read_table(tmp_path / "a" / "results.csv", RESULT_COLUMNS) == [result("1")]
+    assert read_table(tmp_path / "a" / "curves.csv", CURVE_COLUMNS) == [curve("1")]
 
 
 OTHERS = {
@@ -129,21 +183,19 @@ OTHERS = {
 def test_merge_refuses_what_is_no_one_study(tmp_path, name):
     """Folders of another setting, another selector or the same policy from another cell are not merged."""
     change, message = OTHERS[name]
-    for folder, row in (("a", result("1")), ("b", result("2", **change))):
-        (tmp_path / folder).mkdir()
-        results(tmp_path / folder).append([row])
+    fill(tmp_path / "a", [result("1")])
+    fill(tmp_path / "b", [result("2", **change)])
     with pytest.raises(RunError, match=message):
         merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"])
     assert not os.path.exists(tmp_path / "c")
     with pytest.raises(RunError, match=message):
         merge(tmp_path / "a", [tmp_path / "b"])
-    assert len(results(tmp_path / "a").read()) == 1
+    assert len(Results.read(tmp_path / "a").rows) == 1
 
 
 def test_merge_checks_before_it_writes(tmp_path):
     """An empty source, or one of another schema, is refused and the target is not made."""
-    results(tmp_path / "a").path.parent.mkdir()
-    results(tmp_path / "a").append([result("1")])
+    fill(tmp_path / "a", [result("1")])
     (tmp_path / "empty").mkdir()
     with pytest.raises(RunError, match="empty holds no results; it is empty, or no study folder"):
         merge(tmp_path / "c", [tmp_path / "a", tmp_path / "empty"])

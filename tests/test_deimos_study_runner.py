@@ -1,6 +1,5 @@
 """Studies run for real, on tiny budgets: stopped, killed, resumed, with workers that die."""
 
-import json
 import os
 import signal
 import subprocess
@@ -12,9 +11,11 @@ import pytest
 
 from deimos.run.folder import RunError, RunFolder
 from deimos.study import cell as worker
-from deimos.study import cli, lease, plan
-from deimos.study.folder import StudyFolder, result_rows
-from deimos.study.results import TIMED
+from deimos.study import cli, plan
+from deimos.study.engine import LocalProcesses, last_words
+from deimos.study.folder import StudyFolder
+from deimos.study.lock import hold
+from deimos.study.results import TIMED, result
 from deimos.study.runner import Runner
 
 STUDY = """
@@ -58,7 +59,7 @@ def whole(file, tmp_path_factory):
 
 def table(study):
     """Its results without what depends on the clock, NaN made comparable, in a fixed order."""
-    rows = [{name: repr(value) for name, value in row.items() if name not in TIMED} for row in study.results.read()]
+    rows = [{name: repr(value) for name, value in row.items() if name not in TIMED} for row in study.results().rows]
     return sorted(rows, key=lambda row: (row["hash"], row["goals"]))
 
 
@@ -84,7 +85,7 @@ def wait_until(condition, seconds=120):
 def test_study_leaves_its_tables(whole):
     """A finished study has a row per policy and evaluation, a curve per run, run folders, and nobody works on it."""
     cells = whole.cells()
-    rows = whole.results.read()
+    rows = whole.results().rows
     assert [(row["method"], row["goals"]) for row in sorted(rows, key=lambda r: (r["method"], r["goals"]))] == [
         (method, goals) for method in ("p25", "uniform") for goals in ("adversary", "naive")
     ]
@@ -101,21 +102,23 @@ def test_study_leaves_its_tables(whole):
         assert "torch=" in row["versions"]
         assert (row["tracking"], row["errors"]) == ((), {})  # a particle's goal is all of a piece
         legged = twin | {"tracking": [0.6, 0.7], "errors": {"reach": 0.02}}
-        (row,) = result_rows(cell, RunFolder(whole.cell_path(cell) / "run"), [legged])
+        (row,) = result(cell, RunFolder(whole.cell_path(cell) / "run"), [legged])["rows"]
         assert (row["tracking"], row["errors"]) == ([0.6, 0.7], {"reach": 0.02})
-    curves = whole.curves.read()
+    curves = whole.results().curves
     assert {line["hash"] for line in curves} == set(by_digest)
     assert all(line["env_steps"][-1] == 1920 and len(line["crashes_per_1000"]) == ITERATIONS for line in curves)
     assert whole.finished(cells) == set(by_digest)
-    assert not any(lease.is_held(whole.cell_path(cell)) for cell in cells)
+    for path in (whole.path, *map(whole.cell_path, cells)):
+        assert (path / "lock").read_text() == ""
 
 
 def test_finished_study_starts_nothing(whole, file, monkeypatch):
     """Giving the command again adds no row and starts no process."""
-    before = whole.results.path.read_bytes()
+    paths = [whole.cell_path(cell) / "result.json" for cell in whole.cells()]
+    before = [path.read_bytes() for path in paths]
     monkeypatch.setattr(subprocess, "Popen", None)
     cli.run(cli.RunOptions(folder=whole.path, file=file))
-    assert whole.results.path.read_bytes() == before
+    assert [path.read_bytes() for path in paths] == before
 
 
 def test_stopped_and_killed_study_ends_with_the_same_table(whole, file, tmp_path):
@@ -134,15 +137,15 @@ def test_stopped_and_killed_study_ends_with_the_same_table(whole, file, tmp_path
     wait_until(lambda: any(count > stopped_at[name] for name, count in iterations(study).items()))
     runner.kill()
     runner.wait()
-    newest = [max(study.cell_path(cell).glob("claim-*")) for cell in study.cells()]
-    pids = [pid for path in newest for pid in json.loads(path.read_text())["pids"]]
-    wait_until(lambda: not any(lease._is_alive(pid) for pid in pids))
-    assert len(study.results.read()) < 4
+    for cell in study.cells():  # its workers end by themselves
+        with hold(study.cell_path(cell) / "lock", cell.name, patience=60.0):
+            pass
+    assert len(study.results().rows) < 4
 
     cli.run(cli.RunOptions(folder=study.path, workers=2))
     assert table(study) == table(whole)
-    assert len(study.results.read()) == 4
-    assert len(study.curves.read()) == 2
+    assert len(study.results().rows) == 4
+    assert len(study.results().curves) == 2
     again = {name: rows[: stopped_at[name]] for name, rows in timing(study).items()}
     assert again == kept  # what was trained before the stop was not trained again
 
@@ -155,20 +158,19 @@ def test_worker_that_dies_is_retried_once_then_given_up(file, tmp_path, capsys):
     killed = []
 
     def kill(progress):
-        for running in progress.running:
-            if running.name == victim.name:
-                pid = json.loads(max(study.cell_path(victim).glob("claim-*")).read_text())["pids"][1]
-                if pid not in killed:
-                    os.kill(pid, signal.SIGKILL)
-                    killed.append(pid)
+        for process in [] if victim.name not in progress.running else [*engine._running]:
+            if victim.name in process.args and process.pid not in killed:
+                process.kill()
+                killed.append(process.pid)
 
-    end = Runner(study, 2).run(kill, lambda: False)
+    engine = LocalProcesses(study)
+    end = Runner(study, engine, 2).run(kill, lambda: False)
     assert len(killed) == 2
     error = "killed by SIGKILL (out of memory?)"
     assert study.failures(victim) == [error, error]
     assert end.failed == {victim.name: error}
-    assert (end.finished, end.total, end.running) == (1, 2, [])
-    assert {row["method"] for row in study.results.read()} == {"uniform"}
+    assert (end.finished, end.total, end.running) == (1, 2, {})
+    assert {row["method"] for row in study.results().rows} == {"uniform"}
 
     with pytest.raises(
         RunError, match=rf"1 of 2 cells failed, {victim.name.replace('+', '.')} first: killed by SIGKILL"
@@ -180,35 +182,74 @@ def test_worker_that_dies_is_retried_once_then_given_up(file, tmp_path, capsys):
     assert study.finished(study.cells()) == {cell.digest for cell in study.cells()}
 
 
-def test_cell_held_elsewhere_is_left_alone(whole, file, tmp_path):
-    """A runner waits for a cell that another machine works on, and does not touch it."""
+def test_study_that_is_worked_on_is_refused(whole):
+    """A second runner, here or on another machine, is refused in one line that names the first."""
+    command = cli.RunOptions(folder=whole.path)
+    with whole.hold(), pytest.raises(RunError, match=f"whole is being worked on by process {os.getpid()} on "):
+        cli.run(command)
+    lock = whole.path / "lock"
+    lock.write_text('{"machine": "elsewhere", "process": 7}')
+    with pytest.raises(RunError, match="whole was last worked on by process 7 on elsewhere"):
+        cli.run(command)
+    lock.unlink()
+    cli.run(command)
+
+
+def test_cell_that_is_worked_on_is_refused(whole, tmp_path, monkeypatch):
+    """A cell is worked on by one process at a time, whatever engine began it."""
     study = StudyFolder(tmp_path / "study")
-    study.add(plan.expand(plan.read(file), methods=["uniform"]))
+    study.add(whole.cells()[:1])
     (cell,) = study.cells()
-    (study.cell_path(cell) / "claim-0").write_text(json.dumps({"machine": "elsewhere", "pids": [1]}))
-    seen = []
-
-    def report(progress):
-        seen.append((progress.elsewhere, len(progress.running)))
-        rows = [row for row in whole.results.read() if row["method"] == "uniform"]
-        study.results.append(rows)  # the other machine finishes it
-
-    end = Runner(study, 1).run(report, lambda: False)
-    assert seen[0] == (1, 0)
-    assert end.finished == 1
+    monkeypatch.setattr(worker, "PATIENCE_SECONDS", 0.0)
+    with hold(study.cell_path(cell) / "lock", "x"), pytest.raises(RunError, match=f"Cell {cell.name} is being worked"):
+        worker.run(study, cell)
     assert not (study.cell_path(cell) / "run").exists()
+
+
+class Answers:
+    """An engine that works on nothing and gives answers in turn."""
+
+    def __init__(self, *answers):
+        self.answers = list(answers)
+        self.stopped = 0
+
+    def run(self, cell):
+        """The next answer."""
+        return self.answers.pop(0)
+
+    def stop(self):
+        """Take note of it."""
+        self.stopped += 1
+
+    def kill(self):
+        """There is nothing to end."""
+
+
+def test_any_engine_is_retried_once(whole, tmp_path):
+    """An engine that says what failed, or leaves no result, is asked once more; a stop is passed on to it once."""
+    study = StudyFolder(tmp_path / "study")
+    study.add(whole.cells()[:1])
+    (cell,) = study.cells()
+    engine = Answers("the node is lost", None)
+    end = Runner(study, engine, 1).run(lambda progress: None, lambda: False)
+    assert study.failures(cell) == ["the node is lost", "it ended without results"]
+    assert end.failed == {cell.name: "it ended without results"}
+    study.forget_failures()
+    engine = Answers(None)
+    asked = iter([False, *[True] * 9])
+    engine.run = lambda cell: wait_until(lambda: engine.stopped)
+    end = Runner(study, engine, 1).run(lambda progress: None, lambda: next(asked))
+    assert (engine.stopped, end.finished, end.failed, study.failures(cell)) == (1, 0, {}, [])
 
 
 def test_failure_is_told_by_its_last_line(tmp_path):
     """The line of a failure is the last that the worker said, or the signal that ended it."""
-    from deimos.study.runner import _last_words
-
     log = tmp_path / "log.txt"
     log.write_text("Traceback (most recent call last):\n  ...\nValueError: 3 is too many\n\n")
-    assert _last_words(1, log) == "ValueError: 3 is too many"
-    assert _last_words(-signal.SIGSEGV, log) == "killed by SIGSEGV"
-    assert _last_words(worker.STOPPED, log) == "exit code 130 without results"
-    assert _last_words(0, log) == "exit code 0 without results"
+    assert last_words(1, log) == "ValueError: 3 is too many"
+    assert last_words(-signal.SIGSEGV, log) == "killed by SIGSEGV"
+    assert last_words(worker.STOPPED, log) == "exit code 130 without results"
+    assert last_words(0, log) == "exit code 0 without results"
 
 
 def test_cell_of_another_version_is_refused(whole, tmp_path):
@@ -233,7 +274,7 @@ def test_worker_without_results_has_failed(whole, tmp_path, monkeypatch):
 
     popen = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", idle)
-    end = Runner(study, 1).run(lambda progress: None, lambda: False)
+    end = Runner(study, LocalProcesses(study), 1).run(lambda progress: None, lambda: False)
     assert len(begun) == 2
     assert list(end.failed.values()) == ["exit code 0 without results"]
 
@@ -246,9 +287,5 @@ def test_broken_run_is_one_line_of_a_worker(whole, tmp_path, capsys):
     run = study.cell_path(cell) / "run"
     run.mkdir()
     (run / "checkpoint.pt").write_text("not a checkpoint")
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        assert worker.main([str(study.path), cell.name, str(os.getppid())]) == 2
-    finally:
-        signal.signal(signal.SIGINT, handler)
+    assert worker.main([str(study.path), cell.name]) == 2
     assert capsys.readouterr().err == f"{Path(run)} is not a run folder: it holds no config.json.\n"

@@ -18,9 +18,10 @@ import torch
 import deimos
 from deimos import plugins
 from deimos.app import cli
-from deimos.checks import SimulationError
+from deimos.checks import RunError, SimulationError
+from deimos.files import load_tensors
 from deimos.goals.fear import FearConfig
-from deimos.goals.methods import METHODS
+from deimos.goals.methods import METHODS, method
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import director, uniform
 from deimos.learn.ppo import PPOConfig
@@ -28,7 +29,7 @@ from deimos.learn.rollout import Rollout
 from deimos.run import presets, training
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
-from deimos.run.folder import RunError, RunFolder, load_tensors
+from deimos.run.folder import RunFolder
 from deimos.run.training import TrainConfig
 from deimos.sim import envs
 from deimos.sim.env import EnvConfig
@@ -68,7 +69,7 @@ def train(*arguments, original=training.train):
 
 training.CHECKPOINT_SECONDS = float(sys.argv[1])
 training.train = train
-sys.exit(cli.train(sys.argv[3:]))
+sys.exit(cli.main(["train", *sys.argv[3:]]))
 """
 
 
@@ -87,7 +88,7 @@ def go_on(trainer, folder, iterations=None):
 
 def resume(path):
     """Go on with a run to its end, by the command line."""
-    assert cli.train(["--resume", str(path)]) == 0
+    assert cli.main(["train", "--resume", str(path)]) == 0
 
 
 def rows(path):
@@ -97,7 +98,7 @@ def rows(path):
 
 def checkpoint(path):
     """What a run's checkpoint holds."""
-    return load_tensors(path / "checkpoint.pt", "checkpoint", training.SCHEMA)
+    return training.load_checkpoint(RunFolder(path))
 
 
 def assert_same(found, expected, name=""):
@@ -149,7 +150,7 @@ def send_when(process, number, ready):
 def undisturbed(tmp_path_factory):
     """Folder of a run that nothing disturbed, made by the command line."""
     path = tmp_path_factory.mktemp("training") / "undisturbed"
-    assert cli.train([*FLAGS, "--out", str(path)]) == 0
+    assert cli.main(["train", *FLAGS, "--out", str(path)]) == 0
     return path
 
 
@@ -193,7 +194,7 @@ def test_interrupt_leaves_a_checkpoint_to_resume_from(undisturbed, tmp_path):
     assert "Traceback" not in stderr
     done = checkpoint(path)["iteration"]
     assert 3 <= done == len(rows(path)) < CONFIG.iterations
-    assert stderr.splitlines()[-1] == f"Stopped after iteration {done}; go on with --resume {path}"
+    assert stderr.splitlines()[-1] == f"Stopped after iteration {done}; resume with --resume {path}"
     resume(path)
     assert_same_run(path, undisturbed)
 
@@ -203,7 +204,7 @@ def test_larger_budget_equals_one_from_the_start(undisturbed, tmp_path):
     path = tmp_path / "run"
     run(replace(CONFIG, env_steps=200), path)
     assert len(rows(path)) == 9  # 200 steps are eight rollouts and a bit
-    assert cli.train(["--resume", str(path), "--env-steps", "480"]) == 0
+    assert cli.main(["train", "--resume", str(path), "--env-steps", "480"]) == 0
     assert_same_run(path, undisturbed)
     assert training.read_config(RunFolder.open(path)) == CONFIG
 
@@ -211,8 +212,8 @@ def test_larger_budget_equals_one_from_the_start(undisturbed, tmp_path):
 def test_smaller_budget_is_refused(undisturbed, capsys):
     """A resumed run takes no smaller budget, and the refusal changes nothing."""
     before = files(undisturbed)
-    assert cli.train(["--resume", str(undisturbed), "--env-steps", "479"]) == 2
-    assert "takes only a larger budget: it had 480 steps, got 479" in capsys.readouterr().err
+    assert cli.main(["train", "--resume", str(undisturbed), "--env-steps", "479"]) == 2
+    assert "--env-steps must exceed the 480 already set, got 479" in capsys.readouterr().err
     assert files(undisturbed) == before
 
 
@@ -310,7 +311,7 @@ def test_nan_is_one_line_on_the_command_line(tmp_path, monkeypatch, capfd):
         collect(trainer)
 
     monkeypatch.setattr(training.Trainer, "collect", poisoned)
-    assert cli.train([*FLAGS, "--out", str(tmp_path / "run")]) == 2
+    assert cli.main(["train", *FLAGS, "--out", str(tmp_path / "run")]) == 2
     last = capfd.readouterr().err.splitlines()[-1]
     assert re.match(r"deimos: Iteration 2: World 5: its .*position.* is not finite", last)
 
@@ -490,7 +491,7 @@ def test_init_from_refuses_another_size(undisturbed, tmp_path):
 
 CONFIGS = {
     **{f"method {name}": TrainConfig(method=name) for name in METHODS},
-    **{f"selector of {name}": TrainConfig(selector=selector) for name, selector in METHODS.items()},
+    **{f"selector of {name}": TrainConfig(selector=method(name)) for name in METHODS},
     "default": TrainConfig(),
     "all else": TrainConfig(
         env=particle.Config(
@@ -552,7 +553,7 @@ def test_config_differs_from_the_default_in_every_field():
 @pytest.mark.parametrize(
     ("cls", "data", "message"),
     [
-        (TrainConfig, {"sed": 1}, "deimos.run.training.TrainConfig has no sed; it has: device, env"),
+        (TrainConfig, {"sed": 1}, "deimos.run.trainer.TrainConfig has no sed; it has: device, env"),
         (TrainConfig, {"env": {"kind": "moon"}}, "deimos.sim.envs has no 'moon'; it has: .*particle"),
         (EnvConfig, {"variant": "relative"}, "deimos.sim.envs must name its 'kind'"),
         (SelectorConfig, {"kind": "director", "percentile": 101}, r"percentile must be in \[0, 100\], got 101"),
@@ -623,8 +624,7 @@ def test_missing_or_foreign_policy_is_refused(tmp_path):
 
 def test_what_led_to_an_invalid_state_is_left_out():
     """Every transition of a world since its last reset gets weight 0 when the world breaks, and no other one."""
-    env = particle.Config(time_limit=50).build(3, torch.device("cpu"), 0)
-    rollout = Rollout(env, 5)
+    rollout = Rollout(5, 3, 12, 3, torch.device("cpu"))
     rollout.terminated[1, 0] = True  # world 0 is reset after step 1 and breaks at step 3
     rollout.invalid[3, 0] = rollout.truncated[3, 0] = True
     rollout.invalid[0, 1] = rollout.truncated[0, 1] = True  # world 1 breaks at once

@@ -12,12 +12,12 @@ from torch import nn
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import vds
-from deimos.learn.ppo import PPO, PPOConfig, advantages
+from deimos.learn.ppo import PPO, PPOConfig
 from deimos.learn.rollout import Rollout
 from deimos.nn.adam import Adam
 from deimos.nn.ensemble import Stack
-from deimos.nn.fused_critics import fuse_critics
 from deimos.nn.networks import mlp
+from deimos.nn.returns import advantages
 from deimos.run.loop import spaces
 from deimos.sim.envs import particle
 
@@ -33,14 +33,16 @@ def worlds(time_limit=100):
 def random_rollout(env, seed=0):
     """Transitions with crashes, time limits and rows of weight 0."""
     generator = torch.Generator().manual_seed(seed)
-    rollout = Rollout(env, NUM_STEPS, reward_scale=0.01)
-    for tensor in (rollout.obs, rollout.final_obs):
-        tensor.normal_(generator=generator)
+    rollout = Rollout(NUM_STEPS, NUM_ENVS, env.obs_dim, env.action_dim, CPU, reward_scale=0.01)
+    rollout.obs.normal_(generator=generator)
     rollout.reward.uniform_(0.0, 100.0, generator=generator)
     rollout.terminated.bernoulli_(0.05, generator=generator)
-    if len(rollout.final_obs):
+    if env.time_limit:
         rollout.truncated.bernoulli_(0.05, generator=generator)
         rollout.truncated &= ~rollout.terminated
+        for t, truncated in enumerate(rollout.truncated):
+            rows = truncated.nonzero().squeeze(1)
+            rollout.ends.append((t, rows, torch.randn(len(rows), env.obs_dim, generator=generator)))
     rollout.weight.bernoulli_(0.9, generator=generator)
     return rollout
 
@@ -65,8 +67,8 @@ class Alone:
         with torch.no_grad():
             value = self.net(rollout.obs).squeeze(2)
             next_value = value[1:].clone()
-            if len(rollout.final_obs):
-                next_value = torch.where(rollout.truncated, self.net(rollout.final_obs).squeeze(2), next_value)
+            step, world, obs = rollout.cut_off()
+            next_value[step, world] = self.net(obs).squeeze(1)
             returns = value[:-1] + advantages(
                 rollout.reward * rollout.reward_scale, value[:-1], next_value, rollout.terminated, rollout.truncated,
                 discount=rollout.discount, gae_lambda=rollout.gae_lambda,
@@ -124,7 +126,7 @@ def test_one_critic_is_ppos_own():
     config = PPOConfig(
         num_steps=NUM_STEPS, hidden=SMALL["hidden"], activation="elu", desired_kl=0.0, epochs=2, minibatches=3
     )  # fmt: skip
-    ppo, selector = PPO(config, env, seed=0), ensemble(env, critics=1)
+    ppo, selector = PPO(config, NUM_ENVS, env.obs_dim, 3, CPU, seed=0), ensemble(env, critics=1)
     for ours, theirs in zip(selector.stack.nets[0].parameters(), ppo.critic.parameters(), strict=True):
         ours.data.copy_(theirs.data)
     for update in range(5):
@@ -132,7 +134,7 @@ def test_one_critic_is_ppos_own():
         noise = torch.randn(NUM_STEPS, NUM_ENVS, 3, generator=torch.Generator().manual_seed(update))
         for t in range(NUM_STEPS):
             ppo.act(rollout.obs[t], noise[t], rollout.action[t], rollout.mean[t])
-        own, theirs = ppo.batch(rollout)[0], ppo.batch(rollout, selector)[0]
+        own, theirs = ppo.batch(rollout)[0], ppo.batch(rollout, selector.value)[0]
         torch.testing.assert_close(own.returns, theirs.returns, rtol=1e-4, atol=1e-4)
         metrics = ppo.update(rollout, orders(selector, 1)[0])
         row = selector.learn(no_interactions(env), rollout)
@@ -157,9 +159,9 @@ def test_critics_with_returns_of_their_own_do_not_agree():
 def test_a_stack_is_its_networks(count):
     """Values, gradients and the clip of each member are those of its network alone; weights lie in one vector."""
     torch.manual_seed(0)
-    nets = [mlp(5, (16, 9), 1, "tanh") for _ in range(count)]
+    nets = [mlp(5, (16, 9), 1, "tanh", torch.default_generator) for _ in range(count)]
     alone = copy.deepcopy(nets)
-    stack = Stack(nets)
+    stack = Stack(nets, kernels=False)
     x, delta = torch.randn(count, 50, 5), torch.randn(count, 50, 1)
     torch.testing.assert_close(
         stack.values(x[0]), torch.stack([net(x[0]).squeeze(1) for net in alone]).detach(), rtol=1e-5, atol=1e-6
@@ -186,17 +188,17 @@ def test_a_stack_is_its_networks(count):
 def test_kernels_and_batched_products_agree(units, count, clip):
     """Values, losses and gradients are the same to rounding, on all rows and on some, for shared inputs and others."""
     torch.manual_seed(1)  # no unit is so near to ReLU's kink that rounding decides
-    nets = [mlp(units[0], units[1:], 1, "relu") for _ in range(count)]
-    plain, fused = Stack(copy.deepcopy(nets)), Stack(nets, fuse_critics)
+    nets = [mlp(units[0], units[1:], 1, "relu", torch.default_generator) for _ in range(count)]
+    plain, fused = Stack(copy.deepcopy(nets), kernels=False), Stack(nets)
     assert fused.fused is not None
     x = torch.randn(count, 200, units[0])
     before, target, weight = (torch.randn(count, 200) for _ in range(3))
     weight = (weight > -1.0).float()
     for inputs in (x, x[0], x[:, :64], x[:, :1], x[:, :0]):
         torch.testing.assert_close(fused.values(inputs), plain.values(inputs), rtol=1e-5, atol=1e-6)
-    lessons = [stack.gradients(x, before, target, weight, clip) for stack in (plain, fused)]
+    updates = [stack.gradients(x, before, target, weight, clip) for stack in (plain, fused)]
     for rows in (range(200), range(30, 94), range(199, 200)):
-        expected, losses = (lesson(rows) for lesson in lessons)
+        expected, losses = (update(rows) for update in updates)
         torch.testing.assert_close(losses, expected, rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(fused.parameters.grad, plain.parameters.grad, rtol=1e-4, atol=1e-6)
 
@@ -204,34 +206,34 @@ def test_kernels_and_batched_products_agree(units, count, clip):
 def test_what_a_member_computes_does_not_depend_on_the_threads():
     """One thread and three give the same values and gradients, bit for bit, again and again."""
     torch.manual_seed(0)
-    nets = [mlp(6, (70, 64), 1, "relu") for _ in range(7)]
+    nets = [mlp(6, (70, 64), 1, "relu", torch.default_generator) for _ in range(7)]
     stacks = []
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        stacks.append(Stack(copy.deepcopy(nets), fuse_critics))
+        stacks.append(Stack(copy.deepcopy(nets)))
         torch.set_num_threads(1)
     data = (torch.randn(7, 300, 6), *torch.randn(2, 7, 300), torch.ones(7, 300), 0.2)
-    lessons = [stack.gradients(*data) for stack in stacks]
+    updates = [stack.gradients(*data) for stack in stacks]
     for start in range(0, 250, 10):
         rows = range(start, start + 50)
-        assert torch.equal(*[lesson(rows).clone() for lesson in lessons])
+        assert torch.equal(*[update(rows).clone() for update in updates])
         assert torch.equal(*[stack.parameters.grad for stack in stacks])
         assert torch.equal(*[stack.values(data[0][:, start:]) for stack in stacks])
 
 
-def test_lessons_keep_what_they_learn_from():
-    """Nobody else needs to hold the data of a lesson: kernels know addresses, and those stay the data's."""
-    nets = [mlp(4, (8, 8), 1, "relu") for _ in range(2)]
-    plain, fused = Stack(copy.deepcopy(nets)), Stack(nets, fuse_critics)
+def test_updates_keep_what_they_learn_from():
+    """Nobody else needs to hold the data of an update: kernels know addresses, and those stay the data's."""
+    nets = [mlp(4, (8, 8), 1, "relu", torch.default_generator) for _ in range(2)]
+    plain, fused = Stack(copy.deepcopy(nets), kernels=False), Stack(nets)
     x, targets = torch.randn(2, 50, 4), torch.randn(2, 50)
     plain.gradients(x, targets, targets, torch.ones(2, 50), 0.2)(range(50))
     data = [x.clone(), targets.clone(), targets.clone(), torch.ones(2, 50)]
     alive = [weakref.ref(tensor) for tensor in data]
-    lesson = fused.gradients(*data, 0.2)
+    update = fused.gradients(*data, 0.2)
     del data
     gc.collect()
     assert all(reference() is not None for reference in alive)
-    lesson(range(50))
+    update(range(50))
     torch.testing.assert_close(
         [net[0].weight.grad for net in fused.nets], [net[0].weight.grad for net in plain.nets], rtol=1e-4, atol=1e-6
     )
@@ -239,8 +241,8 @@ def test_lessons_keep_what_they_learn_from():
 
 def test_kernels_see_weights_that_changed():
     """Values follow the weights, whoever changed them and however."""
-    nets = [mlp(4, (8, 8), 1, "relu") for _ in range(2)]
-    stack, x = Stack(nets, fuse_critics), torch.randn(9, 4)
+    nets = [mlp(4, (8, 8), 1, "relu", torch.default_generator) for _ in range(2)]
+    stack, x = Stack(nets), torch.randn(9, 4)
     for change in (nets[1][0].bias.data.add_, stack.parameters.data.mul_):
         change(1.5)
         torch.testing.assert_close(stack.values(x), torch.stack([net(x).squeeze(1) for net in nets]).detach())
@@ -249,7 +251,7 @@ def test_kernels_see_weights_that_changed():
 @pytest.mark.parametrize(("activation", "outputs"), [("elu", 1), ("tanh", 1), ("relu", 2)])
 def test_kernels_leave_alone_what_they_cannot(activation, outputs):
     """Other activations and other outputs go to batched products."""
-    assert Stack([mlp(3, (8,), outputs, activation) for _ in range(2)], fuse_critics).fused is None
+    assert Stack([mlp(3, (8,), outputs, activation) for _ in range(2)]).fused is None
 
 
 @pytest.mark.parametrize("rule", ["proportional", "argmax", "percentile"])
@@ -314,7 +316,7 @@ def test_roles():
     env = worlds()
     selector = ensemble(env)
     assert ensemble(env, role="auxiliary").critic() is None
-    assert selector.critic() is selector
+    assert selector.critic() == selector.value
     obs = random_rollout(env).obs
     expected = torch.stack([net(obs).squeeze(2) for net in selector.stack.nets]).mean(0).detach()
     torch.testing.assert_close(selector.value(obs), expected, rtol=1e-5, atol=1e-6)

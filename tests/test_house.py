@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,27 @@ class Longest(GoalSelector):
 '''
 
 
+ROOMS = {  # package: those that it may import, and those that these may import
+    "nn": set(),
+    "kernels": set(),
+    "terrain": {"kernels"},
+    "goals": {"nn"},
+    "learn": {"nn"},
+    "sim": {"nn", "kernels", "terrain"},
+    "run": {"learn", "sim", "goals"},
+    "study": {"run"},
+    "app": {"study", "terrain"},
+    "adapters": {"run"},
+}
+LEAVES = {"_version", "checks", "files", "plugins"}  # modules that everybody may import
+BACKENDS = {
+    "deimos/nn/fusion.py",
+    "deimos/nn/fused.py",
+    "deimos/nn/fused_critics.py",
+}  # imported by functions, where Warp is installed
+ENTRIES = {"train.py", "deimos/__main__.py", "terrain/__main__.py"}  # may import app
+
+
 def sources(*packages):
     """Paths of the source files of packages, with their syntax trees."""
     paths = [path for package in packages for path in sorted((HOME / package).rglob("*.py"))]
@@ -65,21 +87,43 @@ def sources(*packages):
     return {path.relative_to(HOME).as_posix(): ast.parse(path.read_text(encoding="utf-8")) for path in paths}
 
 
+def module_name(path):
+    """The name that a file of the repository is imported under."""
+    name = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    return f"deimos.{name}" if name.split(".")[0] in ("kernels", "terrain") else name
+
+
 def module_names(*packages):
     """Names of all modules of packages."""
-    return [name.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for name in sources(*packages)]
+    return [module_name(path) for path in sources(*packages)]
 
 
-def imports(tree):
-    """Full names of all modules that a file imports, wherever in it."""
+def imports(tree, path=""):
+    """Full names of all modules that a file imports, wherever in it, and of what it takes from them."""
+    package = module_name(path).split(".")
+    if not path.endswith("/__init__.py"):
+        package = package[:-1]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute"
-            assert node.module is not None
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            assert not node.level or path.startswith(("kernels/", "terrain/")), f"{path}: only these import relatively"
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+def reachable(room):
+    """The packages that a package may import."""
+    return ROOMS[room].union(*(reachable(other) for other in ROOMS[room]))
+
+
+def arrows():
+    """Every module of ours with the modules of ours that it imports, and its path."""
+    trees = sources("deimos", "kernels", "terrain")
+    known = {module_name(path) for path in trees}
+    return {path: {name for name in imports(tree, path) if name in known} for path, tree in trees.items()}
 
 
 def python(code, *, cwd, first=()):
@@ -93,13 +137,13 @@ def python(code, *, cwd, first=()):
 
 def test_imports_are_silent_and_light(tmp_path):
     """Importing the packages prints nothing and starts no device; none loads mujoco, and by themselves none torch."""
-    modules = module_names("kernels", "terrain")
-    assert {"kernels", "deimos.kernels.particle", "terrain"} <= set(modules)
+    modules = [name for name in module_names("kernels", "terrain") if not name.endswith("__main__")]
+    assert {"deimos.kernels", "deimos.kernels.particle", "deimos.terrain"} <= set(modules)
     code = f"""
 import importlib, sys
 for name in {modules}:
     importlib.import_module(name)
-loaded = {{"torch", "mujoco", "mujoco_warp", "deimos"}} & set(sys.modules)
+loaded = {{"torch", "mujoco", "mujoco_warp"}} & set(sys.modules)
 assert not loaded, loaded
 import deimos
 from deimos.app import cli
@@ -119,7 +163,7 @@ def test_deimos_alone_loads_no_torch(tmp_path):
     code = """
 import sys
 import deimos
-loaded = {"torch", "warp", "kernels", "terrain", "numpy", "tyro"} & set(sys.modules)
+loaded = {"torch", "warp", "deimos.kernels", "deimos.terrain", "numpy", "tyro"} & set(sys.modules)
 assert not loaded, loaded
 assert callable(deimos.load_policy)
 assert "torch" in sys.modules
@@ -143,62 +187,116 @@ assert warp._src.context.runtime is None, "a device was started"
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_dependencies_point_one_way():
-    """Kernels import Warp, NumPy and themselves; terrain adds trimesh and its tool's; only deimos imports deimos."""
+def test_imports_follow_the_arrows():
+    """A package imports only those below it; learn, sim and goals do not know each other."""
+    for path, targets in arrows().items():
+        own = module_name(path).split(".")[1:2]
+        if path in ENTRIES or not own or own[0] in LEAVES | {"__main__"}:
+            continue
+        for target in targets:
+            other = target.split(".")[1:2]
+            if not other or other[0] in LEAVES | {own[0]} or (path in BACKENDS and other == ["kernels"]):
+                continue
+            assert other[0] in reachable(own[0]), f"{path} imports {target}"
+
+
+def test_leaves_import_no_room():
+    """The modules that everybody may import need nobody's, so that they can be imported from anywhere."""
+    for path, targets in arrows().items():
+        if path.removeprefix("deimos/").removesuffix(".py") in LEAVES:
+            rooms = {target.split(".")[1] for target in targets if "." in target}
+            assert rooms <= LEAVES, path
+
+
+def test_no_import_circle():
+    """No module imports itself over others, inside of functions neither."""
+    graph = {module_name(path): targets - {"deimos"} for path, targets in arrows().items()}
+    graph = {name: {other for other in targets if not name.startswith(f"{other}.")} for name, targets in graph.items()}
+    open_, closed = [], set()
+
+    def visit(name):
+        assert name not in open_, " -> ".join([*open_[open_.index(name) :], name])
+        if name not in closed:
+            open_.append(name)
+            for other in sorted(graph[name]):
+                visit(other)
+            closed.add(open_.pop())
+
+    for name in graph:
+        visit(name)
+
+
+def test_what_is_not_in_the_wheel_is_not_imported():
+    """The library knows neither the reproduction nor the benchmarks, and only entry points import the command line."""
+    for path, tree in sources("deimos", "kernels", "terrain").items():
+        found = {name.split(".")[0] for name in imports(tree, path)}
+        assert not found & {"reproduction", "benchmarks", "kernels", "terrain", "tests"}, path
+    users = [path for path, targets in arrows().items() if any(name.startswith("deimos.app") for name in targets)]
+    assert {path for path in users if not path.startswith("deimos/app/")} <= ENTRIES
+
+
+def test_packages_import_what_they_are_allowed_from_outside():
+    """Networks, goals and the learner need torch and NumPy alone; kernels need Warp; terrain adds trimesh."""
+    base = {"torch", "numpy"}
     allowed = {
-        "kernels": {"warp", "numpy", "kernels"},
-        "terrain": {"warp", "numpy", "trimesh", "tyro", "rich", "matplotlib", "PIL", "kernels", "terrain"},
-    }
+        "deimos/nn": base, "deimos/goals": base, "deimos/learn": base, "kernels": {"warp", "numpy"},
+        "terrain": {"warp", "numpy", "trimesh", "matplotlib", "PIL", "mujoco", "scipy"},
+    }  # fmt: skip
     for package, others in allowed.items():
-        for name, tree in sources(package).items():
-            tops = {module.split(".")[0] for module in imports(tree)}
-            assert tops <= others | set(sys.stdlib_module_names), name
+        for path, tree in sources(package).items():
+            tops = {name.split(".")[0] for name in imports(tree, path)} - {"deimos"}
+            extra = {"warp"} if path in BACKENDS else set()
+            assert tops <= others | extra | set(sys.stdlib_module_names), path
 
 
-def test_what_selectors_are_made_of_sees_tensors_only():
-    """Selectors, interactions, the fear network and the learner's parts import torch, and neither Warp nor a kernel."""
-    trees = sources("deimos")
-    parts = [
-        "selector",
-        "fear_selector",
-        "interactions",
-        "fear",
-        "calibration",
-        "picks",
-        "networks",
-        "ensemble",
-        "products",
-        "seeds",
-    ]
-    parts += ["rollout", "adam", "ppo", "goal_director"]
-    names = [f"deimos/{part}.py" for part in parts] + [name for name in trees if name.startswith("deimos/selectors/")]
-    for name in names:
-        found = set(imports(trees[name]))
-        assert not {module for module in found if module.split(".")[0] in ("warp", "kernels", "terrain")}, name
-        if name.startswith(("deimos/selector", "deimos/fear_selector")):
-            assert (
-                not {
-                    "deimos.sim.env",
-                    "deimos.sim.envs",
-                    "deimos.run.loop",
-                    "deimos.learn.ppo.PPO",
-                    "deimos.run.training",
-                }
-                & found
-            ), name
+def test_wheel_holds_every_package():
+    """pyproject.toml lists every package of deimos, kernels and terrain, and nothing else."""
+    listed = tomllib.loads((HOME / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    there = {module_name(path) for path in sources("deimos", "kernels", "terrain") if path.endswith("__init__.py")}
+    assert sorted(listed) == sorted(there)
 
 
-@pytest.mark.parametrize("name", ["kernels", "terrain"])
-def test_foreign_package_is_refused(tmp_path, name):
-    """A foreign package of the same name that comes first on the path stops ``import deimos`` with a clear message."""
-    (tmp_path / "foreign" / name).mkdir(parents=True)
-    (tmp_path / "foreign" / name / "__init__.py").touch()
-    done = python("import deimos", cwd=tmp_path, first=[tmp_path / "foreign"])
-    assert done.returncode == 1
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"ImportError: Deimos needs its own package '{name}' from {HOME}, but Python found ")
-    assert str(tmp_path / "foreign" / name) in last
-    assert "environment of its own" in last
+def test_checkout_is_used_where_a_wheel_is_installed(tmp_path):
+    """In a checkout, its own kernels are imported even if another deimos is installed; nothing has two names."""
+    installed = tmp_path / "site" / "deimos" / "kernels"
+    installed.mkdir(parents=True)
+    for folder in (installed, installed.parent):
+        (folder / "__init__.py").write_text("raise AssertionError('the installed one')")
+    code = """
+import sys
+import deimos, deimos.kernels.particle, deimos.terrain.shapes.pit, deimos.terrain
+files = [module.__file__ for module in sys.modules.values() if getattr(module, "__file__", None)]
+ours = [name for name in files if "site-packages" not in name and "/lib/python" not in name]
+assert len(ours) == len(set(ours)), sorted(ours)
+print(deimos.kernels.__file__)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=HOME, env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()) == HOME / "kernels" / "__init__.py"
+
+
+def test_terrain_of_a_checkout_runs_under_one_name():
+    """``python -m terrain`` loads no file twice but the package's own ``__init__``, which holds lazy names only."""
+    code = """
+import runpy, sys
+sys.argv = ["terrain", "--help"]
+try:
+    runpy.run_module("terrain", run_name="__main__", alter_sys=False)
+except SystemExit as stop:
+    assert not stop.code, stop.code
+files = [(module.__file__, name) for name, module in sys.modules.items() if getattr(module, "__file__", None)]
+twice = {file for file, name in files if sum(file == other for other, _ in files) > 1 and "terrain" in file}
+assert all(file.endswith("terrain/__init__.py") for file in twice), twice
+"""
+    done = python(code, cwd=HOME)
+    assert done.returncode == 0, done.stderr
+    tree = sources("terrain")["terrain/__init__.py"]
+    kinds = {type(node) for node in tree.body}
+    assert kinds <= {ast.Expr, ast.Import, ast.ImportFrom, ast.If, ast.Assign, ast.FunctionDef}
+    assert [node.name for node in tree.body if isinstance(node, ast.FunctionDef)] == ["__getattr__"]
 
 
 def test_readme_holds_two_setup_lines():
@@ -246,7 +344,7 @@ def test_every_configuration_field_has_a_docstring():
                 if isinstance(field, ast.AnnAssign):
                     assert isinstance(after, ast.Expr), f"{name}: {node.name}.{ast.unparse(field.target)}"
                     checked.append(node.name)
-    assert {"TrainConfig", "PPOConfig", "FearConfig", "EvalConfig", "BenchOptions", "Config"} <= set(checked)
+    assert {"TrainConfig", "PPOConfig", "FearConfig", "EvalConfig", "Config"} <= set(checked)
 
 
 def test_every_test_says_what_holds():
@@ -274,7 +372,7 @@ def test_file_name_is_the_registration(package):
 def test_unknown_plugin_is_refused():
     """Asking for a plugin that is not there lists those that are."""
     with pytest.raises(
-        ValueError, match=r"deimos\.selectors has no 'nope'; it has: boltzmann, cl, director, .*, uniform, vds\."
+        ValueError, match=r"deimos\.goals\.selectors has no 'nope'; it has: boltzmann, cl, director, .*, uniform, vds\."
     ):
         plugins.load(selectors, "nope")
 
@@ -312,12 +410,12 @@ def test_dropped_in_file_is_a_selector(tmp_path, monkeypatch, capsys):
 
 
 def test_entry_point_is_a_selector(tmp_path, monkeypatch, capsys):
-    """A module of another distribution that is registered under ``deimos.goals.selectors`` is a selector too."""
+    """A module of another distribution that is registered under ``deimos.selectors`` is a selector too."""
     (tmp_path / "other_module.py").write_text(SELECTOR)
     information = tmp_path / "other-1.0.dist-info"
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[deimos.goals.selectors]\nfurthest = other_module\n")
+    (information / "entry_points.txt").write_text("[deimos.selectors]\nfurthest = other_module\n")
     before = plugins.names(selectors)
     monkeypatch.syspath_prepend(str(tmp_path))
     try:

@@ -1,4 +1,4 @@
-"""An arm on a legged robot: kinematics, goals and their validity, judgement, resets."""
+"""An arm on a legged robot: kinematics, goals and their validity, evaluation, resets."""
 
 import dataclasses
 import math
@@ -6,12 +6,15 @@ import math
 import numpy as np
 import pytest
 import warp as wp
+from deimos.kernels.episodes import make_worlds
 from deimos.kernels.goals import draw_candidates
-from deimos.kernels.legged.arm import judge_arms, reset_arms
+from deimos.kernels.legged.arm import evaluate_arms, reset_arms
 from deimos.kernels.legged.arm_goals import (
+    ARM,
     SHELL_HIGH,
     SHELL_LOW,
     Arm,
+    check_arm,
     end_effector,
     goal_of_place,
     is_clear,
@@ -21,19 +24,21 @@ from deimos.kernels.legged.arm_goals import (
 from deimos.kernels.legged.arm_rewards import ARM_TERMS, ArmWeights, vecA
 from deimos.kernels.legged.state import (
     COLUMNS,
-    COUNTERS,
     NUM_COLUMNS,
+    TABLES,
+    LeggedWorlds,
     LocomotionParams,
-    LocomotionState,
-    LocomotionStep,
-    Simulation,
+    build,
+    make_params,
+    sizes,
 )
 from deimos.kernels.random import Purpose
 from scipy import stats
 
-from deimos.sim.legged.robots import rx150
+from deimos.sim.legged.robots import go1_rx150 as rx150
 
-J, G, OBS_START, OBS = 17, 6, 60, 70
+J, G, OBS_START, OBS, POINTS = 17, 6, 66, 76, 7
+TIP = slice(OBS_START, OBS_START + 3)  # of the observation: the end effector
 DT, CELL, CORNER = 0.02, 0.1, (-6.0, -8.0)
 GARBAGE = 7.0
 OFFSETS = np.array(rx150.OFFSETS) + np.array([rx150.MOUNT, *[(0.0, 0.0, 0.0)] * 5])
@@ -42,7 +47,6 @@ ORIGIN = np.add(rx150.SHOULDER, (0.0, 0.0, 0.325))
 BODY_LOW, BODY_HIGH = np.array([-0.3, -0.2, -9.0]), np.array([0.3, 0.2, -0.06])
 MIDDLE, HALF = (np.array(SHELL_HIGH) + SHELL_LOW) / 2, (np.array(SHELL_HIGH) - SHELL_LOW) / 2
 MOST = 64  # draws of one goal
-INTEGERS = (*COUNTERS, "overflow")
 
 
 @wp.kernel
@@ -62,11 +66,9 @@ def _geometry(
     clear[i] = is_clear(arm, goal[i])
 
 
-def make_arm(device, low=BODY_LOW, high=BODY_HIGH):
+def make_arm(device, low=BODY_LOW, high=BODY_HIGH, n=1):
     """The ReactorX-150 on a Go1, with some box to keep out of."""
-    arm = Arm()
-    arm.offset = wp.array(OFFSETS, dtype=wp.vec3, device=device)
-    arm.axis = wp.array(AXES, dtype=wp.vec3, device=device)
+    arm = build(ARM, device, offset=OFFSETS, axis=AXES, error=np.full(n, GARBAGE))
     arm.origin, arm.body_low, arm.body_high = wp.vec3(*ORIGIN), wp.vec3(*low), wp.vec3(*high)
     arm.weight, arm.obs_start, arm.clearance = vecA(*dataclasses.astuple(ArmWeights())), OBS_START, 0.035
     return arm
@@ -145,47 +147,59 @@ def make_world(n, seed=0):
         "part_force": np.zeros((4, n, 13)), "overflow": np.zeros(n),
         "goal": rng.uniform(-1, 1, (n, G)), "action": rng.normal(size=(n, J)), "joint_speed": np.zeros((n, J)),
         "air_time": np.zeros((n, 4)), "tracked": np.zeros((n, 2)), "wanted": rng.normal(size=(n, J)),
-        "foot_contact": np.zeros(n), "level": np.zeros(n), "goal_clock": np.zeros(n), "episode_step": np.zeros(n),
-        "episode_count": rng.integers(1, 5, n), "goal_count": np.zeros(n),
+        "foot_contact": np.zeros(n), "level": np.zeros(n), "goal_start": np.zeros((n, 3)), "progress": np.zeros((n, 4)),
+        "episode_count": rng.integers(1, 5, n),
     }  # fmt: skip
 
 
 class World:
     """The same on a device, with outputs that no kernel has written yet."""
 
-    def __init__(self, arrays, device):
+    def __init__(self, arrays, device, *, seed=9, world_offset=50, heights=None, arm=None):
         n = len(arrays["qpos"])
-        self.device, self.arm = device, make_arm(device)
-        self.params = LocomotionParams()
-        self.params.dt, self.params.action_bound, self.params.max_speed, self.params.max_rate = DT, 100.0, 20.0, 500.0
-        self.params.cell, self.params.corner, self.params.seed, self.params.world_offset = CELL, wp.vec2(*CORNER), 9, 50
-        self.sim, self.state, self.out = Simulation(), LocomotionState(), LocomotionStep()
-        for struct, names in ((self.sim, Simulation.vars), (self.state, LocomotionState.vars)):
-            for name in names:
-                dtype = wp.vec2 if name == "tracked" else wp.int32 if name in INTEGERS else wp.float32
-                setattr(struct, name, wp.array(arrays[name], dtype=dtype, device=device))
-        for name, width in (("obs", OBS), ("tracking", 3), ("term", NUM_COLUMNS + len(ARM_TERMS))):
-            setattr(self.out, name, wp.full((n, width), GARBAGE, dtype=wp.float32, device=device))
-        self.action = to_array(arrays["wanted"], device)
-        self.heights = to_array(heights_reference(), device)
-        self.error = wp.full(n, GARBAGE, dtype=wp.float32, device=device)
-
-    def judge(self):
-        """One ``judge_arms``."""
-        judge_arms(
-            self.params, self.arm, self.heights, self.action, self.sim, self.state, self.out, self.error
+        self.arm = arm or make_arm(device, n=n)
+        self.worlds = make_worlds(
+            n, device, obs_dim=OBS, action_dim=J, goal_start=9, goal_scale=[2.0, 2.0, 0.25, 1.0, 1.0, 1.0],
+            goal_period=500, seed=seed, world_offset=world_offset, num_groups=3,
         )  # fmt: skip
-        return {name: getattr(self.out, name).numpy() for name in ("obs", "tracking", "term")} | {
-            "error": self.error.numpy()
-        }
+        for name in ("goal", "episode_count"):
+            getattr(self.worlds, name).assign(arrays[name])
+        self.worlds.action.assign(arrays["wanted"])
+        for name in ("obs", "tracking"):
+            getattr(self.worlds, name).fill_(GARBAGE)
+        heights = heights_reference() if heights is None else heights
+        values = arrays | {
+            "term": np.full((n, NUM_COLUMNS + len(ARM_TERMS)), GARBAGE), "value": np.zeros(n), "pose": np.zeros(J),
+            "action_scale": np.zeros(J), "low": np.zeros(J), "high": np.zeros(J),
+            "action_low": np.full(J, -100.0), "action_high": np.full(J, 100.0), "heights": heights,
+            "origin": np.zeros((1, 1, 3)), "noise": np.zeros(OBS), "point": np.zeros((POINTS, 2)),
+        }  # fmt: skip
+        params = {name: getattr(LocomotionParams(), name) for name in LocomotionParams.vars} | {
+            "dt": DT, "max_speed": 20.0, "max_rate": 500.0, "cell": CELL,
+            "corner": wp.vec2(*CORNER),
+        }  # fmt: skip
+        self.legged = LeggedWorlds(
+            sizes=sizes(
+                num_envs=n, num_joints=J, substeps=4, num_points=POINTS, heights=heights.shape, goal_dim=G,
+                num_groups=3, num_terms=NUM_COLUMNS + len(ARM_TERMS), arm_fields=3,
+            ),
+            params=make_params(**params),
+            worlds=self.worlds,
+            **{label: build(table, device, **values) for label, table in TABLES.items() if label != "worlds"},
+        )  # fmt: skip
+        check_arm(self.arm, self.legged)
+
+    def evaluate(self):
+        """One ``evaluate_arms``."""
+        evaluate_arms(self.legged, self.arm)
+        out = {"obs": self.worlds.obs, "tracking": self.worlds.tracking, "term": self.legged.out.term}
+        return {name: array.numpy() for name, array in (out | {"error": self.arm.error}).items()}
 
     def reset(self, mask, goal_range):
         """One ``reset_arms``."""
-        scale = to_array([2.0, 2.0, 0.25, 1.0, 1.0, 1.0], self.device)
-        reset_arms(
-            self.params, self.arm, self.heights, wp.array(mask, dtype=wp.bool, device=self.device),
-            to_array(goal_range, self.device), scale, self.sim.qpos, self.state, self.out.obs, self.error,
-        )  # fmt: skip
+        self.worlds.mask.assign(mask)
+        self.worlds.first_range.assign(goal_range)
+        reset_arms(self.legged, self.arm)
 
 
 def place_of(qpos):
@@ -226,10 +240,10 @@ def test_goals_map_to_places_and_back(device):
 
 
 @pytest.mark.parametrize("n", [1, 130])
-def test_judgement_matches_reference(device, n):
+def test_evaluation_matches_reference(device, n):
     """Terms, tracking, observation and error equal plain NumPy from the same state, on sloping ground."""
     arrays = make_world(n, seed=n)
-    out = World(arrays, device).judge()
+    out = World(arrays, device).evaluate()
     for i in range(n):
         place = place_of(arrays["qpos"][i])
         seen, goal = goal_reference(place), arrays["goal"][i, 3:]
@@ -245,9 +259,9 @@ def test_judgement_matches_reference(device, n):
         slack = 1e-6 / max(0.01, math.hypot(place[0], place[1]))
         np.testing.assert_allclose(out["term"][i, NUM_COLUMNS:], terms, rtol=1e-4 + 10 * slack, atol=1e-7)
         np.testing.assert_allclose(out["tracking"][i, 2], values["reach"], rtol=1e-4 + 10 * slack)
-        np.testing.assert_allclose(out["obs"][i, OBS_START:63], np.clip(seen, -2, 2), rtol=0, atol=1e-4 + slack)
+        np.testing.assert_allclose(out["obs"][i, TIP], np.clip(seen, -2, 2), rtol=0, atol=1e-4 + slack)
         np.testing.assert_allclose(out["error"][i], distance, rtol=0, atol=2e-6)
-    assert np.all(np.delete(out["obs"], np.r_[OBS_START:63], axis=1) == GARBAGE)
+    assert np.all(np.delete(out["obs"], TIP, axis=1) == GARBAGE)
     assert np.all(out["term"][:, :NUM_COLUMNS] == GARBAGE)
     assert np.all(out["tracking"][:, :2] == GARBAGE)
 
@@ -258,14 +272,14 @@ def test_a_goal_that_is_met_earns_all(device):
     arrays["qpos"][:, 3:7] = (1, 0, 0, 0)
     places = np.array([place_of(q) for q in arrays["qpos"]])
     arrays["goal"][:, 3:] = [goal_reference(place) for place in places]
-    out = World(arrays, device).judge()
+    out = World(arrays, device).evaluate()
     far = np.hypot(places[:, 0], places[:, 1]) > 0.05
     assert far.sum() > 80
     np.testing.assert_allclose(out["error"], 0, atol=2e-6)
     np.testing.assert_allclose(out["term"][far, NUM_COLUMNS], 0.5 * DT, rtol=1e-4)
     np.testing.assert_allclose(out["term"][:, NUM_COLUMNS + 1], ArmWeights().precision * DT, rtol=1e-4)
     seen = np.clip(arrays["goal"][far, 3:], -2, 2)
-    np.testing.assert_allclose(out["obs"][far, OBS_START:63], seen, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(out["obs"][far, TIP], seen, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -275,9 +289,9 @@ def test_a_goal_that_is_met_earns_all(device):
 def test_worlds_that_are_not_physical_are_left_alone(device, name, column, value):
     """Nothing is written of a broken world, and no bit of its neighbours' changes."""
     arrays = make_world(5)
-    sound = World(arrays, device).judge()
+    sound = World(arrays, device).evaluate()
     arrays[name][2, column] = value
-    broken = World(arrays, device).judge()
+    broken = World(arrays, device).evaluate()
     for key, array in broken.items():
         assert np.all(array[2] == GARBAGE), key
         np.testing.assert_array_equal(np.delete(array, 2, 0), np.delete(sound[key], 2, 0), err_msg=key)
@@ -287,30 +301,30 @@ def test_torch_sees_the_error_in_place(device):
     """The error's torch view is the memory that the kernel writes."""
     torch = pytest.importorskip("torch")
     world = World(make_world(4), device)
-    view = wp.to_torch(world.error)
-    assert view.data_ptr() == world.error.ptr
+    view = wp.to_torch(world.arm.error)
+    assert view.data_ptr() == world.arm.error.ptr
     assert torch.all(view == GARBAGE)
-    world.judge()
-    np.testing.assert_array_equal(view.cpu().numpy(), world.error.numpy())
+    world.evaluate()
+    np.testing.assert_array_equal(view.cpu().numpy(), world.arm.error.numpy())
     assert not torch.any(view == GARBAGE)
 
 
 def draw(device, n, count, scale, *, arm=None, seed=3, world_offset=20, heights=None):
     """Candidates before and after ``redraw_candidates``, each (n, count, 6); robots face x at the world's origin."""
+    arrays = make_world(n)
+    arrays["qpos"] = np.zeros((n, 7 + J))
+    arrays["qpos"][:, 3] = 1.0
+    ground = np.zeros((121, 161)) if heights is None else heights
+    world = World(
+        arrays, device, seed=seed, world_offset=world_offset, heights=ground, arm=arm or make_arm(device, n=n)
+    )
+    world.worlds.goal_count.assign(np.arange(n) % 4)
     row = wp.array(np.arange(n), dtype=wp.int32, device=device)
-    goal_count = wp.array(np.arange(n) % 4, dtype=wp.int32, device=device)
     scale = to_array(scale, device)
     candidate = wp.full((n, count, G), np.nan, dtype=wp.float32, device=device)
-    draw_candidates(row, goal_count, scale, candidate, seed=seed, world_offset=world_offset)
+    draw_candidates(row, world.worlds.goal_count, scale, candidate, seed=seed, world_offset=world_offset)
     first = candidate.numpy().copy()
-    params = LocomotionParams()
-    params.cell, params.corner, params.seed, params.world_offset = CELL, wp.vec2(*CORNER), seed, world_offset
-    ground = to_array(np.zeros((121, 161)) if heights is None else heights, device)
-    qpos = np.zeros((n, 7 + J))
-    qpos[:, 3] = 1.0
-    redraw_candidates(
-        params, arm or make_arm(device), ground, to_array(qpos, device), row, goal_count, scale, candidate
-    )  # fmt: skip
+    redraw_candidates(world.legged, world.arm, row, scale, candidate).launch()
     return first, candidate.numpy()
 
 
@@ -372,7 +386,7 @@ def test_no_goal_is_ever_invalid_and_valid_ones_are_uniform(device):
 def test_where_no_goal_is_valid_it_is_the_middle(device):
     """After the last draw the arm's part is 0: a place before the shoulder."""
     everywhere = np.full(3, 1e3)
-    goals = draw(device, 3, 4, np.ones(6), arm=make_arm(device, -everywhere, everywhere))[1]
+    goals = draw(device, 3, 4, np.ones(6), arm=make_arm(device, -everywhere, everywhere, n=3))[1]
     assert np.all(goals[..., 3:] == 0)
     assert clear_reference([np.zeros(3)])[0]
 
@@ -383,9 +397,9 @@ def test_reset_matches_reference(device, uniform_reference):
     goal_range = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.5], np.float32)
     mask = np.arange(120) % 3 > 0
     world = World(arrays, device)
-    before = world.state.goal.numpy().copy()
+    before = world.worlds.goal.numpy().copy()
     world.reset(mask, goal_range)
-    goals, obs, error = world.state.goal.numpy(), world.out.obs.numpy(), world.error.numpy()
+    goals, obs, error = world.worlds.goal.numpy(), world.worlds.obs.numpy(), world.arm.error.numpy()
     changed = 0
     for i in range(120):
         if not mask[i]:
@@ -411,54 +425,46 @@ def test_terms_have_names_of_their_own():
 
 
 @pytest.mark.parametrize(
-    ("struct", "name", "shape", "message"),
+    ("name", "shape", "message"),
     [
-        ("sim", "qpos", (5, 19), r"sim.qpos must be float32\(5, 24\).*got float32\(5, 19\)"),
-        ("state", "goal", (5, 3), r"state.goal must be float32\(5, 6\)"),
-        ("out", "term", (5, 12), r"out.term must be float32\(5, 16\)"),
-        ("out", "tracking", (5, 2), r"out.tracking must be float32\(5, 3\)"),
-        ("out", "obs", (5, 62), r"out.obs must be float32\(5, 63\)"),
-        ("arm", "axis", (4,), r"arm.axis must be vec3.*\(5,\)"),
+        ("axis", (4,), r"arm.axis must be vec3f\(5,\).*got vec3f\(4,\)"),
+        ("offset", (5,), r"arm.offset must be vec3f\(6,\).*got vec3f\(5,\)"),
+        ("error", (4,), r"arm.error must be float32\(5,\).*got float32\(4,\)"),
     ],
 )
-def test_judge_rejects_arrays_of_another_shape(device, struct, name, shape, message):
-    """The message names the array, what it must be and what it was."""
-    world = World(make_world(5), device)
-    dtype = wp.vec3 if struct == "arm" else wp.float32
-    setattr(getattr(world, struct), name, wp.zeros(shape, dtype=dtype, device=device))
+def test_rejects_an_arm_of_other_joints(device, name, shape, message):
+    """An arm has the joints that are not the legs'; the message names the array, what it must be and what it was."""
+    arm = make_arm(device, n=5)
+    setattr(arm, name, wp.zeros(shape, dtype=ARM.dtype(name), device=device))
     with pytest.raises(ValueError, match=message):
-        world.judge()
+        World(make_world(5), device, arm=arm)
 
 
-@pytest.mark.parametrize("call", ["judge", "reset"])
-@pytest.mark.parametrize("name", LocomotionState.vars)
-def test_rejects_a_wrong_state(device, call, name):
-    """Judgement and reset check every array of the state, and the message names it."""
-    world = World(make_world(5), device)
-    array = getattr(world.state, name)
-    setattr(world.state, name, wp.zeros((4, *array.shape[1:]), dtype=array.dtype, device=device))
-    with pytest.raises(ValueError, match=rf"^state.{name} must be \w+\(5,.*got \w+\(4,"):
-        world.judge() if call == "judge" else world.reset(np.ones(5, bool), np.ones(G))
+@pytest.mark.parametrize(
+    ("label", "name", "shape", "message"),
+    [
+        ("sim", "qpos", (5, 19), r"sim.qpos must be float32\(5, 24\).*got float32\(5, 19\)"),
+        ("worlds", "goal", (5, 3), r"worlds.goal must be float32\(5, 6\)"),
+        ("worlds", "first_range", (3,), r"worlds.first_range must be float32\(6,\).*got float32\(3,\)"),
+        ("out", "term", (5, 12), r"out.term must be float32\(5, 16\)"),
+        ("worlds", "tracking", (5, 2), r"worlds.tracking must be float32\(5, 3\)"),
+        ("worlds", "obs", (5, 62), r"worlds.obs must be float32\(5, 76\)"),
+    ],
+)
+def test_rejects_arrays_without_the_arm(device, label, name, shape, message):
+    """What robots with an arm have more of is checked with all the rest."""
+    legged = World(make_world(5), device).legged
+    setattr(getattr(legged, label), name, wp.zeros(shape, dtype=wp.float32, device=device))
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(legged)
 
 
-@pytest.mark.parametrize("name", ["qpos", "qvel", "torque", "overflow"])
-def test_judge_rejects_a_wrong_simulation(device, name):
-    """So does the judgement with what it reads of the simulator."""
-    world = World(make_world(5), device)
-    array = getattr(world.sim, name)
-    setattr(world.sim, name, wp.zeros((4, *array.shape[1:]), dtype=array.dtype, device=device))
-    with pytest.raises(ValueError, match=rf"^sim.{name} must be \w+\(5,.*got \w+\(4,"):
-        world.judge()
-
-
-def test_others_reject_arrays_of_another_shape(device):
-    """Likewise the redraw and the reset."""
-    with pytest.raises(ValueError, match=r"goal_range must be float32\(6,\).*got float32\(3,\)"):
-        World(make_world(5), device).reset(np.ones(5, bool), np.ones(3))
-    ints = wp.zeros(2, dtype=wp.int32, device=device)
+def test_redraws_reject_arrays_of_another_shape(device):
+    """Candidates have all components of a goal."""
+    world, ints = World(make_world(5), device), wp.zeros(2, dtype=wp.int32, device=device)
+    right, short = (wp.zeros((2, 4, width), dtype=wp.float32, device=device) for width in (6, 3))
+    scale = to_array(np.ones(6), device)
     with pytest.raises(ValueError, match=r"candidate must be float32\(2, 4, 6\).*got float32\(2, 4, 3\)"):
-        redraw_candidates(
-            LocomotionParams(), make_arm(device), to_array(np.zeros((9, 9)), device),
-            to_array(np.zeros((2, 7 + J)), device), ints, ints, to_array(np.ones(6), device),
-            wp.zeros((2, 4, 3), device=device),
-        )  # fmt: skip
+        redraw_candidates(world.legged, world.arm, ints, scale, short)
+    with pytest.raises(ValueError, match=r"scale must be float32\(6,\).*got float32\(3,\)"):
+        redraw_candidates(world.legged, world.arm, ints, to_array(np.ones(3), device), right)

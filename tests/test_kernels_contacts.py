@@ -3,21 +3,22 @@
 import numpy as np
 import pytest
 import warp as wp
-from deimos.kernels.legged.contacts import TERRAIN, UNWATCHED, Contacts, gather_contacts, peak_force
+from deimos.kernels.legged.contacts import CONTACTS, TERRAIN, UNWATCHED, gather_contacts, peak_force
+from deimos.kernels.legged.state import build
 
 WORLDS, PARTS, ROWS, SUBSTEPS = 7, 5, 40, 3
 PART_OF_GEOM = np.array([TERRAIN, 0, 0, 1, 2, 3, 4, UNWATCHED], np.int32)
 
 
-def make_case(seed=0, found=60, room=80):
+def make_case(seed=0, found=60, buffer=80):
     """Random contacts; some are not in the solution, some between two parts of a robot."""
     rng = np.random.default_rng(seed)
     case = {
         "count": np.array([found]),
-        "world": rng.integers(WORLDS, size=room),
-        "geom": np.stack([np.zeros(room, int), rng.integers(1, len(PART_OF_GEOM), size=room)], axis=1),
-        "dim": rng.choice([1, 3], size=room),
-        "row": np.repeat(rng.integers(0, ROWS - 4, size=room)[:, None], 4, axis=1) + np.arange(4),
+        "world": rng.integers(WORLDS, size=buffer),
+        "geom": np.stack([np.zeros(buffer, int), rng.integers(1, len(PART_OF_GEOM), size=buffer)], axis=1),
+        "dim": rng.choice([1, 3], size=buffer),
+        "row": np.repeat(rng.integers(0, ROWS - 4, size=buffer)[:, None], 4, axis=1) + np.arange(4),
         "force": rng.uniform(0, 20, size=(WORLDS, ROWS)).astype(np.float32),
     }
     case["geom"][::5] = rng.integers(1, len(PART_OF_GEOM), size=(len(case["geom"][::5]), 2))  # without the terrain
@@ -26,22 +27,16 @@ def make_case(seed=0, found=60, room=80):
     return case
 
 
-def to_warp(case, device):
-    """The case as the launcher takes it."""
-    contacts = Contacts()
-    for name, value in case.items():
-        dtype = {"geom": wp.vec2i, "force": wp.float32}.get(name, wp.int32)
-        setattr(contacts, name, wp.array(value, dtype=dtype, device=device))
-    return contacts
-
-
 def run(case, device, substeps=SUBSTEPS, substep=1):
     """Part forces and peaks after one gathering."""
-    part_force = wp.zeros((substeps, WORLDS, PARTS), dtype=wp.float32, device=device)
-    peak = wp.zeros(2, dtype=wp.int32, device=device)
-    geom_part = wp.array(PART_OF_GEOM, dtype=wp.int32, device=device)
-    gather_contacts(to_warp(case, device), geom_part, part_force, peak, substep=substep)
-    return part_force.numpy(), peak.numpy()
+    part_force = np.zeros((substeps, WORLDS, PARTS))
+    contacts = build(CONTACTS, device, **case, geom_part=PART_OF_GEOM, part_force=part_force, peak=np.zeros(2))
+    CONTACTS.require(
+        "contacts", contacts, contacts.peak, num_envs=WORLDS, buffer=len(case["world"]), edges=4, rows=ROWS,
+        num_geoms=len(PART_OF_GEOM), substeps=substeps, parts=PARTS,
+    )  # fmt: skip
+    gather_contacts(contacts, substep=substep)
+    return contacts.part_force.numpy(), contacts.peak.numpy()
 
 
 def gather_reference(case):
@@ -72,8 +67,8 @@ def test_matches_reference(device, found):
     assert found < 2 or (expected > 0).sum() > 5
 
 
-def test_contacts_beyond_the_room_are_counted_but_not_read(device):
-    """More contacts than there is room for: those that are there count, and the peak says how many were found."""
+def test_contacts_beyond_the_buffer_are_counted_but_not_read(device):
+    """More contacts than the buffer holds: those that are there count, and the peak says how many were found."""
     case = make_case(found=1000)
     force, peak = run(case, device)
     np.testing.assert_allclose(force[1], gather_reference(case)[0], rtol=320 * 2.0**-24, atol=0)
@@ -82,7 +77,7 @@ def test_contacts_beyond_the_room_are_counted_but_not_read(device):
 
 def test_pyramid_edges_add_up_to_the_normal_force(device):
     """A contact with friction has four edges whose forces add up; without friction it has one row."""
-    case = make_case(found=2, room=2)
+    case = make_case(found=2, buffer=2)
     case |= {"world": np.array([3, 3]), "dim": np.array([3, 1]), "geom": np.array([[0, 3], [4, 0]])}
     case["row"] = np.array([[10, 11, 12, 13], [20, -1, -1, -1]])
     case["force"][3, [10, 11, 12, 13, 20]] = [1.0, 2.0, 4.0, 8.0, 16.0]
@@ -92,7 +87,7 @@ def test_pyramid_edges_add_up_to_the_normal_force(device):
 
 def test_rows_that_did_not_fit_are_not_read(device):
     """A contact whose last rows lie beyond the constraint buffer counts with those that fit."""
-    case = make_case(found=1, room=1)
+    case = make_case(found=1, buffer=1)
     case |= {"world": np.array([2]), "dim": np.array([3]), "geom": np.array([[0, 1]])}
     case["row"] = np.array([[ROWS - 2, ROWS - 1, ROWS, ROWS + 1]])
     case["force"][2, -2:] = [3.0, 5.0]
@@ -119,7 +114,7 @@ def test_peak_is_the_largest_substep(device, substeps):
 
 def test_one_contact_more_is_its_force_more(device):
     """Forces add up over contacts: all at once equals one after another, whatever their order."""
-    case = make_case(found=20, room=20)
+    case = make_case(found=20, buffer=20)
     case["force"] = np.round(case["force"])  # whole numbers add without rounding
     whole, _ = run(case, device)
     order = np.random.default_rng(2).permutation(20)
@@ -132,6 +127,7 @@ def test_one_contact_more_is_its_force_more(device):
     [
         ("count", np.zeros(2), r"contacts.count must be int32\(1,\)"),
         ("dim", np.zeros(3), r"contacts.dim must be int32\(80,\).*got int32\(3,\)"),
+        ("geom", np.zeros((3, 2)), r"contacts.geom must be vec2i\(80,\).*got vec2i\(3,\)"),
         ("row", np.zeros((3, 4)), r"contacts.row must be int32\(80, 4\).*got int32\(3, 4\)"),
         ("force", np.zeros((2, ROWS)), r"contacts.force must be float32\(7, 40\).*got float32\(2, 40\)"),
     ],

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import warp as wp
-from deimos.kernels.legged.height_scan import require_heights, sample_height, sample_minimum, scan_points
+from deimos.kernels.legged.height_scan import sample_height, sample_minimum, scan_points
+from deimos.kernels.legged.state import GROUND, build
 
 U = 2.0**-24  # relative error of one float32 operation
 CELL = 0.05  # [m]
@@ -139,15 +140,21 @@ def test_points_are_legged_gyms():
 @pytest.mark.parametrize(
     ("shape", "dtype", "message"),
     [
-        ((1, 41), wp.float32, r"ground must be float32\(2, 41\).*got float32\(1, 41\)"),
-        ((41, 0), wp.float32, r"ground must be float32\(41, 2\).*got float32\(41, 0\)"),
-        ((41,), wp.float32, r"ground must have 2 axes, got the shape \(41,\)"),
-        ((41, 41), wp.float64, r"ground must be float32\(41, 41\).*got float64"),
+        ((1, 41), wp.float32, r"ground.heights must be float32\(61, 41\).*got float32\(1, 41\)"),
+        ((61, 0), wp.float32, r"ground.heights must be float32\(61, 41\).*got float32\(61, 0\)"),
+        ((61,), wp.float32, r"'heights' expects an array with 2 dimension.*got 1"),
+        ((61, 41), wp.float64, r"'heights' expects dtype float32, got float64"),
     ],
 )
 def test_rejects_what_is_no_grid(device, shape, dtype, message):
     """The message says what a height grid must be and what it was."""
-    like = wp.zeros(3, dtype=wp.int32, device=device)
-    require_heights("ground", wp.zeros((2, 2), dtype=wp.float32, device=device), like)
-    with pytest.raises(ValueError, match=message):
-        require_heights("ground", wp.zeros(shape, dtype=dtype, device=device), like)
+    ground = build(GROUND, device, heights=make_ground(), origin=np.zeros((1, 1, 3)))
+    sizes = {"nx": SHAPE[0], "ny": SHAPE[1], "levels": 1, "columns": 1}
+    GROUND.require("ground", ground, ground.heights, **sizes)
+
+    def check():
+        ground.heights = wp.zeros(shape, dtype=dtype, device=device)  # a struct knows types and axes, a table lengths
+        GROUND.require("ground", ground, ground.origin, **sizes)
+
+    with pytest.raises((TypeError, ValueError), match=message):
+        check()

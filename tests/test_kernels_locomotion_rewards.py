@@ -1,8 +1,14 @@
 """The legged robots' reward terms, each against plain NumPy."""
 
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import pytest
 import warp as wp
+from deimos.kernels.legged import arm_rewards, rewards
 from deimos.kernels.legged.rewards import (
     TERMS,
     LegMotion,
@@ -11,6 +17,7 @@ from deimos.kernels.legged.rewards import (
     vecT,
     weighted_terms,
 )
+from deimos.kernels.legged.terms import functions_of
 
 DT = 0.02
 N = 64
@@ -169,3 +176,66 @@ def test_default_weights_are_those_of_the_a1(device):
         "air_time": 1.0,
     }  # fmt: skip
     assert vars(RewardWeights()) == a1 | {"tilt": -1.0}
+
+
+ADDED = {
+    rewards: ("LegMotion", "RewardWeights", "sideways_speed", "wp.abs(m.velocity[1])"),
+    arm_rewards: ("ArmMotion", "ArmWeights", "arm_distance", "m.distance"),
+}
+"""What a term that somebody adds reads, and its weight, function and formula."""
+
+
+@pytest.fixture(params=ADDED, ids=lambda module: module.__name__)
+def extended(request, tmp_path, monkeypatch):
+    """A rewards file to which a term was added, by a function and a weight of its name and nothing else."""
+    motion, weights, name, formula = ADDED[request.param]
+    lines = Path(request.param.__file__).read_text().splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith(f"class {weights}"))
+    end = next(i for i in range(at, len(lines)) if lines[i].startswith(tuple("ABCDEFGHIJKLMNOPQRSTUVWXYZ")))
+    lines[end:end] = [f"    {name}: float = 3.0", '    """A new term."""', ""]
+    at = next(i for i, line in enumerate(lines) if line.startswith("_FUNCTIONS"))
+    lines[at:at] = ["@wp.func", f"def {name}(m: {motion}) -> float:", f"    return {formula}", "", ""]
+    file = tmp_path / f"{request.param.__name__.rpartition('.')[2]}_extended.py"
+    file.write_text("\n".join(lines))
+    spec = importlib.util.spec_from_file_location(f"deimos.kernels.legged.{file.stem}", file)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    return module, name
+
+
+def test_a_term_is_one_function_and_one_weight(extended, device):
+    """A term that is added to its file alone has a name for the log and is weighted under it, the others as before."""
+    module, name = extended
+    if hasattr(module, "RewardWeights"):
+        vector, motion, weigh, terms = module.vecT, module.LegMotion, module.weighted_terms, module.TERMS
+    else:
+        vector, motion, weigh, terms = module.vecA, module.ArmMotion, module.weighted_arm_terms, module.ARM_TERMS
+
+    @wp.kernel(module="unique")
+    def weigh_one(weight: vector, term: wp.array[vector]):
+        m = motion()
+        m.dt = 0.5
+        if wp.static("distance" in motion.vars):
+            m.distance = 2.0
+        else:
+            m.velocity = wp.vec3(0.0, -2.0, 0.0)
+        term[0] = weigh(m, weight)
+
+    assert terms[-1] == name
+    term = wp.full(1, vector(np.nan), dtype=vector, device=device)
+    weight = vector(*[float(each == name) * 3.0 for each in terms])
+    wp.launch(weigh_one, dim=1, inputs=[weight], outputs=[term], device=device)
+    assert term.numpy()[0].tolist() == [0.0] * (len(terms) - 1) + [0.5 * 3.0 * 2.0]
+
+
+def test_a_weight_without_a_function_is_named():
+    """Whoever forgets the function learns so when the file is imported, and which one it is."""
+
+    @dataclass
+    class Weights:
+        tilt: float = 1.0
+        wobble: float = 1.0
+
+    with pytest.raises(NameError, match=r"Weights has weights without a @wp.func of the same name: wobble\."):
+        functions_of(Weights, {"tilt": rewards.tilt, "wobble": 3})

@@ -5,9 +5,9 @@ import zipfile
 
 import numpy as np
 import pytest
-from deimos.terrain import files
 
-from deimos import terrain
+from deimos import files, terrain
+from deimos.checks import RunError
 
 
 def make_terrain(**changes):
@@ -58,7 +58,7 @@ def test_failed_write_leaves_what_was_there(tmp_path):
         file.write(b"half")
         raise OSError("disk full")
 
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(RunError, match="disk full"):
         files.write_whole(path, fail)
     assert path.read_bytes() == b"before"
     assert list(tmp_path.iterdir()) == [path]

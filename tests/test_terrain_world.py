@@ -148,9 +148,9 @@ def test_progress_counts_tiles_and_rays():
         ({"tile": 3.0}, r"platform must be smaller than tile = 3 m, got 3 m"),
         ({"hardest": 1.1}, r"hardest must be in \[0, 1\], got 1.1"),
         ({"easiest": -0.1}, r"easiest must be in \[0, 1\], got -0.1"),
-        ({"levels": 0}, r"levels must be a whole number of at least 1, got 0"),
-        ({"columns": 1.5}, r"columns must be a whole number of at least 1, got 1.5"),
-        ({"seed": -1}, r"seed must be a whole number of at least 0, got -1"),
+        ({"levels": 0}, r"levels must be at least 1, got 0"),
+        ({"columns": 1.5}, r"columns must be a whole number, got 1.5"),
+        ({"seed": -1}, r"seed must be at least 0, got -1"),
         ({"shapes": ()}, r"shapes must have at least one entry"),
         (
             {"shapes": (world.Share(shape=catalog.make("flat"), share=0.0),)},

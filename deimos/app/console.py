@@ -1,128 +1,129 @@
-"""What a person sees on the terminal: progress bars and small tables."""
+"""What all commands share: their dispatch, the parsing of options, progress bars, the way in which they are stopped.
+
+Importing it needs Python alone, so that ``deimos`` can say which packages are missing.
+"""
 
 import contextlib
-import math
-from collections.abc import Callable, Iterator
-from types import TracebackType
-from typing import TYPE_CHECKING
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from deimos.checks import RunError
 
-if TYPE_CHECKING:
-    from deimos.run.training import Trainer
+Command = Callable[[list[str], str], None]
+"""Runs on its arguments, under the name that a person calls it by, such as ``deimos study run``."""
 
 
-class TrainingBar:
-    """Iteration, frames per second, reward, crashes per 1000 transitions, time left."""
+def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments: list[str], program: str) -> None:
+    """Run the command that the first argument names; without one, list them all.
 
-    def __init__(self, trainer: "Trainer") -> None:
-        self._trainer = trainer
-        self._progress = Progress(
-            TextColumn("iteration {task.completed}/{task.total}"),
-            BarColumn(),
-            TextColumn("{task.fields[fps]:.0f} FPS  reward {task.fields[reward]:.3f}  "
-                       "crashes/1000 {task.fields[crashes]:.2f}"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )  # fmt: skip
-        self._task = self._progress.add_task(
-            "train", total=trainer.config.iterations, completed=trainer.iteration, fps=0.0, reward=0.0, crashes=0.0
-        )
+    Args:
+        commands: By name, one line about the command and the command.
+        about: What they do together.
+        arguments: What follows ``program`` on the command line.
+        program: How a person calls them.
 
-    def report(self, row: dict[str, float], fps: float) -> None:
-        """Show an iteration."""
-        self._progress.update(
-            self._task, completed=row["iteration"], fps=fps, reward=row["reward"], crashes=row["crashes_per_1000"]
-        )
+    Raises:
+        RunError: If there is no such command.
+    """
+    if not arguments or arguments[0] in ("-h", "--help"):
+        width = max(map(len, commands))
+        listed = [f"  {name:{width}}  {text}" for name, (text, _) in commands.items()]
+        print(about, f"usage: {program} COMMAND [OPTIONS]", "\n".join(["commands:", *listed]),
+              "Every command explains its options with --help.", sep="\n\n")  # fmt: skip
+        return
+    name, rest = arguments[0], arguments[1:]
+    if name not in commands:
+        asked = " ".join([*program.split()[1:], name])
+        raise RunError(f"There is no command '{asked}'; there are: {', '.join(commands)}.")
+    commands[name][1](rest, f"{program} {name}")
 
-    def __enter__(self) -> "TrainingBar":
-        self._progress.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
+def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
+    """The options that the arguments ask for, by tyro.
+
+    Raises:
+        RunError: If the arguments are wrong.
+        SystemExit: If only help was asked for.
+    """
+    import tyro
+
+    try:
+        from tyro._errors import on_parse_error  # since 1.0.17, and not promised
+    except ImportError:  # then tyro's own, framed words stay, with exit code 2
+        hook: Any = contextlib.nullcontext()
+    else:
+        hook = on_parse_error(_refuse)
+    with hook:
+        return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
+
+
+def _refuse(event: Any) -> None:
+    """Raise ``RunError`` in place of tyro's framed words; what is not known here stays with tyro."""
+    argument = getattr(event, "argument", None)
+    name = argument and argument.display_name()
+    match type(event).__name__:
+        case "InstantiationFailure":
+            raise RunError(f"{name}: {event.message}" if name else event.message)
+        case "InvalidChoice":
+            raise RunError(f"There is no '{event.value}' for {name}; there are: {', '.join(map(repr, event.choices))}.")
+        case "BadValue":
+            raise RunError(f"Missing value for argument '{name}'.")
+        case "UnrecognizedArgs":
+            raise RunError(f"Unrecognized options: {' '.join(event.tokens)}.")
+        case "MissingArgs":
+            arguments = [found.arg for found in event.missing_arguments]
+            about = [(each.display_name(), each.field.helptext) for each in arguments]
+            missing = [f"{name} ({text() if callable(text) else text})" for name, text in about]
+            raise RunError(f"Missing from {event.prog}: {', '.join(missing)}")
 
 
 @contextlib.contextmanager
-def stage_bar(title: str) -> Iterator[Callable[[str, float], None]]:
-    """A bar over named stages; gives the function that reports (stage, share done)."""
-    columns = (TextColumn(title + ": {task.description}"), BarColumn(), TaskProgressColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+def stage_bar(title: str = "") -> Iterator[Callable[[str, float], None]]:
+    """A bar over named stages that vanishes at the end; gives the function that reports (stage, fraction done)."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    columns = (TextColumn(title + "{task.description}"), BarColumn(), TaskProgressColumn())
+    screen = Console(stderr=True)
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
         task = progress.add_task("", total=1.0)
-        yield lambda stage, share: progress.update(task, description=stage, completed=share)
+        yield lambda stage, fraction: progress.update(task, description=stage, completed=fraction)
 
 
-def print_evaluation(rows: list[dict]) -> None:
-    """Print Naive beside Adversary."""
-    table = Table(title="Evaluation", title_justify="left")
-    table.add_column("")
-    for row in rows:
-        table.add_column(row["goals"].capitalize(), justify="right")
-    for label, name, form in (
-        ("score (0 does nothing, 1 reference)", "score", ".3f"),
-        ("reward per transition", "reward", ".4f"),
-        ("crashes", "crashes", "d"),
-        ("crashes per 1000 transitions", "crashes_per_1000", ".3f"),
-        ("crashes per robot-minute", "crashes_per_minute", ".3f"),
-        ("crashes per interaction", "crash_rate", ".4f"),
-        ("interactions", "interactions", "d"),
-        ("crashes under first goals", "first_goal_crashes", "d"),
-        ("Adversary's AUROC", "adversary_auroc", ".3f"),
-        ("Adversary's interactions", "adversary_interactions", "d"),
-        ("crashes among them", "adversary_crashes", "d"),
-    ):
-        cells = [_cell(row.get(name), form) for row in rows]
-        if set(cells) != {"-"}:
-            table.add_row(label, *cells)
-    for name in rows[0].get("errors", {}):
-        table.add_row(f"median error, {name}", *[_cell(row["errors"][name], ".3f") for row in rows])
-    groups = len(rows[0]["tracking"])
-    for i in range(groups if groups > 1 else 0):  # a single one is the reward
-        table.add_row(f"tracking of goal group {i}", *[_cell(row["tracking"][i], ".3f") for row in rows])
-    Console().print(table)
-    if any(row.get("weak_adversary") for row in rows):
-        Console().print("weak adversary: it has seen too few crashes, or ranks goals too badly, to prove much")
+@contextlib.contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C end the iteration instead of cutting it; a second one cuts."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: Any) -> None:
+        asked.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
-def print_audit(audit: dict) -> None:
-    """Print the audit of a fear network."""
-    table = Table(title="Fear network against exact outcomes", title_justify="left", show_header=False)
-    for label, name, form in (
-        ("AUROC within contexts", "auroc", ".3f"),
-        ("95 % interval, low", "low", ".3f"),
-        ("95 % interval, high", "high", ".3f"),
-        ("contexts with both outcomes", "contexts", "d"),
-        ("contexts tried", "tried", "d"),
-        ("crash share", "crash_share", ".3f"),
-        ("after iteration", "iteration", "d"),
-    ):
-        table.add_row(label, _cell(audit[name], form))
-    Console().print(table)
+def quiet_warp() -> None:
+    """Keep Warp's start-up report off the terminal, with its warning that there is no GPU; all else shows."""
+    import warp as wp
 
-
-def print_calibration(judged: dict[str, dict[str, float]]) -> None:
-    """Print how good the fear network's probabilities are, under each kind of goals."""
-    table = Table(title="Fear network's probabilities", title_justify="left")
-    table.add_column("goals")
-    for name in judged:
-        table.add_column(name, justify="right")
-    for name in next(iter(judged.values())):
-        form = ".0f" if name == "interactions" else ".4f"
-        table.add_row(name.replace("_", " "), *[_cell(quality[name], form) for quality in judged.values()])
-    Console().print(table)
-
-
-def print_timing(trainer: "Trainer") -> None:
-    """Print where the time of the iterations went."""
-    total = sum(trainer.seconds.values())
-    if total > 0:
-        shares = "  ".join(f"{name} {100 * seconds / total:.1f} %" for name, seconds in trainer.seconds.items())
-        Console().print(f"time: {shares}", highlight=False)
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None or (isinstance(value, float) and math.isnan(value)) else format(value, form)
+    wp.config.log_level = wp.LOG_WARNING
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)  # the warning is printed from C
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            said = [line for line in file.read().decode().splitlines() if "find or load the NVIDIA" not in line]
+            if said:
+                print(*said, sep="\n", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""``deimos play``: watch a trained policy, as a film or as single pictures."""
+"""``deimos play``: watch a trained policy, as a video or as single pictures."""
 
 import os
 import sys
@@ -6,23 +6,24 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 import tyro
 
-from deimos.checks import check_at_least, check_positive
+from deimos.app import console
+from deimos.checks import RunError, check_at_least, check_positive
 from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.selectors import uniform
 from deimos.learn.policy import load_policy
-from deimos.run.folder import RunError, RunFolder, load_tensors
+from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.training import SCHEMA, TrainConfig, read_config
+from deimos.run.trainer import TrainConfig
+from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
 
-if TYPE_CHECKING:
-    import mujoco
+RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,7 @@ class PlayOptions:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     video: Path | None = None
-    """Film to write (.mp4, .gif, ...)."""
+    """Video to write (.mp4, .gif, ...)."""
     frames: Path | None = None
     """Folder for single pictures instead; must not exist."""
     seconds: float = 10.0
@@ -49,7 +50,7 @@ class PlayOptions:
     world: int = 0
     """Global number of the world, at least 0: where it stands, and which goals it gets."""
     goal_period: int | None = None
-    """T: steps that a goal is in force. By default as in training."""
+    """T: steps that a goal is active. By default as in training."""
     seed: int = 1_000_003
     """Seed of the world and its goals, in [0, 2^32)."""
 
@@ -63,12 +64,10 @@ class PlayOptions:
             raise ValueError("Give one of --video FILE and --frames FOLDER.")
 
 
-def play(options: PlayOptions) -> Path:
-    """Render what ``options`` ask for; returns what was written.
-
-    Raises:
-        RunError: If there is nothing to render, or it cannot be written.
-    """
+def main(arguments: list[str], program: str) -> None:
+    """Run ``deimos play``."""
+    options: PlayOptions = console.parse(PlayOptions, arguments, program)
+    console.quiet_warp()
     _import_mujoco()
     folder = RunFolder.open(options.run)
     config = read_config(folder)
@@ -85,15 +84,13 @@ def play(options: PlayOptions) -> Path:
     loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
     afraid = _fear(folder, config, env)
     every = max(1, round(1.0 / (options.fps * env.dt)))
-    target = options.video or options.frames
-    assert target is not None
     with _camera(env, options) as picture, _writer(options, 1.0 / (every * env.dt)) as write:
         for t in range(round(options.seconds / env.dt)):
             if t % every == 0:
                 write(_captioned(picture(), _caption(env, afraid, t)))
             loop.advance(env.step(policy.scaled(env.obs)))
     env.check()
-    return target
+    print(options.video or options.frames)
 
 
 def _import_mujoco() -> None:
@@ -107,6 +104,8 @@ def _import_mujoco() -> None:
     try:
         import mujoco  # noqa: F401
     except Exception as error:  # ImportError, AttributeError (PyOpenGL without a library), RuntimeError, OSError
+        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
+            raise
         raise _unrenderable(error) from error
 
 
@@ -122,7 +121,7 @@ def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | No
     afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
     if afraid is None or afraid.parts:
         return None
-    state = load_tensors(folder.path / "checkpoint.pt", "checkpoint", SCHEMA)["loop"]["selector"]
+    state = load_checkpoint(folder)["loop"]["selector"]
     if "fear" not in state:  # it is a part of another selector
         return None
     afraid.load_state_dict(state)
@@ -142,7 +141,7 @@ def _caption(env: Env, afraid: FearSelector | None, t: int) -> str:
 
 @contextmanager
 def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]]:
-    """A camera that follows the robot of world 0."""
+    """A camera that follows the robot of world 0 and shows its goal, where it is a point, as a red ball."""
     import mujoco
 
     scene = env.scene(0)
@@ -161,31 +160,15 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
         assert found is not None
         camera.lookat[:] = found[1].qpos[:3]
         renderer.update_scene(found[1], camera)
-        point = env.goal_point(0)
-        if point is not None:
-            _add_ball(renderer.scene, point)
+        point, scene = env.goal_point(0), renderer.scene
+        if point is not None and scene.ngeom < scene.maxgeom:
+            ball, size, turn = mujoco.mjtGeom.mjGEOM_SPHERE, np.array([0.025, 0.0, 0.0]), np.eye(3).ravel()
+            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], ball, size, point.astype(float), turn, RED)
+            scene.ngeom += 1
         return renderer.render()
 
     with renderer:
         yield picture
-
-
-def _add_ball(scene: "mujoco.MjvScene", point: np.ndarray) -> None:
-    """Show a place as a red ball, if the scene has room for it."""
-    import mujoco
-
-    if scene.ngeom == scene.maxgeom:
-        return
-    size, colour = np.array([0.025, 0.0, 0.0]), np.array([0.9, 0.15, 0.1, 0.9], np.float32)
-    mujoco.mjv_initGeom(
-        scene.geoms[scene.ngeom],
-        mujoco.mjtGeom.mjGEOM_SPHERE,
-        size,
-        point.astype(np.float64),
-        np.eye(3).ravel(),
-        colour,
-    )
-    scene.ngeom += 1
 
 
 def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
@@ -201,7 +184,7 @@ def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
 
 @contextmanager
 def _writer(options: PlayOptions, fps: float) -> Iterator[Callable[[np.ndarray], Any]]:
-    """Writes pictures one after another; a film that is cut off does not stay."""
+    """Writes pictures one after another; a video that is cut off does not stay."""
     if options.frames is not None:
         from PIL import Image
 
@@ -219,14 +202,14 @@ def _writer(options: PlayOptions, fps: float) -> Iterator[Callable[[np.ndarray],
     if not options.video.parent.is_dir():
         raise RunError(f"The folder of {options.video} does not exist.")
     unfinished = options.video.with_name(f".unfinished-{options.video.name}")
-    film = imageio_ffmpeg.write_frames(
+    video = imageio_ffmpeg.write_frames(
         str(unfinished), (options.width, options.height), fps=fps, macro_block_size=2, ffmpeg_log_level="error"
     )
-    film.send(None)
+    video.send(None)
     try:
-        yield lambda picture: film.send(np.ascontiguousarray(picture))
-        film.close()
+        yield lambda picture: video.send(np.ascontiguousarray(picture))
+        video.close()
         unfinished.replace(options.video)
     finally:
-        film.close()
+        video.close()
         unfinished.unlink(missing_ok=True)

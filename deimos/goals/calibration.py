@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from deimos.nn.stateful import Stateful
+
 TEMPERATURES = (0.1, 10.0)  # range of a temperature; outside, the scores are not logits of anything
 BINS = 15
 
 
-class Calibration:
+class Calibration(Stateful):
     """Turns logits of a class-balanced classifier into probabilities.
 
     Class weights n / (2 n_class) multiply the odds that a classifier learns by (1 - pi) / pi, with pi the
@@ -26,21 +28,15 @@ class Calibration:
         .. [2] Guo et al., *On Calibration of Modern Neural Networks*, ICML 2017, section 4.2. arXiv:1706.04599
     """
 
+    saved = ("prior", "temperature")
+
     def __init__(self) -> None:
         self.prior = 0.0
         self.temperature = 1.0
 
-    def logit(self, score: Tensor) -> Tensor:
-        """Log odds of a crash, same shape.
-
-        Args:
-            score: Logits of the class-balanced classifier, any shape.
-        """
-        return (score + self.prior) / self.temperature
-
     def probability(self, score: Tensor) -> Tensor:
-        """Probability of a crash, in (0, 1); the arguments are those of ``logit``."""
-        return torch.sigmoid(self.logit(score))
+        """Probability of a crash, in (0, 1), of logits of the class-balanced classifier."""
+        return self.of_log_odds(score + self.prior)
 
     def of_log_odds(self, log_odds: Tensor) -> Tensor:
         """Probability of a crash where the prior, perhaps one of another day, has been added already."""
@@ -70,14 +66,6 @@ class Calibration:
             inverse = (inverse - slope / curvature).clamp(min=0.5 * inverse, max=2.0 * inverse)
         low, high = TEMPERATURES
         self.temperature = min(max(1.0 / inverse.item(), low), high)
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {"prior": self.prior, "temperature": self.temperature}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``."""
-        self.prior, self.temperature = state["prior"], state["temperature"]
 
 
 @dataclass(frozen=True)
@@ -112,7 +100,7 @@ def reliability(probability: Tensor, crashed: Tensor, bins: int = BINS) -> Relia
     return Reliability(predicted, observed, count)
 
 
-def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
+def evaluate(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     """How good predicted probabilities are.
 
     Args:
@@ -125,7 +113,7 @@ def judge(probability: Tensor, crashed: Tensor) -> dict[str, float]:
         uncertainty up to the spread within bins. ``ece``, the expected calibration error over the same bins;
         ``log_loss_skill``, 1 - loss / (loss of predicting the base rate): 0 knows nothing, 1 everything.
         ``top_decile_gap``: predicted minus observed rate where the predictions are highest, which is what a
-        gate at run time sees. NaN where there is nothing to judge, for the skill also where a class is empty.
+        gate at run time sees. NaN where there is nothing to evaluate, for the skill also where a class is empty.
 
     References:
         .. [1] Murphy, *A New Vector Partition of the Probability Score*, J. Appl. Meteorology 12, 1973.

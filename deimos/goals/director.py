@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least
+from deimos.checks import check_at_least, check_range
+from deimos.goals.core import GoalCore
 from deimos.goals.fear_selector import fear_selector
 from deimos.goals.interactions import Interactions
+from deimos.goals.methods import method
 from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces
-from deimos.nn.seeds import generator, restore
-from deimos.sim.env import Step
+from deimos.nn.random import Purpose, uniforms
 
 
 @dataclass(frozen=True)
@@ -27,16 +28,16 @@ class GoalDirector:
     """Chooses the goals of any vectorised environment, and learns from what becomes of them.
 
     It keeps the goal clocks and the interactions, and lets the selector learn. Call ``step`` once after
-    every step of the worlds, and put the goals that it returns into force.
+    every step of the worlds, and put the goals that it returns into force. It keeps copies, without gradients.
 
     Selectors that learn from the learner's transitions (``vds``, ``plr``) need Deimos' own loop.
 
     Args:
         selector: Who chooses: a selector's ``Config``, or the name of a method such as ``p25``.
-        goal_period: T: steps that a goal is in force, at least 1.
-        learn_every: Steps between two lessons of the selector, at least 1; a rollout of the learner is a good choice.
+        goal_period: T: steps that a goal is active, at least 1.
+        learn_every: Steps between two updates of the selector, at least 1; a rollout of the learner is a good choice.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
-        seed: Seed of the selector's networks and of every choice.
+        seed: Seed of the selector's networks and of every choice, in [0, 2^32).
     """
 
     def __init__(
@@ -46,15 +47,13 @@ class GoalDirector:
         check_at_least("goal_period", goal_period, 1)
         check_at_least("learn_every", learn_every, 1)
         check_at_least("total_steps", total_steps, 0)
-        if isinstance(selector, str):
-            from deimos.goals.methods import method
-
-            selector = method(selector)
+        check_range("seed", seed, 0, 2**32 - 1)
         self.goal_period, self.learn_every = goal_period, learn_every
         self.metrics: dict[str, float] = {}
-        """What the selector's last lesson had to say."""
-        self._config, self._total_steps, self._seed = selector, total_steps, seed
-        self._selector: GoalSelector | None = None
+        """What the selector's last update had to say."""
+        self._config = method(selector) if isinstance(selector, str) else selector
+        self._total_steps, self._seed = total_steps, seed
+        self._core: GoalCore | None = None
         self._sizes: tuple[int, int, int] | None = None  # worlds, components of a state, of a goal
 
     @property
@@ -64,9 +63,18 @@ class GoalDirector:
         Raises:
             RuntimeError: Before the first step, which tells how many worlds and components there are.
         """
-        if self._selector is None:
+        return self._known.selector
+
+    @property
+    def interactions(self) -> Interactions:
+        """What became of its goals; see ``selector`` for when it is known."""
+        return self._known.interactions
+
+    @property
+    def _known(self) -> GoalCore:
+        if self._core is None:
             raise RuntimeError("The GoalDirector knows its worlds only after the first call of step().")
-        return self._selector
+        return self._core
 
     @property
     def goal_range(self) -> Tensor | None:
@@ -74,8 +82,9 @@ class GoalDirector:
 
         Only a curriculum of the range (``cl``) has one, and only from the first step on.
         """
-        return None if self._selector is None else self._selector.goal_range()
+        return None if self._core is None else self._core.selector.goal_range()
 
+    @torch.no_grad()
     def step(
         self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor,
         tracking: Tensor | None = None,
@@ -87,7 +96,7 @@ class GoalDirector:
         Args:
             state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be
                 that of before or after its reset: nothing is chosen for it.
-            goal: Goals that were in force during the step, shape (num_envs, goal_dim).
+            goal: Goals that were active during the step, shape (num_envs, goal_dim).
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
             candidates: Independent uniform valid goals, from within ``goal_range``, shape
@@ -99,53 +108,34 @@ class GoalDirector:
                 the selector needs the learner's rollout.
         """
         self._check(state, goal, terminated, truncated, candidates)
-        if self._selector is None:
-            self._begin(state, goal)
-        done = terminated | truncated
+        core = self._core or self._begin(state, goal)
         self._clock += 1
         due = self._clock >= self.goal_period
-        reward = torch.zeros_like(self._clock, dtype=torch.float32) if tracking is None else tracking.float()
-        result = Step(state, reward, terminated, truncated, due, torch.zeros_like(done))
-        self._interactions.advance(result)
-        ended, chooses = due | done, due & ~done
-        counts = torch.stack([ended.sum(), chooses.sum()]).tolist()  # the one synchronisation of the step
-        ended_rows, rows = (
-            torch.nonzero_static(mask, size=count).squeeze(1)
-            for mask, count in zip((ended, chooses), counts, strict=True)
-        )
-        self._interactions.resolve(result, ended_rows)
+        reward = torch.zeros(len(state), device=state.device) if tracking is None else tracking.float()
+        changes = core.advance(terminated, truncated, due, reward)
+        done = terminated | truncated
         goals = torch.where(done.unsqueeze(1), candidates[:, 0], goal)
+        rows = changes.due
         if len(rows):
-            self._propose(rows, state[rows], goal[rows], candidates[rows], goals)
-        self._clock.masked_fill_(ended, 0)
-        if self._interactions.now % self.learn_every == 0:
-            self.metrics = self.selector.learn(self._interactions, None)
-        return Assignment(goals, ended)
+            draws = uniforms(self._seed, Purpose.GOAL, rows, self._count[rows])
+            goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], draws)
+            self._count[rows] += 1
+        self._clock.masked_fill_(due | done, 0)
+        if core.interactions.now % self.learn_every == 0:
+            self.metrics = core.selector.learn(core.interactions, None)
+        return Assignment(goals, due | done)
 
-    def _begin(self, state: Tensor, goal: Tensor) -> None:
-        spaces = Spaces(
-            len(state), state.shape[1], goal.shape[1], self.goal_period, state.device, total_steps=self._total_steps
-        )
-        with torch.inference_mode(False):  # what is made in a loop without gradients shall also be used outside it
-            selector = self._config.build(spaces, self._seed)
-            if selector.needs_rollout:
-                raise ValueError(
-                    f"selector must need no rollout of the learner, as vds and plr do; got {self._config}."
-                )
-            self._selector = selector
-            self._sizes = len(state), state.shape[1], goal.shape[1]
-            self._interactions = Interactions(*self._sizes, self.goal_period, 2 * self.goal_period, state.device)
-            self._clock = torch.zeros(len(state), dtype=torch.int64, device=state.device)
-            self._generator = generator(self._seed, "goal director", state.device)
-
-    def _propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, goals: Tensor) -> None:
-        draws = torch.rand(len(rows), 4, generator=self._generator, device=rows.device)
-        with torch.no_grad():
-            proposal = self.selector.propose(rows, state, goal, candidates, draws)
-        self._interactions.open(
-            rows, state, goal, proposal.goal, proposal.score, probe=proposal.probe, note=proposal.note
-        )
-        goals[rows] = proposal.goal
+    @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
+    def _begin(self, state: Tensor, goal: Tensor) -> GoalCore:
+        self._sizes = len(state), state.shape[1], goal.shape[1]
+        spaces = Spaces(*self._sizes, self.goal_period, state.device, total_steps=self._total_steps)
+        selector = self._config.build(spaces, self._seed)
+        if selector.needs_rollout:
+            raise ValueError(f"selector must need no rollout of the learner, as vds and plr do; got {self._config}.")
+        # Steps that the goal of every world has been active, and goals that were chosen for it: its draws' addresses.
+        self._clock, self._count = torch.zeros(2, len(state), dtype=torch.int64, device=state.device)
+        self._core = GoalCore(selector, spaces)
+        return self._core
 
     def _check(self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor) -> None:
         n, state_dim, goal_dim = self._sizes or (len(state), state.shape[-1], goal.shape[-1])
@@ -161,13 +151,14 @@ class GoalDirector:
             expected = f"({n}, N, {goal_dim}) with N at least 1"
             raise ValueError(f"candidates must have the shape {expected}, got {tuple(candidates.shape)}.")
 
+    @torch.no_grad()
     def fear(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> Tensor:
         """Calibrated probability that the policy crashes within T steps of getting ``new_goal``, shape (B,).
 
         Args:
             state: States, shape (B, state_dim).
-            goal: Goals in force, shape (B, goal_dim).
-            new_goal: Goals to judge, shape (B, goal_dim).
+            goal: Active goals, shape (B, goal_dim).
+            new_goal: Goals to evaluate, shape (B, goal_dim).
 
         Raises:
             ValueError: If the selector has no fear network.
@@ -183,10 +174,9 @@ class GoalDirector:
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs; see ``load_state_dict``."""
         return {
-            "selector": self.selector.state_dict(),
-            "interactions": self._interactions.state_dict(),
+            "core": self._known.state_dict(),
             "clock": self._clock.clone(),
-            "generator": self._generator.get_state(),
+            "count": self._count.clone(),
         }
 
     def load_state_dict(self, state: dict, observed: Tensor, goal: Tensor) -> None:
@@ -197,8 +187,6 @@ class GoalDirector:
             observed: Any states, shape (num_envs, state_dim), to tell the sizes.
             goal: Any goals, shape (num_envs, goal_dim).
         """
-        self._begin(observed, goal)
-        self.selector.load_state_dict(state["selector"])
-        self._interactions.load_state_dict(state["interactions"])
+        self._begin(observed, goal).load_state_dict(state["core"])
         self._clock.copy_(state["clock"])
-        restore(self._generator, state["generator"])
+        self._count.copy_(state["count"])

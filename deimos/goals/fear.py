@@ -7,11 +7,12 @@ from torch import Tensor, nn
 
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.goals.interactions import Resolved
-from deimos.goals.selector import Fuse
 from deimos.nn.adam import Adam
-from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, weights_of
+from deimos.nn.fusion import fused_scores
+from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
 from deimos.nn.ranks import mean_over_ranks
-from deimos.nn.seeds import generator, restore, weights_from
+from deimos.nn.seeds import generator
+from deimos.nn.stateful import Stateful
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +43,7 @@ class FearConfig:
             check_at_least(name, getattr(self, name), 1)
 
 
-class Fear:
+class Fear(Stateful):
     """A fear network, an MLP of (state, goal, next goal) with one logit, and how it learns online.
 
     Args:
@@ -51,20 +52,18 @@ class Fear:
         goal_dim: Components of a goal.
         device: Where it lives.
         seed: Seed of its weights and of the order that it learns in.
-        fuse: Who scores candidates in one kernel; see ``selector.Spaces``.
     """
 
-    def __init__(
-        self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int,
-        fuse: Fuse | None = None,
-    ) -> None:  # fmt: skip
+    saved = ("network", "optimizer", "generator", "fitted", "share")
+
+    def __init__(self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int) -> None:
         self.config = config
-        with weights_from(seed, "fear weights"):
-            self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation).to(device)
+        weights = generator(seed, "fear weights")
+        self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation, weights).to(device)
         self._parameters, _ = flatten_parameters(self.network)
         self._pass = Backprop(self.network)
         self._candidates = ManyCandidates(self.network, goal_dim, config.workspace)
-        self._fused = fuse(self.network, goal_dim) if fuse else None
+        self._fused = fused_scores(self.network, goal_dim)
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = generator(seed, "fear minibatches", device)
         self.fitted = False
@@ -120,7 +119,7 @@ class Fear:
 
         Args:
             state: States, shape (B, state_dim).
-            goal: Goals in force, shape (B, goal_dim).
+            goal: Active goals, shape (B, goal_dim).
             candidates: Possible next goals, shape (B, N, goal_dim).
 
         Returns:
@@ -131,31 +130,10 @@ class Fear:
             return self._fused(context, candidates)
         return self._candidates(context, candidates).squeeze(2)
 
-    def operations(self, decisions: float, count: int) -> float:
-        """Multiplications and additions of scoring ``count`` candidates in each of ``decisions``."""
-        return self._candidates.operations(decisions, count)
-
     def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
         if not bool(self._parameters.isfinite().all()):
             raise SimulationError("A weight of the fear network is not finite after a fit.")
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {
-            "network": weights_of(self.network),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            "fitted": self.fitted,
-            "share": self.share,
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``."""
-        self.network.load_state_dict(state["network"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        restore(self.generator, state["generator"])
-        self.fitted, self.share = state["fitted"], state["share"]
 
 
 def auroc(score: Tensor, positive: Tensor) -> float:

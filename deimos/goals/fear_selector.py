@@ -2,19 +2,17 @@
 
 import abc
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least, check_choice, check_range
 from deimos.goals import picks
-from deimos.goals.calibration import Calibration, judge
+from deimos.goals.calibration import Calibration, evaluate
 from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
-from deimos.learn.rollout import Rollout
-from deimos.nn.networks import operations
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +39,13 @@ class FearSelector(GoalSelector):
     """Learns fear online and leaves the choice to ``choose``. Until it has seen both classes it is uniform."""
 
     config: FearSelectorConfig
+    saved: ClassVar[tuple[str, ...]] = ("fear", "calibration", "_learnt_at")
 
     def __init__(self, config: FearSelectorConfig, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
-        self._num_envs = spaces.num_envs
         self._learnt_at = 0  # step of the last call of learn
-        self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed, spaces.fuse)
+        self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
         self.calibration = Calibration()
 
     @abc.abstractmethod
@@ -72,15 +70,15 @@ class FearSelector(GoalSelector):
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
-        # As a forecast it keeps the prior of its day, whatever the share of crashes is when it is judged.
+        # As a forecast it keeps the prior of its day, whatever the share of crashes is when it is evaluated.
         return Proposal(picks.take(candidates, pick), picks.take(score, pick) + self.calibration.prior, probe=probe)
 
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Logits of the fear network for all candidates; see ``Fear.score``."""
         return self.fear.score(self._seen(state), goal, candidates)
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
-        """Fit the fear network to the window; what has resolved since the last time judges it first."""
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
+        """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at
         self._learnt_at = interactions.now
@@ -88,15 +86,15 @@ class FearSelector(GoalSelector):
         known = window.score.isfinite()
         score, crashed = window.score[known], window.crashed[known]
         fair = known & window.probe if self.config.probe else known  # chosen goals are a biased sample
-        judged = fair & recent
+        fresh = fair & recent
         row = {
             "fear/auroc": auroc(window.score[fair], window.crashed[fair]),
-            "fear/crash_share": window.crashed[recent].float().mean().item(),
+            "fear/crash_rate": window.crashed[recent].float().mean().item(),
             "fear/resolved": float(recent.sum()),
             "fear/score": window.score[recent].nanmean().item(),
             "fear/temperature": self.calibration.temperature,
         }
-        quality = judge(self.calibration.of_log_odds(window.score[judged]), window.crashed[judged])
+        quality = evaluate(self.calibration.of_log_odds(window.score[fresh]), window.crashed[fresh])
         row |= {f"calibration/{name}": value for name, value in quality.items()}
         # The temperature is fitted to scores from before the network learnt from their outcomes.
         crashes = int(crashed.sum())
@@ -107,29 +105,12 @@ class FearSelector(GoalSelector):
             self.calibration.set_share(self.fear.share)
         return row
 
-    def operations(self, decisions: float, transitions: int) -> float:
-        """See ``GoalSelector.operations``."""
-        window = 2 * self._num_envs  # interactions: the resolved ones of 2 T steps, about one per world and T
-        fit = 3.0 * operations(self.fear.network) * window * self.config.fear.epochs
-        return self.fear.operations(decisions, self.num_candidates) + fit
-
     def _seen(self, state: Tensor) -> Tensor:
         return torch.zeros_like(state) if self.config.control == "state-blind" else state
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
         self.fear.check()
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        calibration = self.calibration.state_dict()
-        return {"fear": self.fear.state_dict(), "calibration": calibration, "learnt_at": self._learnt_at}
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.fear.load_state_dict(state["fear"])
-        self.calibration.load_state_dict(state["calibration"])
-        self._learnt_at = state["learnt_at"]
 
 
 def fear_selector(selector: GoalSelector) -> FearSelector | None:

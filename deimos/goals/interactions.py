@@ -1,19 +1,18 @@
 """Pending and resolved interactions: a goal is issued, and the policy crashes on it or survives it.
 
-An interaction is (state, goal in force, next goal) at the moment of the choice. It resolves as *crashed*
-when the world crashes within T steps, on the step of the next goal change included, and as *survived*
+An interaction is (state, active goal, next goal) at the moment of the choice. It resolves as *crashed*
+when the world crashes within T steps (its horizon), on the step of the next goal change included, and as *survived*
 when the next goal is due and the world lives. Where the episode ends otherwise before that, it is
-dropped. First goals are no interactions.
+dropped. First goals are no interactions unless somebody opens them.
 """
 
 import copy
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from deimos.sim.env import Step
+from deimos.nn.stateful import Stateful
 
 
 @dataclass(frozen=True)
@@ -25,15 +24,15 @@ class Resolved:
     state: Tensor
     """State at the moment of the choice, shape (n, state_dim)."""
     goal: Tensor
-    """Goal that was in force, shape (n, goal_dim)."""
+    """Goal that was active until then, shape (n, goal_dim)."""
     next_goal: Tensor
-    """Goal as it was issued, shape (n, goal_dim)."""
+    """Goal that was executed: as it was issued, unless ``execute`` told another, shape (n, goal_dim)."""
     score: Tensor
     """What the selector thought of it then, NaN where it had no opinion, shape (n,)."""
     reward: Tensor
     """Sum of the rewards until it resolved, without that of a crash, shape (n,)."""
     tracking: Tensor
-    """How well each group of its components was met, mean over its T steps, 0 from a crash on, shape (n, groups)."""
+    """How well each group of its components was met, mean over its horizon, 0 from a crash on, shape (n, groups)."""
     probe: Tensor
     """True where the goal was drawn uniformly, whatever its score, bool, shape (n,)."""
     note: Tensor
@@ -44,6 +43,8 @@ class Resolved:
     """Step that it was issued after, int64, shape (n,)."""
     resolved: Tensor
     """Step that it was resolved on, int64, shape (n,)."""
+    horizon: Tensor
+    """Steps that it was to last, int64, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.crashed)
@@ -53,78 +54,90 @@ class Resolved:
         return Resolved(**{name: getattr(self, name)[mask] for name in self.__dataclass_fields__})
 
 
-class Interactions:
+class Interactions(Stateful):
     """One pending interaction per world, and the resolved ones of the last steps.
 
     Each world has a small ring of its own for what it resolved, so that nothing waits for a count and
-    the memory is bounded: a world resolves at most ``ceil(window / T) + 1`` interactions within
-    ``window`` steps, since a crash is followed by a first goal of T steps.
+    the memory is bounded. What is stored is a copy and carries no gradient.
 
     Args:
         num_envs: Number of worlds.
         state_dim: Components of a state.
         goal_dim: Components of a goal.
-        goal_period: T, steps.
+        capacity: Resolved interactions that are kept per world, at least 1; the oldest makes way for a new one.
         window: Steps that a resolved interaction is kept for.
         device: Where they are kept.
-        groups: Columns of ``Step.tracking``; 0 where it is ``None`` and the reward says it.
+        groups: Columns of ``tracking`` in ``advance``; 0 where it is ``None`` and the reward says it.
     """
 
+    saved = ("now", "active", "_pending", "issued_at", "_horizon", "_ring", "_marks", "_cursor")
+
     def __init__(
-        self, num_envs: int, state_dim: int, goal_dim: int, goal_period: int, window: int, device: torch.device,
+        self, num_envs: int, state_dim: int, goal_dim: int, capacity: int, window: int, device: torch.device,
         groups: int = 0,
     ) -> None:  # fmt: skip
-        self.goal_period = goal_period
         self.window = window
         self.now = 0
         """Steps so far."""
         self._scored = True
         self.active = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """True where an interaction is pending, shape (num_envs,)."""
-        self._slots = math.ceil(window / goal_period) + 1
+        self._capacity = capacity
         # State, goal, next goal, score, probe, note, reward, tracking.
         self._sizes = [state_dim, goal_dim, goal_dim, 1, 1, 1, 1, groups]
+        self._next_goal = slice(state_dim + goal_dim, state_dim + 2 * goal_dim)
         self._reward = slice(-1 - groups, None)  # and the tracking: what grows with every step
         width = sum(self._sizes)
         # One row per interaction, not one tensor per field: a few decisions per step cost what their calls cost.
         self._pending = torch.zeros(num_envs, width, device=device)
-        self.issued_at = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.issued_at, self._horizon, self._cursor = torch.zeros(3, num_envs, dtype=torch.int64, device=device)
         """Step that the pending interaction was issued after, int64, shape (num_envs,)."""
-        self._ring = torch.zeros(num_envs, self._slots, width, device=device)
-        self._marks = torch.zeros(num_envs, self._slots, 3, dtype=torch.int64, device=device)
-        """Crashed, issued, resolved; steps count from 1, so a resolved step of 0 marks a free slot."""
-        self._cursor = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self._ring = torch.zeros(num_envs, capacity, width, device=device)
+        self._marks = torch.zeros(num_envs, capacity, 4, dtype=torch.int64, device=device)
+        """Crashed, issued, resolved, horizon; steps count from 1, so a resolved step of 0 marks a free slot."""
 
-    def advance(self, step: Step) -> None:
-        """Count a step and its rewards. Call it once per step, before ``resolve``."""
+    @torch.no_grad()
+    def advance(self, reward: Tensor, terminated: Tensor, tracking: Tensor | None = None) -> None:
+        """Count a step and its rewards. Call it once per step, before ``resolve``.
+
+        Args:
+            reward: Rewards, shape (num_envs,).
+            terminated: True where the world crashed, bool, shape (num_envs,).
+            tracking: How well each group of goal components was met, in [0, 1], shape (num_envs, groups).
+        """
         self.now += 1
-        alive = (~step.terminated).float()
-        if step.tracking is None:
-            self._pending[:, -1].addcmul_(step.reward, alive)
+        alive = (~terminated).float()
+        if tracking is None:
+            self._pending[:, -1].addcmul_(reward, alive)
         else:
-            gain = torch.cat([step.reward.unsqueeze(1), step.tracking], dim=1)
+            gain = torch.cat([reward.unsqueeze(1), tracking], dim=1)
             self._pending[:, self._reward].addcmul_(gain, alive.unsqueeze(1))
 
-    def resolve(self, step: Step, rows: Tensor) -> None:
+    @torch.no_grad()
+    def resolve(self, rows: Tensor, crashed: Tensor, survived: Tensor) -> None:
         """Close what this step has decided, and drop what it has cut off.
 
         Args:
-            step: What the step gave back, before anything is reset.
-            rows: The worlds whose goal is due or that are done, int64, shape (m,), each once.
+            rows: The worlds whose interaction ends in any way, int64, shape (m,), each once.
+            crashed: True where it ends in a crash, bool, shape (m,).
+            survived: True where its time was up, bool, shape (m,); a crash outweighs it. Where neither is true, the
+                episode was cut off, and the interaction is dropped.
         """
-        crashed = step.terminated[rows]
-        decided = self.active[rows] & (crashed | step.goal_due[rows])
+        decided = self.active[rows] & (crashed | survived)
         cursor = self._cursor[rows]
-        slot = cursor % self._slots
-        marks = torch.stack([crashed.long(), self.issued_at[rows], torch.full_like(slot, self.now)], dim=1)
+        slot = cursor % self._capacity
+        marks = torch.stack(
+            [crashed.long(), self.issued_at[rows], torch.full_like(slot, self.now), self._horizon[rows]], dim=1
+        )
         keep = decided.unsqueeze(1)
         self._ring[rows, slot] = torch.where(keep, self._pending[rows], self._ring[rows, slot])
         self._marks[rows, slot] = torch.where(keep, marks, self._marks[rows, slot])
         self._cursor[rows] = cursor + decided
         self.active[rows] = False
 
+    @torch.no_grad()
     def open(
-        self, rows: Tensor, state: Tensor, goal: Tensor, next_goal: Tensor, score: Tensor,
+        self, rows: Tensor, state: Tensor, goal: Tensor, next_goal: Tensor, score: Tensor, horizon: int | Tensor,
         probe: Tensor | None = None, note: Tensor | None = None,
     ) -> None:  # fmt: skip
         """Start an interaction in each listed world.
@@ -132,9 +145,10 @@ class Interactions:
         Args:
             rows: Worlds, int64, shape (m,), each once.
             state: States, shape (m, state_dim).
-            goal: Goals that were in force, shape (m, goal_dim).
+            goal: Goals that were active until now, shape (m, goal_dim).
             next_goal: Goals as they are issued, shape (m, goal_dim).
             score: What the selector thinks of them, shape (m,).
+            horizon: Steps until they are over if nothing happens, at least 1, one number or int64, shape (m,).
             probe: True where the goal was drawn uniformly, bool, shape (m,); ``None`` for nowhere.
             note: Whole numbers below 2^24 to give back with the interaction, shape (m,); ``None`` for 0.
         """
@@ -145,28 +159,39 @@ class Interactions:
             rest[:, 1] = note
         self._pending[rows] = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1)
         self.issued_at[rows] = self.now
+        self._horizon[rows] = horizon
         self.active[rows] = True
+
+    @torch.no_grad()
+    def execute(self, rows: Tensor, goal: Tensor) -> None:
+        """Tell what the listed worlds pursue where that is not what was issued: it is what is learnt from.
+
+        Args:
+            rows: Worlds, int64, shape (m,), each once.
+            goal: Goals, shape (m, goal_dim).
+        """
+        self._pending[rows, self._next_goal] = goal
 
     def resolved(self) -> Resolved:
         """The interactions resolved within the window, ordered by world."""
         at = self._marks[:, :, 2]
         env, slot = torch.nonzero((at > 0) & (at > self.now - self.window), as_tuple=True)
         state, goal, next_goal, score, probe, note, reward, tracking = self._ring[env, slot].split(self._sizes, dim=1)
-        crashed, issued, resolved = self._marks[env, slot].unbind(1)
+        crashed, issued, resolved, horizon = self._marks[env, slot].unbind(1)
         met = tracking if self._sizes[-1] else reward
         score = score if self._scored else torch.full_like(score, torch.nan)
         return Resolved(
             env=env, state=state, goal=goal, next_goal=next_goal, score=score.squeeze(1), reward=reward.squeeze(1),
-            tracking=met / self.goal_period, probe=probe.squeeze(1) > 0, note=note.squeeze(1).long(),
-            crashed=crashed.bool(), issued=issued, resolved=resolved,
+            tracking=met / horizon.unsqueeze(1), probe=probe.squeeze(1) > 0, note=note.squeeze(1).long(),
+            crashed=crashed.bool(), issued=issued, resolved=resolved, horizon=horizon,
         )  # fmt: skip
 
     def issued(self, since: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What was issued after step ``since`` and is still known, pending or resolved.
 
         Returns:
-            World, int64, shape (n,); state (n, state_dim), goal that was in force and goal that was
-            issued, (n, goal_dim) each.
+            World, int64, shape (n,); state (n, state_dim), goal that was active until then and goal that is
+            executed, (n, goal_dim) each.
         """
         pending = torch.nonzero(self.active & (self.issued_at > since)).squeeze(1)
         issued, resolved = self._marks[:, :, 1], self._marks[:, :, 2]
@@ -180,19 +205,3 @@ class Interactions:
         view = copy.copy(self)
         view._scored = False
         return view
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return {
-            "active": self.active, "pending": self._pending, "issued": self.issued_at,
-            "ring": self._ring, "marks": self._marks, "cursor": self._cursor,
-        }  # fmt: skip
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {"now": self.now} | {name: value.clone() for name, value in self._tensors().items()}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``."""
-        self.now = state["now"]
-        for name, value in self._tensors().items():
-            value.copy_(state[name])

@@ -3,39 +3,14 @@
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions
-from deimos.learn.rollout import Rollout
-
-if TYPE_CHECKING:  # it needs PPO, which needs this module
-    from deimos.nn.ensemble import Stack, StackKernels
-
-
-@dataclass(frozen=True)
-class Whitening:
-    """What a network sees of a candidate: clip((x - mean) * factor, -bound, bound). Tensors may change, not move."""
-
-    mean: Tensor
-    """Shape (goal_dim,)."""
-    factor: Tensor
-    """Shape (goal_dim,)."""
-    bound: float
-    """Above 0."""
-
-
-class Fuse(Protocol):
-    """Makes ``scores(context, candidates)``, shape (B, N), of a network; ``None`` where it cannot: ``fused.fuse``."""
-
-    def __call__(
-        self, net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None
-    ) -> Callable[[Tensor, Tensor], Tensor] | None:
-        """See ``fused.fuse``."""
-        ...
+from deimos.nn.stateful import Stateful
 
 
 @dataclass(frozen=True)
@@ -49,7 +24,7 @@ class Spaces:
     goal_dim: int
     """Components of a goal."""
     goal_period: int
-    """T: steps that a goal is in force."""
+    """T: steps that a goal is active."""
     device: torch.device
     """Where the tensors lie."""
     groups: tuple[slice, ...] = (slice(None),)
@@ -58,10 +33,6 @@ class Spaces:
     """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
     total_steps: int = 0
     """Steps of the whole training; 0 where nobody knows."""
-    fuse: Fuse | None = None
-    """Who scores candidates in one kernel, where the worlds have kernels (``fused.fuse``); ``None`` for torch alone."""
-    fuse_critics: "Callable[[Stack], StackKernels | None] | None" = None
-    """Who has kernels for an ensemble (``fused_critics.fuse_critics``); ``None`` for torch alone."""
 
     def state_then_goal(self, obs: Tensor) -> Tensor:
         """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""
@@ -108,11 +79,22 @@ def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
     return Proposal(picks.take(candidates, pick), torch.full_like(draw, torch.nan))
 
 
-class Critic(Protocol):
-    """A value function that somebody else trains."""
+class Transitions(Protocol):
+    """What selectors may learn from the learner's transitions, of shape (num_steps, num_envs) but for ``obs``."""
 
-    def value(self, obs: Tensor) -> Tensor:
-        """Values, in units of scaled rewards, of observations of shape (..., obs_dim)."""
+    num_steps: int
+    obs: Tensor  # that the steps started from, and those after the last: (num_steps + 1, num_envs, obs_dim)
+    reward: Tensor  # as the environment gives them
+    terminated: Tensor
+    truncated: Tensor
+    weight: Tensor  # in everything learnt: 0 leaves a transition out
+    advantage: Tensor  # the learner's, in units of scaled rewards
+    reward_scale: float  # what the learner multiplies rewards by before it values them
+    discount: float
+    gae_lambda: float
+
+    def cut_off(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Steps and worlds that were truncated, int64, shape (m,) each, and their last observations, (m, obs_dim)."""
         ...
 
 
@@ -129,8 +111,8 @@ class SelectorConfig(abc.ABC):
         """
 
 
-class GoalSelector(abc.ABC):
-    """Chooses the goals of a training run."""
+class GoalSelector(Stateful, abc.ABC):
+    """Chooses the goals of a training run; ``saved`` names what a resume needs."""
 
     num_candidates: int = 1
     """Candidates that it wants to choose from at every decision."""
@@ -152,17 +134,20 @@ class GoalSelector(abc.ABC):
         Args:
             rows: Worlds, int64, shape (B,).
             state: Their states, shape (B, state_dim).
-            goal: Their goals in force, shape (B, goal_dim).
+            goal: Their active goals, shape (B, goal_dim).
             candidates: Independent uniform goals for each, shape (B, num_candidates, goal_dim).
             draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All chance
                 in the choice comes from here, so that it is the same in any batch.
         """
 
-    def critic(self) -> "Critic | None":
-        """The value function that the learner shall use instead of its own, if this selector supplies one."""
+    def critic(self) -> Callable[[Tensor], Tensor] | None:
+        """The value function that the learner shall use instead of its own, if this selector supplies one.
+
+        It takes observations of shape (..., obs_dim) and returns values in units of scaled rewards, shape (...).
+        """
         return None
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Learn from what happened, once per rollout.
 
         Args:
@@ -175,24 +160,8 @@ class GoalSelector(abc.ABC):
         """
         return {}
 
-    def operations(self, decisions: float, transitions: int) -> float:
-        """Multiplications and additions of its matrix products in an iteration: what it cannot cost less than.
-
-        Args:
-            decisions: Goals that it chooses in an iteration.
-            transitions: Transitions of an iteration.
-        """
-        return sum(part.operations(decisions, transitions) for part in self.parts)
-
-    def check(self) -> None:  # noqa: B027 (a selector without weights has nothing to check)
+    def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite."""
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {}
-
-    def load_state_dict(self, state: dict) -> None:  # noqa: B027 (nor anything to load)
-        """Go on from ``state_dict()``."""
 
 
 class Delegate(GoalSelector):
@@ -203,20 +172,9 @@ class Delegate(GoalSelector):
     def current(self) -> GoalSelector:
         """Who chooses."""
 
-    @property
-    def num_candidates(self) -> int:  # type: ignore[override]
-        """See ``GoalSelector.num_candidates``."""
-        return self.current.num_candidates
-
-    @property
-    def needs_rollout(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.needs_rollout``."""
-        return any(part.needs_rollout for part in self.parts)
-
-    @property
-    def first_goals_scaled(self) -> bool:  # type: ignore[override]
-        """See ``GoalSelector.first_goals_scaled``."""
-        return self.current.first_goals_scaled
+    needs_rollout = property(lambda self: any(part.needs_rollout for part in self.parts))
+    num_candidates = property(lambda self: self.current.num_candidates)
+    first_goals_scaled = property(lambda self: self.current.first_goals_scaled)
 
     def goal_range(self) -> Tensor | None:
         """See ``GoalSelector.goal_range``."""
@@ -226,22 +184,14 @@ class Delegate(GoalSelector):
         """See ``GoalSelector.propose``."""
         return self.current.propose(rows, state, goal, candidates, draws)
 
-    def critic(self) -> "Critic | None":
+    def critic(self) -> Callable[[Tensor], Tensor] | None:
         """See ``GoalSelector.critic``."""
         return self.current.critic()
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``GoalSelector.learn``."""
         return self.current.learn(interactions, rollout)
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
         self.current.check()
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return self.current.state_dict()
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.current.load_state_dict(state)

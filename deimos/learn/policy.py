@@ -7,9 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from deimos.checks import RunError
+from deimos.files import load_tensors, save_tensors
+from deimos.nn.layout import ObsField, goal_slice
 from deimos.nn.networks import Activation, Actor, weights_of
-from deimos.run.folder import RunError, load_tensors, save_tensors
-from deimos.sim.env import Env, ObsField
 
 SCHEMA = 1
 
@@ -38,8 +39,7 @@ class Policy(nn.Module):
         self.dt = dt
         scale = [torch.as_tensor(field.scale, dtype=torch.float32).expand(field.size) for field in layout]
         self.register_buffer("scale", torch.cat(scale).to(actor.std.device))
-        start = sum(field.size for field in self.layout[: [f.name for f in self.layout].index("goal")])
-        self.goal_slice = slice(start, start + next(f.size for f in self.layout if f.name == "goal"))
+        self.goal_slice = goal_slice(self.layout)
 
     @torch.no_grad()
     def forward(self, obs: Tensor) -> Tensor:
@@ -52,16 +52,20 @@ class Policy(nn.Module):
         return self.actor(obs).clamp(-self.action_bound, self.action_bound)
 
 
-def save_policy(path: Path, actor: Actor, hidden: Sequence[int], activation: Activation, env: Env) -> None:
-    """Write a policy that needs nothing else to run."""
+def save_policy(path: Path, policy: Policy) -> None:
+    """Write a policy that needs nothing else to run.
+
+    Raises:
+        RunError: If it cannot be written; the file of before is untouched.
+    """
     save_tensors(path, {
         "schema": SCHEMA,
-        "actor": weights_of(actor),
-        "hidden": list(hidden),
-        "activation": activation,
-        "layout": [asdict(field) for field in env.layout],
-        "action_bound": env.action_bound,
-        "dt": env.dt,
+        "actor": weights_of(policy.actor),
+        "hidden": list(policy.hidden),
+        "activation": policy.activation,
+        "layout": [asdict(field) for field in policy.layout],
+        "action_bound": policy.action_bound,
+        "dt": policy.dt,
     })  # fmt: skip
 
 

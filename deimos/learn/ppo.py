@@ -6,20 +6,21 @@ uses the value of the one before.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
-from deimos.goals.selector import Critic
 from deimos.learn.rollout import Rollout
 from deimos.nn.adam import Adam
-from deimos.nn.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache, weights_of
+from deimos.nn.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
+from deimos.nn.random import Purpose, normals
 from deimos.nn.ranks import mean_over_ranks
-from deimos.nn.seeds import generator, restore, weights_from
-from deimos.sim.env import Env
+from deimos.nn.returns import value_gradient
+from deimos.nn.seeds import generator
+from deimos.nn.stateful import Stateful
 
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # what the adaptive schedule may reach; rsl_rl's
 
@@ -38,7 +39,7 @@ class PPOConfig:
     minibatches: int = 4
     """Parts that a rollout is split into, at least 1. What does not divide evenly is left out."""
     learning_rate: float = 1e-3
-    """Step size of Adam, positive; where the adaptive schedule starts."""
+    """Initial learning rate of Adam, positive."""
     desired_kl: float = 0.01
     """KL divergence of one update that the adaptive schedule aims at, at least 0; 0 keeps the step size fixed."""
     discount: float = 0.99
@@ -76,87 +77,6 @@ class PPOConfig:
             check_range(name, getattr(self, name), 0.0, 1.0)
         check_choice("activation", self.activation, ["relu", "elu", "tanh"])
         check_hidden("hidden", self.hidden)
-
-
-def advantages(
-    reward: Tensor,
-    value: Tensor,
-    next_value: Tensor,
-    terminated: Tensor,
-    truncated: Tensor,
-    *,
-    discount: float,
-    gae_lambda: float,
-) -> Tensor:
-    """Generalized advantage estimates [1]_, exact at time limits [2]_.
-
-    An episode that terminated has no future, so its last target is the reward alone. One that was
-    only truncated has a future that was cut off, so its last target still counts ``next_value``.
-    Neither passes advantage across the reset.
-
-    Args:
-        reward: Rewards, shape (num_steps, num_envs).
-        value: V of the observation that each step started from, same shape.
-        next_value: V of the observation that each step ended in, *before* any reset, same shape.
-        terminated: True where the task itself ended the episode, bool, same shape.
-        truncated: True where only the time limit ended it, bool, same shape.
-        discount: gamma, in [0, 1].
-        gae_lambda: lambda, in [0, 1].
-
-    Returns:
-        Advantages, shape (num_steps, num_envs). Add ``value`` for the value targets.
-
-    Raises:
-        ValueError: If the shapes differ.
-
-    References:
-        .. [1] Schulman et al., *High-Dimensional Continuous Control Using Generalized Advantage
-           Estimation*, ICLR 2016, equation 16. arXiv:1506.02438
-        .. [2] Pardo et al., *Time Limits in Reinforcement Learning*, ICML 2018. arXiv:1712.00378
-    """
-    for name, array in (
-        ("value", value), ("next_value", next_value), ("terminated", terminated), ("truncated", truncated),
-    ):  # fmt: skip
-        if array.shape != reward.shape:
-            raise ValueError(f"{name} must have the shape of reward, {tuple(reward.shape)}, got {tuple(array.shape)}.")
-    has_future = (~terminated).float()
-    goes_on = (~(terminated | truncated)).float().mul_(discount * gae_lambda)
-    advantage = torch.addcmul(reward, has_future, next_value, value=discount).sub_(value)
-    for t in reversed(range(len(reward) - 1)):
-        advantage[t].addcmul_(goes_on[t], advantage[t + 1])
-    return advantage
-
-
-def value_gradient(
-    value: Tensor, old_value: Tensor, returns: Tensor, weight: Tensor, *, clip: float, coef: float
-) -> tuple[Tensor, Tensor]:
-    """The clipped value loss and its gradient by the value.
-
-    Where the value has moved too far and clipping makes the loss larger, the clipped loss counts,
-    and that one is flat. Inside the clip both are the same but for rounding, which must not decide.
-
-    Args:
-        value: Values, shape (..., n).
-        old_value: Values before the update, same shape.
-        returns: Their targets, same shape.
-        weight: Share of every row in the average, same shape.
-        clip: How far a value may move, positive; infinite for the plain squared error.
-        coef: What the gradient is multiplied by.
-
-    Returns:
-        The loss, shape (...), without ``coef``; and its gradient, shape (..., n), with it.
-    """
-    error = value - returns
-    loss = error.square()
-    grad = error * weight * (2.0 * coef)
-    if not math.isinf(clip):
-        step = value - old_value
-        inside = step.abs() <= clip
-        step.clamp_(-clip, clip)
-        clipped = (old_value + step).sub_(returns).square_()
-        grad *= inside | (loss >= clipped)
-        loss = torch.maximum(loss, clipped)
-    return (loss * weight).sum(-1), grad
 
 
 @dataclass(frozen=True)
@@ -197,33 +117,64 @@ class Batch:
             })  # fmt: skip
 
 
-class PPO:
-    """An actor and a critic, and how they learn from a rollout."""
+class PPO(Stateful):
+    """An actor and a critic, and how they learn from a rollout.
 
-    def __init__(self, config: PPOConfig, env: Env, seed: int) -> None:
-        rows = config.num_steps * env.num_envs
+    Args:
+        config: How they learn.
+        num_envs: Number of worlds.
+        obs_dim: Components of an observation.
+        action_dim: Components of an action.
+        device: Where they live.
+        seed: Seed of the weights, the exploration and the order of the minibatches, in [0, 2^32).
+
+    Raises:
+        ValueError: If there are more minibatches than transitions in a rollout.
+    """
+
+    saved = ("actor", "critic", "optimizer", "generator")
+
+    def __init__(
+        self, config: PPOConfig, num_envs: int, obs_dim: int, action_dim: int, device: torch.device, seed: int
+    ) -> None:
+        rows = config.num_steps * num_envs
         if config.minibatches > rows:
             raise ValueError(
                 f"minibatches must be at most the {rows} transitions of a rollout, got {config.minibatches}."
             )
-        if partial := [field.name for field in env.layout if field.seen_by != "both"]:
-            raise ValueError(
-                f"PPO shows all of the observation to actor and critic; {', '.join(partial)} must be seen by both."
-            )
         self.config = config
         self._size = rows // config.minibatches
-        with weights_from(seed, "policy weights"):
-            self.actor = Actor(env.obs_dim, config.hidden, env.action_dim, config.activation, config.init_std)
-            self.critic = mlp(env.obs_dim, config.hidden, 1, config.activation)
-        self.actor.to(env.device)
-        self.critic.to(env.device)
-        self.generator = generator(seed, "policy noise", env.device)
+        weights = generator(seed, "policy weights")
+        self.actor = Actor(obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights).to(device)
+        self.critic = mlp(obs_dim, config.hidden, 1, config.activation, weights).to(device)
+        self.generator = generator(seed, "policy minibatches", device)
         self._parameters, self._grads = flatten_parameters(self.actor, self.critic)
-        self.learning_rate = torch.tensor(config.learning_rate, device=env.device)
+        self.learning_rate = torch.tensor(config.learning_rate, device=device)
         self.optimizer = Adam(self._parameters, self.learning_rate)
-        self._piece = rows_in_cache(max(config.hidden)) if env.device.type == "cpu" else self._size
+        self._piece = rows_in_cache(max(config.hidden)) if device.type == "cpu" else self._size
         self._actor_pass = Backprop(self.actor.mean)
         self._critic_pass = Backprop(self.critic)
+        self._sizes = num_envs, obs_dim, action_dim, device
+        self._seed, self._worlds = seed, torch.arange(num_envs, device=device)
+
+    def new_rollout(self) -> Rollout:
+        """Memory for what ``update`` learns from."""
+        config = self.config
+        return Rollout(
+            config.num_steps, *self._sizes, discount=config.discount, gae_lambda=config.gae_lambda,
+            reward_scale=config.reward_scale,
+        )  # fmt: skip
+
+    def draw_noise(self, noise: Tensor, first_step: int, env_offset: int = 0) -> None:
+        """Draw the exploration of a whole rollout; a world's number depends on the seed, the world and the step alone.
+
+        Args:
+            noise: Standard normal draws, shape (num_steps, num_envs, action_dim). Written.
+            first_step: Steps that every world has taken before, below 2^32 - num_steps.
+            env_offset: Global number of world 0.
+        """
+        steps = torch.arange(first_step, first_step + len(noise), device=noise.device).unsqueeze(1)
+        noise.copy_(normals(self._seed, Purpose.EXPLORATION, self._worlds + env_offset, steps, noise.shape[2]))
 
     @torch.no_grad()
     def act(self, obs: Tensor, noise: Tensor, action: Tensor, mean: Tensor) -> None:
@@ -250,15 +201,18 @@ class PPO:
         return value.view(obs.shape[:-1])
 
     @torch.no_grad()
-    def update(self, rollout: Rollout, order: Tensor | None = None, critic: Critic | None = None) -> dict[str, float]:
+    def update(
+        self, rollout: Rollout, order: Tensor | None = None, critic: Callable[[Tensor], Tensor] | None = None
+    ) -> dict[str, float]:
         """Learn from a rollout.
 
         Args:
             rollout: What the current policy did.
             order: The order that the transitions are split into minibatches in, int64,
                 shape (num_steps * num_envs,); ``None`` draws one.
-            critic: The value function to use as the baseline; ``None`` for PPO's own. Somebody
-                else trains it, and PPO's own learns nothing then.
+            critic: The value function to use as the baseline, from observations of shape (..., obs_dim) to values
+                in units of scaled rewards; ``None`` for PPO's own. Somebody else trains it, and PPO's own learns
+                nothing then.
 
         Returns:
             Averages over all minibatches: ``value_loss``, ``surrogate_loss``, ``kl``; and, after the
@@ -288,24 +242,15 @@ class PPO:
         }
 
     @torch.no_grad()
-    def batch(self, rollout: Rollout, critic: Critic | None = None) -> tuple[Batch, Tensor]:
+    def batch(self, rollout: Rollout, critic: Callable[[Tensor], Tensor] | None = None) -> tuple[Batch, Tensor]:
         """Advantages, value targets and old log-probabilities of a rollout; and the share of variance explained.
 
         The networks have not changed since the rollout, so values and log-probabilities are
         computed here at once and not step by step.
         """
-        config, value_of = self.config, critic.value if critic else self.value
-        value = value_of(rollout.obs)
-        next_value = value[1:].clone()
-        if len(rollout.final_obs):
-            cut_off = rollout.truncated.nonzero(as_tuple=True)
-            next_value[cut_off] = value_of(rollout.final_obs[cut_off])
-        advantage = advantages(
-            rollout.reward * config.reward_scale, value[:-1], next_value, rollout.terminated, rollout.truncated,
-            discount=config.discount, gae_lambda=config.gae_lambda,
-        )  # fmt: skip
-        rollout.advantage.copy_(advantage)
-        returns = advantage + value[:-1]
+        value = rollout.estimate(critic or self.value)
+        advantage = rollout.advantage
+        returns = advantage + value
         weight = rollout.weight
         total = mean_over_ranks(weight.sum())
         mean = mean_over_ranks((weight * advantage).sum()) / total
@@ -321,7 +266,7 @@ class PPO:
             mean=rollout.mean.view(-1, action_dim).t().contiguous(),
             log_prob=log_prob.flatten(),
             advantage=advantage.flatten(),
-            value=value[:-1].flatten(),
+            value=value.flatten(),
             returns=returns.flatten(),
             weight=weight.flatten(),
         ), explained
@@ -398,25 +343,6 @@ class PPO:
     def _log_normaliser(std: Tensor) -> Tensor:
         """Log of the integral of exp(-z^2 / 2) over all actions."""
         return std.log().sum() + 0.5 * len(std) * math.log(2 * math.pi)
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {
-            "actor": weights_of(self.actor),
-            "critic": weights_of(self.critic),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``.
-
-        Raises:
-            RuntimeError: If the networks have other sizes.
-        """
-        self.load_weights(state)
-        self.optimizer.load_state_dict(state["optimizer"])
-        restore(self.generator, state["generator"])
 
     def load_weights(self, state: dict) -> None:
         """Take over the networks alone.

@@ -1,9 +1,11 @@
-"""What happened in every world over a few steps, in memory allocated once."""
+"""What happened in every world over a few steps, in memory allocated once, and what it was worth."""
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from deimos.sim.env import Env, Step
+from deimos.nn.returns import advantages
 
 
 class Rollout:
@@ -11,52 +13,103 @@ class Rollout:
 
     Shapes are (num_steps, num_envs, ...) but for ``obs``, which has one more step: the observation
     that the next rollout starts from. Where an episode ended, ``obs[t + 1]`` is the one after the reset.
+
+    Args:
+        num_steps: Steps of every world.
+        num_envs: Number of worlds.
+        obs_dim: Components of an observation.
+        action_dim: Components of an action.
+        device: Where everything lies.
+        discount: Weight of the next step's reward (gamma), in [0, 1].
+        gae_lambda: lambda of the advantages, in [0, 1].
+        reward_scale: What rewards are multiplied by before they are valued.
     """
 
     def __init__(
-        self, env: Env, num_steps: int, *, discount: float = 0.99, gae_lambda: float = 0.95, reward_scale: float = 1.0
-    ) -> None:
-        n, device = env.num_envs, env.device
+        self, num_steps: int, num_envs: int, obs_dim: int, action_dim: int, device: torch.device, *,
+        discount: float = 0.99, gae_lambda: float = 0.95, reward_scale: float = 1.0,
+    ) -> None:  # fmt: skip
         self.num_steps = num_steps
         self.discount, self.gae_lambda, self.reward_scale = discount, gae_lambda, reward_scale
-        # The learner's: whoever estimates values beside it must mean the same by them.
-        self.obs = torch.zeros(num_steps + 1, n, env.obs_dim, device=device)
-        self.action = torch.zeros(num_steps, n, env.action_dim, device=device)
-        self.mean = torch.zeros(num_steps, n, env.action_dim, device=device)
+        n = num_envs
+        self.obs = torch.zeros(num_steps + 1, n, obs_dim, device=device)
+        self.action = torch.zeros(num_steps, n, action_dim, device=device)
+        self.mean = torch.zeros(num_steps, n, action_dim, device=device)
         """Mean of the policy's distribution at the time."""
-        self.noise = torch.zeros(num_steps, n, env.action_dim, device=device)
+        self.noise = torch.zeros(num_steps, n, action_dim, device=device)
         """Standard normal draws, made for the whole rollout at once."""
         self.reward = torch.zeros(num_steps, n, device=device)
         self.terminated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
-        self.final_obs = torch.zeros(num_steps if env.time_limit else 0, n, env.obs_dim, device=device)
-        """Observations that the steps ended in, before any reset; kept only where episodes can be truncated."""
+        self.ends: list[tuple[int, Tensor, Tensor]] = []
+        """Steps that truncated worlds: the step, the worlds, int64, shape (m,), and the observations that their
+        episodes ended in, before any reset, shape (m, obs_dim)."""
         self.advantage = torch.zeros(num_steps, n, device=device)
-        """Advantages in units of scaled rewards, before they are normalised; the learner fills them in."""
+        """Advantages in units of scaled rewards, before they are normalised; see ``estimate``."""
         self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.weight = torch.ones(num_steps, n, device=device)
         """Weight of the transition in everything learnt: 0 leaves it out."""
 
-    def record(self, t: int, step: Step, weight: Tensor) -> None:
+    def record(
+        self, t: int, *, obs: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, invalid: Tensor,
+        weight: Tensor, cut_off: Tensor,
+    ) -> None:  # fmt: skip
         """Copy what step ``t`` gave back.
 
         Args:
-            t: Index of the step, in [0, num_steps).
-            step: Views, not yet reset.
+            t: Index of the step, in [0, num_steps); step 0 begins a new rollout.
+            obs: Observations that the step ended in, not yet reset, shape (num_envs, obs_dim).
+            reward: Rewards, shape (num_envs,).
+            terminated: True where the world crashed, bool, shape (num_envs,).
+            truncated: True where the episode was cut off without a crash, bool, shape (num_envs,).
+            invalid: True where the state is not physical any more, bool, shape (num_envs,).
             weight: Weight of every world's transition, shape (num_envs,).
+            cut_off: The worlds where ``truncated`` is true, int64, shape (m,).
         """
-        self.reward[t] = step.reward
-        self.terminated[t] = step.terminated
-        self.invalid[t] = step.invalid
+        if t == 0:
+            self.ends.clear()
+        self.reward[t] = reward
+        self.terminated[t] = terminated
+        self.truncated[t] = truncated
+        self.invalid[t] = invalid
         self.weight[t] = weight
-        if len(self.final_obs):
-            self.truncated[t] = step.truncated
-            self.final_obs[t] = step.obs
+        if len(cut_off):
+            self.ends.append((t, cut_off, obs[cut_off]))
 
     def exclude_invalid(self) -> None:
         """Give weight 0 to what led to an invalid state: every transition of that world since its last reset."""
-        spoilt = torch.zeros_like(self.invalid[0])
+        invalid = torch.zeros_like(self.invalid[0])
         for t in reversed(range(self.num_steps)):
-            spoilt &= ~(self.terminated[t] | self.truncated[t])
-            spoilt |= self.invalid[t]
-            self.weight[t].masked_fill_(spoilt, 0.0)
+            invalid &= ~(self.terminated[t] | self.truncated[t])
+            invalid |= self.invalid[t]
+            self.weight[t].masked_fill_(invalid, 0.0)
+
+    def cut_off(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Steps and worlds that were truncated, int64, shape (m,) each, and their last observations, (m, obs_dim)."""
+        steps = [torch.full_like(worlds, t) for t, worlds, _ in self.ends]
+        empty = self.obs.new_empty(0, dtype=torch.int64), self.obs[0, :0]
+        return (
+            torch.cat([empty[0], *steps]),
+            torch.cat([empty[0], *(worlds for _, worlds, _ in self.ends)]),
+            torch.cat([empty[1], *(obs for *_, obs in self.ends)]),
+        )
+
+    def estimate(self, critic: Callable[[Tensor], Tensor]) -> Tensor:
+        """Fill in ``advantage``.
+
+        Args:
+            critic: Values of observations of shape (..., obs_dim), in units of scaled rewards.
+
+        Returns:
+            Values of the observations that the steps started from, shape (num_steps, num_envs).
+        """
+        value = critic(self.obs)
+        next_value = value[1:].clone()
+        if self.ends:
+            step, world, obs = self.cut_off()
+            next_value[step, world] = critic(obs)
+        self.advantage.copy_(advantages(
+            self.reward * self.reward_scale, value[:-1], next_value, self.terminated, self.truncated,
+            discount=self.discount, gae_lambda=self.gae_lambda,
+        ))  # fmt: skip
+        return value[:-1]

@@ -5,8 +5,10 @@ import math
 import torch
 from torch import Tensor
 
+from deimos.nn.stateful import Stateful
 
-class Adam:
+
+class Adam(Stateful):
     """Adam [1]_ without weight decay: six operations on one vector, and no host round trip.
 
     ``torch.optim.Adam`` spends 0.2 ms per step in Python whatever the size of the network; an
@@ -21,6 +23,7 @@ class Adam:
            arXiv:1412.6980
     """
 
+    saved = ("steps", "_mean", "_square", "learning_rate")
     BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8  # the paper's
 
     def __init__(self, parameters: Tensor, learning_rate: Tensor) -> None:
@@ -39,23 +42,3 @@ class Adam:
         scale = self._square.sqrt().div_(math.sqrt(1 - self.BETA_2**self.steps)).add_(self.EPSILON)
         rate = self.learning_rate / (1 - self.BETA_1**self.steps)
         self._parameters.sub_(self._mean.div(scale).mul_(rate))
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {
-            "steps": self.steps,
-            "mean": self._mean.clone(),
-            "square": self._square.clone(),
-            "learning_rate": self.learning_rate.clone(),
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``.
-
-        Raises:
-            RuntimeError: If it belongs to another number of parameters.
-        """
-        self._mean.copy_(state["mean"])
-        self._square.copy_(state["square"])
-        self.learning_rate.copy_(state["learning_rate"])
-        self.steps = state["steps"]

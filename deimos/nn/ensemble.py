@@ -1,42 +1,28 @@
 """Several value functions that differ by initialisation and by data, in one stack of weights."""
 
 from collections.abc import Callable, Iterator
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
-from deimos.learn.ppo import value_gradient
+from deimos.nn.fusion import fused_critics
 from deimos.nn.matmul import activate_, multiply_by_slope_, on_threads, onednn
 from deimos.nn.networks import rows_in_cache
-
-
-class StackKernels(Protocol):
-    """What computes values and gradients of a stack in the place of batched products."""
-
-    def values(self, x: Tensor) -> Tensor:
-        """See ``Stack.values``."""
-        ...
-
-    def gradients(
-        self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor, clip: float
-    ) -> Callable[[range], Tensor]:
-        """See ``Stack.gradients``."""
-        ...
+from deimos.nn.returns import value_gradient
 
 
 class Stack:
     """K multilayer perceptrons of one shape and one output.
 
     All weights lie in one vector, those of a member end to end. A layer of all members is one batched product, unless
-    somebody has kernels for the whole.
+    there are kernels for the whole.
 
     Args:
         nets: Made by ``networks.mlp``, on one device. Their parameters become views of the stack.
-        fuse: Gives kernels for a stack, or ``None`` where it has none for this one; see ``selector.Spaces``.
+        kernels: Whether Warp kernels may do the work where there are any for it.
     """
 
-    def __init__(self, nets: list[nn.Sequential], fuse: "Callable[[Stack], StackKernels | None] | None" = None) -> None:
+    def __init__(self, nets: list[nn.Sequential], *, kernels: bool = True) -> None:
         self.nets = nets
         linears = [[layer for layer in net if isinstance(layer, nn.Linear)] for net in nets]
         tensors = [[tensor for layer in own for tensor in (layer.weight, layer.bias)] for own in linears]
@@ -61,7 +47,7 @@ class Stack:
         """Threads that torch had when the stack was made; it uses them also where its caller keeps to one."""
         widest = max(layer.in_features for layer in linears[0][1:]) * len(nets)
         self._piece = rows_in_cache(widest) if device.type == "cpu" else max(1, 2**26 // widest)
-        self.fused = fuse(self) if fuse else None
+        self.fused = fused_critics(self.layers, self._activation, self.threads) if kernels else None
         """Kernels in the place of batched products, if there are any."""
 
     @torch.no_grad()
@@ -80,7 +66,7 @@ class Stack:
     def gradients(
         self, x: Tensor, before: Tensor, target: Tensor, weight: Tensor, clip: float
     ) -> Callable[[range], Tensor]:
-        """The gradient of the clipped value loss of every member on rows of its own; see ``ppo.value_gradient``.
+        """The gradient of the clipped value loss of every member on rows of its own; see ``returns.value_gradient``.
 
         Args:
             x: Inputs, shape (K, n, inputs).
@@ -96,7 +82,7 @@ class Stack:
         if self.fused is not None:
             return self.fused.gradients(x, before, target, weight, clip)
 
-        def lesson(rows: range) -> Tensor:
+        def update(rows: range) -> Tensor:
             assert self.parameters.grad is not None
             self.parameters.grad.zero_()
             share = weight[:, rows.start : rows.stop]
@@ -111,7 +97,7 @@ class Stack:
                     losses += loss
             return losses
 
-        return lesson
+        return update
 
     def _pieces(self, rows: range) -> Iterator[slice]:
         """Consecutive parts of some rows; on a CPU such as suit its caches, on a GPU such as fit 256 MiB a layer."""

@@ -8,7 +8,6 @@ import torch
 import warp as wp
 from torch import Tensor, nn
 
-from deimos.goals.selector import Whitening
 from deimos.kernels.candidates import (
     MOST_COMPONENTS,
     MOST_COMPONENTS_SQUARED,
@@ -16,6 +15,7 @@ from deimos.kernels.candidates import (
     mean_square_of_candidates,
     score_candidates,
 )
+from deimos.nn.networks import Whitening
 
 
 def fuse(net: nn.Sequential, goal_dim: int, *, whitening: Whitening | None = None) -> "FusedScores | None":

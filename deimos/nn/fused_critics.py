@@ -9,31 +9,38 @@ import warp as wp
 from torch import Tensor, nn
 
 from deimos.kernels.critics import CriticTables, Layout, gradients, values
-from deimos.nn.ensemble import Stack
 
 LARGE = 2**18  # values that a call may ask for whose memory is kept until the next one
 _Copies = list[tuple[Tensor, Tensor]]  # destination and source
 
 
-def fuse_critics(stack: Stack) -> "FusedCritics | None":
-    """Kernels for a stack; ``None`` unless it lies on a CPU, has ReLU between its layers and one output."""
-    linears = [layer for layer in stack.nets[0] if isinstance(layer, nn.Linear)]
-    fits = isinstance(stack.nets[0][1], nn.ReLU) and linears[-1].out_features == 1
-    return FusedCritics(stack, linears) if fits and stack.parameters.device.type == "cpu" else None
+_Layers = list[tuple[Tensor, ...]]  # weights, their gradients, biases and theirs; see ``Stack.layers``
+
+
+def fuse_critics(layers: _Layers, activation: nn.Module, threads: int) -> "FusedCritics | None":
+    """Kernels for a stack on a CPU; ``None`` unless it has ReLU between its layers and one output.
+
+    Args:
+        layers: See ``Stack.layers``.
+        activation: Between the layers.
+        threads: Threads to use.
+    """
+    fits = isinstance(activation, nn.ReLU) and layers[-1][0].shape[1] == 1
+    return FusedCritics(layers, threads) if fits else None
 
 
 class FusedCritics:
     """See ``fuse_critics``. Threads share the members; what a member computes does not depend on their number."""
 
-    def __init__(self, stack: Stack, linears: list[nn.Linear]) -> None:
+    def __init__(self, layers: _Layers, threads: int) -> None:
         wp.init()
-        layout = Layout((linears[0].in_features, *(layer.out_features for layer in linears[:-1])))
-        count = len(stack.nets)
+        count = len(layers[0][0])
+        layout = Layout(tuple(weight.shape[2] for weight, *_ in layers))
         self._table = torch.zeros(count, layout.rows, layout.width)
         self._gradient = torch.zeros_like(self._table)
-        self._loads, self._stores = _views(stack, layout, self._table, self._gradient)
+        self._loads, self._stores = _views(layers, layout, self._table, self._gradient)
         self._critics = CriticTables(layout, wp.from_torch(self._table), wp.from_torch(self._gradient))
-        self._others = max(1, min(stack.threads, count)) - 1
+        self._others = max(1, min(threads, count)) - 1
         """Threads beside the caller's."""
         self._pool = ThreadPoolExecutor(max(1, self._others))
         self._values: list[wp.Launch] = []
@@ -64,7 +71,7 @@ class FusedCritics:
         # A recorded launch keeps its arguments alive.
         launches = self._record(partial(gradients, self._critics, *arrays, clip=clip, rows=range(1)))
 
-        def lesson(rows: range) -> Tensor:
+        def update(rows: range) -> Tensor:
             for launch in launches:
                 launch.set_param_by_name("start", rows.start)
                 launch.set_param_by_name("stop", rows.stop)
@@ -73,7 +80,7 @@ class FusedCritics:
             _copy(self._stores)
             return loss
 
-        return lesson
+        return update
 
     def _record(self, launcher: Callable[..., wp.Launch | None]) -> list[wp.Launch]:
         """A launch for every member."""
@@ -99,11 +106,11 @@ def _copy(views: _Copies) -> None:
         to.copy_(source)
 
 
-def _views(stack: Stack, layout: Layout, table: Tensor, gradient: Tensor) -> tuple[_Copies, _Copies]:
+def _views(layers: _Layers, layout: Layout, table: Tensor, gradient: Tensor) -> tuple[_Copies, _Copies]:
     """What fills the tables, and what their gradients go to."""
     loads: _Copies = []
     stores: _Copies = []
-    for layer, (weight, weight_grad, bias, bias_grad) in enumerate(stack.layers):
+    for layer, (weight, weight_grad, bias, bias_grad) in enumerate(layers):
         outputs, inputs = weight.shape[1:]
         loads += zip(_places(layout, layer, inputs, outputs, table), (weight, bias), strict=True)
         stores += zip((weight_grad, bias_grad), _places(layout, layer, inputs, outputs, gradient), strict=True)

@@ -4,14 +4,15 @@ PyTorch hands them to MKL, which takes twice as long as oneDNN and longer where 
 A GPU has one library; there everything here is the plain operation.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-_MATMUL = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
+_MATMUL: Any = getattr(torch.backends.mkldnn, "matmul", None)  # not in every version of PyTorch
 
 
 def fast_linear(x: Tensor, weight: Tensor, bias: Tensor | None, activation: nn.Module | None = None) -> Tensor:
@@ -24,13 +25,27 @@ def fast_linear(x: Tensor, weight: Tensor, bias: Tensor | None, activation: nn.M
     """
     if x.shape[1] == 1 and bias is None:
         y = x * weight.t()  # an outer product: MKL takes ten times as long
-    elif len(x) * weight.numel() >= 2**20 and x.device.type == "cpu" and torch.backends.mkldnn.is_available():
+    elif len(x) * weight.numel() >= 2**20 and x.device.type == "cpu" and (linear := _onednn_linear()) is not None:
         fused = "relu" if isinstance(activation, nn.ReLU) else "tanh" if isinstance(activation, nn.Tanh) else "none"
-        y = torch.ops.mkldnn._linear_pointwise(x, weight, bias, fused, [], "")
+        y = linear(x, weight, bias, fused, [], "")
         activation = activation if fused == "none" else None
     else:
         y = nn.functional.linear(x, weight, bias)
     return y if activation is None else activate_(y, activation)
+
+
+@cache
+def _onednn_linear() -> Callable[..., Tensor] | None:
+    """The operator of oneDNN, which is private to PyTorch; ``None`` where it is missing or takes something else."""
+    if not torch.backends.mkldnn.is_available():
+        return None
+    x = torch.tensor([[-1.0, 3.0]])
+    try:
+        linear = torch.ops.mkldnn._linear_pointwise
+        right = torch.equal(linear(x, x, x[0, :1], "relu", [], ""), torch.tensor([[9.0]]))
+    except (AttributeError, RuntimeError, TypeError):
+        return None
+    return linear if right else None
 
 
 def add_product_(total: Tensor, delta: Tensor, x: Tensor) -> None:
@@ -97,7 +112,7 @@ def _exact_through_onednn() -> bool:
     PyTorch passes float32 on to oneDNN only with that permission. oneDNN uses it on processors with units for
     tiles of bfloat16 (AMX), whose own library is fast in float32, and not on the others.
     """
-    if not torch.backends.mkldnn.is_available():
+    if not torch.backends.mkldnn.is_available() or not hasattr(_MATMUL, "fp32_precision"):
         return False
     before = _MATMUL.fp32_precision
     _MATMUL.fp32_precision = "bf16"

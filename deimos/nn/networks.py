@@ -1,6 +1,8 @@
 """Multilayer perceptrons, their gradient without allocations, and the actor-critic."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -14,18 +16,48 @@ Activation = Literal["relu", "elu", "tanh"]
 _MODULES: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU, "tanh": nn.Tanh}
 
 
-def mlp(inputs: int, hidden: Sequence[int], outputs: int, activation: Activation) -> nn.Sequential:
-    """Linear layers with ``activation`` between them, in PyTorch's default initialisation."""
+@dataclass(frozen=True)
+class Whitening:
+    """What a network sees of a candidate: clip((x - mean) * factor, -bound, bound). Tensors may change, not move."""
+
+    mean: Tensor
+    """Shape (goal_dim,)."""
+    factor: Tensor
+    """Shape (goal_dim,)."""
+    bound: float
+    """Above 0."""
+
+
+def mlp(
+    inputs: int, hidden: Sequence[int], outputs: int, activation: Activation, generator: torch.Generator | None = None
+) -> nn.Sequential:
+    """Linear layers with ``activation`` between them.
+
+    Args:
+        inputs: Inputs.
+        hidden: Units of the hidden layers.
+        outputs: Outputs.
+        activation: Between the layers.
+        generator: Where the weights are drawn from, by PyTorch's default initialisation; ``None`` leaves them 0, to
+            be loaded. PyTorch itself would draw them from the process's generator, which is somebody else's.
+    """
     sizes = [inputs, *hidden]
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
-        layers += [nn.Linear(size_in, size_out), _MODULES[activation]()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
+        layers += [_linear(size_in, size_out, generator), _MODULES[activation]()]
+    return nn.Sequential(*layers, _linear(sizes[-1], outputs, generator))
 
 
-def operations(net: nn.Module) -> int:
-    """Multiplications and additions of the linear layers of a network for one row, forward."""
-    return sum(2 * layer.weight.numel() for layer in net.modules() if isinstance(layer, nn.Linear))
+def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    if generator is None:
+        nn.init.zeros_(layer.weight)
+        nn.init.zeros_(layer.bias)
+    else:  # as ``nn.Linear.reset_parameters`` does it
+        nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=generator)
+        bound = 1 / math.sqrt(inputs)
+        nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
+    return layer
 
 
 def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]:
@@ -61,7 +93,7 @@ def flatten_parameters(*modules: nn.Module) -> tuple[nn.Parameter, list[Tensor]]
 
 
 def weights_of(net: nn.Module) -> dict[str, Tensor]:
-    """A copy of a network's ``state_dict``: later lessons leave it alone, and a file of it holds nothing else.
+    """A copy of a network's ``state_dict``: later updates leave it alone, and a file of it holds nothing else.
 
     Parameters that ``flatten_parameters`` has laid out are views, and a view is saved with all that it is a view of.
     """
@@ -77,7 +109,7 @@ def rows_in_cache(widest: int) -> int:
     """Rows whose activations take 3 MiB in a layer of ``widest`` units.
 
     A CPU works through larger batches in such pieces: they stay in its caches and far below the blocks of memory
-    that the C library gives back to the system (see ``products.keep_freed_memory``).
+    that the C library gives back to the system (see ``matmul.keep_freed_memory``).
     """
     return max(256, 3 * 2**20 // (4 * widest))
 
@@ -150,16 +182,6 @@ class ManyCandidates:
         rows = workspace * 2**20 // (8 * widest)  # a layer's input and output
         self._rows = min(rows, rows_in_cache(widest)) if weight.device.type == "cpu" else rows
 
-    def operations(self, contexts: float, count: int) -> float:
-        """Multiplications and additions of the products for ``count`` candidates in each of ``contexts``."""
-        shared, own = 2 * self._of_context.numel(), 2 * self._of_candidate.numel()
-        rest = sum(2 * layer.weight.numel() for layer in self._others)
-        return contexts * (shared + count * (own + rest))
-
-    def contexts_at_once(self, count: int) -> int:
-        """Contexts, each with ``count`` candidates, whose activations fit the workspace; at least 1."""
-        return max(1, self._rows // count)
-
     @torch.no_grad()
     def __call__(self, context: Tensor, candidates: Tensor) -> Tensor:
         """The network's output for every candidate, shape (B, N, outputs).
@@ -171,7 +193,7 @@ class ManyCandidates:
         count = candidates.shape[1]
         of_candidate = self._of_candidate.expand(len(candidates), -1, -1)
         of_context = torch.addmm(self._first.bias, context, self._of_context).unsqueeze(1)
-        size = self.contexts_at_once(count)
+        size = max(1, self._rows // count)
         outputs = []
         for known, part in zip(of_context.split(size), candidates.split(size), strict=True):
             x = torch.baddbmm(known, part, of_candidate[: len(part)]).flatten(0, 1)
@@ -184,13 +206,14 @@ class ManyCandidates:
 
 
 class Actor(nn.Module):
-    """A Gaussian policy: its mean is an MLP of the observation, its deviation one number per action."""
+    """A Gaussian policy: its mean is an MLP of the observation, its deviation one number per action; see ``mlp``."""
 
     def __init__(
-        self, obs_dim: int, hidden: Sequence[int], action_dim: int, activation: Activation, init_std: float
-    ) -> None:
+        self, obs_dim: int, hidden: Sequence[int], action_dim: int, activation: Activation, init_std: float,
+        generator: torch.Generator | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
-        self.mean = mlp(obs_dim, hidden, action_dim, activation)
+        self.mean = mlp(obs_dim, hidden, action_dim, activation, generator)
         self.std = nn.Parameter(torch.full((action_dim,), init_std))
 
     def forward(self, obs: Tensor) -> Tensor:

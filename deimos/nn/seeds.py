@@ -2,8 +2,6 @@
 
 import hashlib
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -25,25 +23,12 @@ def derive(seed: int, use: str) -> int:
     return int(np.random.SeedSequence([seed, *use.encode()]).generate_state(1, np.uint64)[0])
 
 
-def generator(seed: int, use: str, device: torch.device) -> torch.Generator:
-    """A generator of its own for one use of chance; the arguments are those of ``derive``."""
-    return torch.Generator(device).manual_seed(derive(seed, use))
+def generator(seed: int, use: str, device: torch.device | str = "cpu") -> torch.Generator:
+    """A generator of its own for one use of chance; the arguments are those of ``derive``.
 
-
-@contextmanager
-def weights_from(seed: int, use: str) -> Iterator[None]:
-    """Draw the weights of networks built inside from ``derive(seed, use)`` alone, and leave torch's own streams be.
-
-    Networks are built on the CPU. ``torch.manual_seed`` would seed the streams of all GPUs too, which may be those of
-    somebody else's training.
+    Weights are drawn on the CPU, whatever the device of their network.
     """
-    own = torch.default_generator
-    state = own.get_state()
-    own.manual_seed(derive(seed, use))
-    try:
-        yield
-    finally:
-        own.set_state(state)
+    return torch.Generator(device).manual_seed(derive(seed, use))
 
 
 def restore(generator: torch.Generator, state: torch.Tensor) -> None:

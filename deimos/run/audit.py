@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.goals.calibration import judge
+from deimos.goals.calibration import evaluate
 from deimos.goals.fear import auroc
 from deimos.goals.fear_selector import fear_selector
 from deimos.goals.interactions import Resolved
@@ -45,7 +45,7 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
 
     Returns:
         ``auroc``, the mean over contexts; ``low`` and ``high``, its 95 % bootstrap interval by
-        context; ``contexts`` with both outcomes among those ``tried``; ``crash_share`` of all
+        context; ``contexts`` with both outcomes among those ``tried``; ``crash_rate`` of all
         rollouts; ``iteration``.
 
     Raises:
@@ -85,7 +85,7 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
         "high": float(high),
         "contexts": len(ranks),
         "tried": tried,
-        "crash_share": crashes / (tried * CANDIDATES),
+        "crash_rate": crashes / (tried * CANDIDATES),
         "iteration": trainer.iteration,
     }
 
@@ -102,7 +102,7 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
 
     Returns:
         For ``selected`` and ``uniform`` goals: probabilities, shape (n,), what became of them, bool, shape (n,),
-        and the dictionary of ``calibration.judge``, with ``interactions``, ``crash_share`` and ``auroc``.
+        and the dictionary of ``calibration.evaluate``, with ``interactions``, ``crash_rate`` and ``auroc``.
 
     Raises:
         RunError: If there is no fear network.
@@ -117,8 +117,8 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
         done = _watch(trainer, chooser, interactions, generator)
         score = afraid.score(done.state, done.goal, done.next_goal.unsqueeze(1)).squeeze(1)
         probability = afraid.calibration.probability(score)
-        counts = {"interactions": float(len(done)), "crash_share": done.crashed.float().mean().item()}
-        quality = counts | {"auroc": auroc(score, done.crashed)} | judge(probability, done.crashed)
+        counts = {"interactions": float(len(done)), "crash_rate": done.crashed.float().mean().item()}
+        quality = counts | {"auroc": auroc(score, done.crashed)} | evaluate(probability, done.crashed)
         results[name] = probability, done.crashed, quality
     return results
 

@@ -18,13 +18,8 @@ _PLUGINS = {EnvConfig: envs, SelectorConfig: selectors}
 
 def to_dict(config: Any) -> dict:
     """A dataclass as a dictionary of JSON types; a plugin's configuration names its plugin in ``kind``."""
-    if isinstance(config, EnvConfig | SelectorConfig):
-        return {"kind": kind(config)} | _fields(config)
-    return _fields(config)
-
-
-def _fields(config: Any) -> dict:
-    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    named = {"kind": kind(config)} if isinstance(config, EnvConfig | SelectorConfig) else {}
+    return named | {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
 def _plain(value: Any) -> Any:

@@ -16,10 +16,9 @@ from torch import Tensor, nn
 
 from deimos.checks import check_at_least, check_choice, check_range
 from deimos.goals.fear import Fear, FearConfig, auroc
-from deimos.goals.interactions import Interactions, Resolved
+from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.goals.selectors import director, uniform
-from deimos.nn.fused import fuse
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones, Oracle
 from deimos.sim.env import Env, EnvConfig
@@ -236,7 +235,7 @@ def train_adversary(
         ``adversary_auroc`` (on every fifth world, which it did not learn from; NaN where they hold no pair to rank) and
         ``weak_adversary``: whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
     """
-    fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed, fuse)
+    fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed)
     collector = _Collector(env, fear)
     limit = config.adversary_steps * config.adversary_patience
     loop = GoalLoop(env, collector, window=limit)
@@ -247,12 +246,12 @@ def train_adversary(
         loop.advance(step)
         if t % pause == 0 or t == limit:
             progress(min(1.0, t / config.adversary_steps))
-            data = _whole(loop.interactions)
+            data = _whole(loop)
             fear.fit(_training_part(data), epochs=1)
             if _enough(config, len(data), int(data.crashed.sum()), t):
                 break
     env.check()
-    data = _whole(loop.interactions)
+    data = _whole(loop)
     fear.fit(_training_part(data))
     fear.check()
     quality = _quality(fear, data.where(data.env % HELD_OUT == 0))
@@ -290,10 +289,10 @@ def _enough(config: EvalConfig, interactions: int, crashes: int, steps: int) -> 
     return any(counts) if config.adversary_enough == "any" else all(counts) and steps >= config.adversary_steps
 
 
-def _whole(interactions: Interactions) -> Resolved:
+def _whole(loop: GoalLoop) -> Resolved:
     """What was issued at least T steps ago: of the later ones only the crashes are known yet."""
-    data = interactions.resolved()
-    return data.where(data.issued <= interactions.now - interactions.goal_period)
+    data = loop.interactions.resolved()
+    return data.where(data.issued <= loop.interactions.now - loop.env.goal_period)
 
 
 def _training_part(data: Resolved) -> Resolved:

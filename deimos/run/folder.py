@@ -1,82 +1,14 @@
 """A run's folder: what is written where, so that it survives a kill at any moment."""
 
-import contextlib
 import csv
+import io
 import json
 import math
-import os
-import pickle
-import struct
-import warnings
-import zipfile
-import zlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import torch
-
-
-class RunError(Exception):
-    """A run cannot go on for a reason outside the program: a folder, a file, a disk, a device."""
-
-
-_UNREADABLE = (  # what reading damaged and foreign archives was seen to raise
-    OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError,
-    struct.error, zlib.error, zipfile.BadZipFile, pickle.UnpicklingError,
-)  # fmt: skip
-
-
-def save_tensors(path: Path, data: dict) -> None:
-    """Write a file of tensors so that at every moment either the old or the new one is whole.
-
-    Raises:
-        RunError: If it cannot be written; the file of before is untouched.
-    """
-    _write_whole(path, lambda file: torch.save(data, file))
-
-
-def _write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write a file under a temporary name, to the disk, and only then rename it."""
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        with temporary.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-        with contextlib.suppress(OSError):  # nor can anything be deleted on a read-only disk
-            temporary.unlink(missing_ok=True)
-        raise RunError(f"{path} could not be written ({_first_line(error)}); what was there is untouched.") from error
-
-
-def load_tensors(path: Path, what: str, schema: int) -> dict:
-    """Read a file of tensors.
-
-    Raises:
-        RunError: If it is missing, broken, foreign or of another version.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:  # torch reads on over damaged bytes; the archive's checksums tell
-            if damaged := archive.testzip():
-                raise ValueError(f"{damaged} is damaged")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what torch says of a foreign file; it is refused all the same
-            data = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise RunError(f"There is no {what} at {path}.") from error
-    except _UNREADABLE as error:  # torch's own words on foreign objects advise to run them
-        reason = "it holds more than tensors" if isinstance(error, pickle.UnpicklingError) else _first_line(error)
-        raise RunError(f"{path} is not a {what}, or it is broken ({reason}).") from error
-    found = data.get("schema") if isinstance(data, dict) else None
-    if not isinstance(found, int) or found != schema:
-        raise RunError(f"{path} is not a {what} of schema {schema}, got {found}.")
-    return data
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+from deimos.checks import RunError
+from deimos.files import first_line, write_whole
 
 
 class RunFolder:
@@ -95,9 +27,8 @@ class RunFolder:
         try:
             path.mkdir(parents=True)
         except FileExistsError as error:
-            raise RunError(
-                f"{path} exists and is not overwritten; choose another --out, or go on with --resume."
-            ) from error
+            reason = f"{path} exists and is not overwritten; choose another --out, or continue with --resume."
+            raise RunError(reason) from error
         except OSError as error:
             raise RunError(f"The run folder {path} cannot be made ({error.strerror}).") from error
         return cls(path)
@@ -120,7 +51,7 @@ class RunFolder:
             RunError: If it cannot be written.
         """
         text = json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n"
-        _write_whole(self.path / name, lambda file: file.write(text.encode()))
+        write_whole(self.path / name, lambda file: file.write(text.encode()))
 
     def read_json(self, name: str) -> Any:
         """Read a JSON file.
@@ -131,7 +62,7 @@ class RunFolder:
         try:
             return json.loads((self.path / name).read_text())
         except (OSError, ValueError) as error:
-            raise RunError(f"{self.path / name} cannot be read ({_first_line(error)}).") from error
+            raise RunError(f"{self.path / name} cannot be read ({first_line(error)}).") from error
 
     def read_csv(self, name: str) -> list[dict[str, str]]:
         """All whole rows of a CSV file; none if there is no file."""
@@ -142,18 +73,20 @@ class RunFolder:
             return [row for row in csv.DictReader(file) if None not in row.values()]
 
     def cut_csv(self, name: str, iteration: int) -> None:
-        """Drop the rows after an iteration: a resumed run writes them again."""
+        """Drop the rows after an iteration: a resumed run writes them again.
+
+        Raises:
+            RunError: If it cannot be written.
+        """
         rows = [row for row in self.read_csv(name) if int(row["iteration"]) <= iteration]
-        path = self.path / name
         if not rows:
-            path.unlink(missing_ok=True)
+            (self.path / name).unlink(missing_ok=True)
             return
-        temporary = path.with_name(path.name + ".partial")
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
-        temporary.replace(path)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+        write_whole(self.path / name, lambda file: file.write(text.getvalue().encode()))
 
     def append_csv(self, name: str, row: dict[str, float]) -> None:
         """Add a row, and a header where there is none yet; NaN becomes an empty cell.

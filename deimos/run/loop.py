@@ -1,12 +1,9 @@
 """What happens between two steps: interactions resolve, goals are chosen, episodes begin."""
 
 import torch
-from torch import Tensor
 
-from deimos.goals.interactions import Interactions
+from deimos.goals.core import Changes, GoalCore
 from deimos.goals.selector import GoalSelector, Spaces
-from deimos.nn.fused import fuse
-from deimos.nn.fused_critics import fuse_critics
 from deimos.sim.env import Env, Step
 
 
@@ -15,13 +12,11 @@ def spaces(env: Env, total_steps: int = 0) -> Spaces:
     return Spaces(
         num_envs=env.num_envs, state_dim=env.state_dim, goal_dim=env.goal_dim, goal_period=env.goal_period,
         device=env.device, groups=env.goal_groups, goal_start=env.goal_slice.start, total_steps=total_steps,
-        fuse=fuse,
-        fuse_critics=fuse_critics,
     )  # fmt: skip
 
 
 class GoalLoop:
-    """Joins an environment, a selector and their interactions; training and evaluation both run it.
+    """Joins an environment and a goal core; training and evaluation both run it.
 
     Args:
         env: The worlds.
@@ -31,13 +26,8 @@ class GoalLoop:
 
     def __init__(self, env: Env, selector: GoalSelector, window: int | None = None) -> None:
         self.env = env
-        self.selector = selector
-        self.interactions = Interactions(
-            env.num_envs, env.state_dim, env.goal_dim, env.goal_period, window or 2 * env.goal_period, env.device,
-            groups=0 if env.goal_groups == (slice(None),) else len(env.goal_groups),
-        )  # fmt: skip
-        self.weight = torch.ones(env.num_envs, device=env.device)
-        """1 where the learner may use the transitions under the goal in force, else 0, shape (num_envs,)."""
+        self.core = GoalCore(selector, spaces(env), window)
+        self.selector, self.interactions, self.weight = selector, self.core.interactions, self.core.weight
         if selector.first_goals_scaled:  # the goals that the environment was built with are not
             env.restart(selector.goal_range())
 
@@ -52,52 +42,33 @@ class GoalLoop:
         Interactions are resolved before anything is reset, so one whose T-th step is the time
         limit keeps its label. Worlds that are done get a first goal, not one of the selector's.
         """
-        self.interactions.advance(step)
-        done = step.terminated | step.truncated
-        due = step.goal_due & ~done
-        due_count, done_count = torch.stack([due.sum(), done.sum()]).tolist()  # the one synchronisation of the step
-        if due_count + done_count == 0:
-            return
-        due_rows = _rows(due, due_count)
-        self.interactions.resolve(step, torch.cat([due_rows, _rows(done, done_count)]))
-        if due_count:
-            self._propose(due_rows)
-        if done_count:
-            self._reset(done)
+        self.renew(step, self.resolve(step))
 
-    def _propose(self, rows: Tensor) -> None:
-        env, selector = self.env, self.selector
-        obs = env.obs[rows]
-        state, goal = env.state(obs), obs[:, env.goal_slice]
-        candidates = env.sample_goals(rows, selector.num_candidates, selector.goal_range())
-        proposal = selector.propose(rows, state, goal, candidates, env.draw(rows))
-        self.interactions.open(
-            rows, state, goal, proposal.goal, proposal.score, probe=proposal.probe, note=proposal.note
-        )
-        self.weight[rows] = 1.0 if proposal.learn is None else proposal.learn.float()
-        env.set_goals(rows, proposal.goal)
+    def resolve(self, step: Step) -> Changes:
+        """The first half of ``advance``: what became of the goals; nothing is reset yet."""
+        return self.core.advance(step.terminated, step.truncated, step.goal_due, step.reward, step.tracking)
 
-    def _reset(self, mask: Tensor) -> None:
+    def renew(self, step: Step, changes: Changes) -> None:
+        """The second half of ``advance``: new goals where they are due, new episodes where one has ended."""
+        env, rows = self.env, changes.due
+        if len(rows):
+            obs = env.obs[rows]
+            candidates = env.sample_goals(rows, self.selector.num_candidates, self.selector.goal_range())
+            goal = self.core.choose(rows, env.state(obs), obs[:, env.goal_slice], candidates, env.draw(rows))
+            env.set_goals(rows, goal)
+        if len(changes.done):
+            self._reset(step.terminated | step.truncated)
+
+    def _reset(self, mask: torch.Tensor) -> None:
         self.env.reset(mask, self.selector.goal_range() if self.selector.first_goals_scaled else None)
         self.weight.masked_fill_(mask, 1.0)
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
-        return {
-            "env": self.env.state_dict(),
-            "selector": self.selector.state_dict(),
-            "interactions": self.interactions.state_dict(),
-            "learn": self.weight.clone(),
-        }
+        state = self.core.state_dict()
+        return {"env": self.env.state_dict(), "learn": state.pop("weight"), **state}
 
     def load_state_dict(self, state: dict) -> None:
         """Go on from ``state_dict()``."""
         self.env.load_state_dict(state["env"])
-        self.selector.load_state_dict(state["selector"])
-        self.interactions.load_state_dict(state["interactions"])
-        self.weight.copy_(state["learn"])
-
-
-def _rows(mask: Tensor, count: int) -> Tensor:
-    """Indices of the ``count`` true entries of ``mask``; a known count spares the device a wait."""
-    return torch.nonzero_static(mask, size=count).squeeze(1)
+        self.core.load_state_dict(state | {"weight": state["learn"]})

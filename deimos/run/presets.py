@@ -1,13 +1,15 @@
 """Ready configurations: what an environment is trained with unless somebody says otherwise.
 
 A module of ``deimos.sim.envs`` may hold ``PRESETS``: by name, the fields of ``TrainConfig`` that differ from its
-defaults. The one with the environment's own name is what ``env:NAME`` starts from. As on the command line,
-hyphens and underscores in a name are the same.
+defaults, in plain dictionaries as ``config.json`` has them: those of the environment in ``env``, of the learner in
+``ppo``, of the evaluation in ``eval``. The one with the environment's own name is what ``env:NAME`` starts from. As on
+the command line, hyphens and underscores in a name are the same.
 """
 
 from typing import Any
 
 from deimos import plugins
+from deimos.run.config import from_dict
 from deimos.run.training import TrainConfig
 from deimos.sim import envs
 
@@ -17,7 +19,7 @@ def _all() -> dict[str, tuple[str, dict[str, Any]]]:
     found: dict[str, tuple[str, dict[str, Any]]] = {}
     for env in plugins.names(envs):
         module = plugins.load(envs, env)
-        own = {_spelled(env): {"env": module.Config()}} | getattr(module, "PRESETS", {})
+        own = {_spelled(env): {}} | getattr(module, "PRESETS", {})
         found |= {_spelled(name): (env, fields) for name, fields in own.items()}
     return found
 
@@ -40,9 +42,11 @@ def preset(name: str) -> TrainConfig:
     """The configuration of a preset.
 
     Raises:
-        ValueError: If there is no such preset; the message lists those that there are.
+        ValueError: If there is no such preset; the message lists those that there are. Or if one of its fields is
+            unknown or not allowed.
     """
-    return TrainConfig(**_get(name)[1])
+    env, fields = _get(name)
+    return from_dict(TrainConfig, fields | {"env": {"kind": env} | fields.get("env", {})})
 
 
 def _get(name: str) -> tuple[str, dict[str, Any]]:

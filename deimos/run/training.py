@@ -1,4 +1,4 @@
-"""Training: a policy learns in parallel worlds whose goals a selector chooses."""
+"""From nothing or from a checkpoint to a trained policy: how a run begins, goes on, is saved and ends."""
 
 import os
 import platform
@@ -6,95 +6,24 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
 import torch
-from torch import Tensor
 
 from deimos import __version__
-from deimos.checks import SimulationError, check_at_least, check_choice
-from deimos.goals.methods import method
-from deimos.goals.selector import SelectorConfig
-from deimos.learn.policy import load_policy, save_policy
-from deimos.learn.ppo import PPO, PPOConfig
-from deimos.learn.rollout import Rollout
-from deimos.nn.matmul import keep_freed_memory, on_threads
+from deimos.checks import RunError
+from deimos.files import load_tensors, save_tensors
+from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run.config import from_dict, kind, to_dict
-from deimos.run.evaluation import EvalConfig
-from deimos.run.folder import RunError, RunFolder, load_tensors, save_tensors
-from deimos.run.loop import GoalLoop, spaces
-from deimos.sim.env import EnvConfig
-from deimos.sim.envs import particle
+from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig, Trainer
 
-SCHEMA = 1  # of config.json and checkpoint.pt
+SCHEMA = 1  # of config.json
+CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be taken over, but its worlds cannot go on
 CHECKPOINT_SECONDS = 30.0
 LEAST_BYTES = 100  # of any transition, and of any world
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """A training run and the evaluation at its end."""
-
-    env: EnvConfig = field(default_factory=particle.Config)
-    """The environment."""
-    method: str | None = None
-    """Who chooses the goals, by name (docs/selectors.md explains them all): uniform, coop, p10, p25, p50, p75, p90,
-    antagonist, rnd, vds, cl, vds+p75, ... By default p25; or leave it out and set up a selector."""
-    selector: SelectorConfig | None = None
-    """Who chooses the goals, in detail."""
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    """The learner."""
-    eval: EvalConfig = field(default_factory=EvalConfig)
-    """The evaluation against Naive and Adversary at the end."""
-    evaluation: bool = True
-    """Whether the run ends with the evaluation."""
-    seed: int = 0
-    """Seed of the weights, the worlds, the goals and the exploration, in [0, 2^32)."""
-    num_envs: int = 2000
-    """Parallel worlds, at least 1."""
-    env_steps: int = 2000
-    """Steps of every world, at least 1; rounded up to whole rollouts."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to simulate and learn; auto takes the GPU where there is one."""
-    threads: int = 0
-    """CPU threads, at least 0; 0 takes one per core that this process may use. Part of what fixes a run's numbers."""
-
-    def __post_init__(self) -> None:
-        check_at_least("num_envs", self.num_envs, 1)
-        check_at_least("env_steps", self.env_steps, 1)
-        check_at_least("threads", self.threads, 0)
-        check_choice("device", self.device, ["auto", "cpu", "cuda"])
-        if not 0 <= self.seed < 2**32:
-            raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
-        if self.method is not None and self.selector is not None:
-            raise ValueError(f"method '{self.method}' and a selector exclude each other; give one of them.")
-        if self.method is not None:
-            method(self.method)
-        if self.evaluation and self.eval.steps < 2 * self.env.goal_period:
-            raise ValueError(f"eval.steps must be at least 2 T = {2 * self.env.goal_period}, got {self.eval.steps}.")
-        transitions = self.num_envs * self.ppo.num_steps
-        if transitions < 2 or self.ppo.minibatches > transitions:
-            raise ValueError(
-                f"A rollout must hold ppo.minibatches = {self.ppo.minibatches} transitions or more, got {transitions}."
-            )
-
-    @property
-    def goals(self) -> SelectorConfig:
-        """Who chooses the goals."""
-        return self.selector or method(self.method or "p25")
-
-    @property
-    def label(self) -> str:
-        """Short name of who chooses the goals."""
-        return self.method or (kind(self.selector) if self.selector else "p25")
-
-    @property
-    def iterations(self) -> int:
-        """Rollouts in the whole run."""
-        return -(-self.env_steps // self.ppo.num_steps)
 
 
 def resolve_device(name: str) -> torch.device:
@@ -111,150 +40,6 @@ def resolve_device(name: str) -> torch.device:
 def cores() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-class Trainer:
-    """Everything that a run holds in memory, and one iteration of it."""
-
-    def __init__(self, config: TrainConfig, device: torch.device) -> None:
-        keep_freed_memory()
-        self.config = config
-        self.env = config.env.build(config.num_envs, device, config.seed)
-        total_steps = config.iterations * config.ppo.num_steps
-        self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
-        self.ppo = PPO(config.ppo, self.env, config.seed)
-        self.rollout = Rollout(
-            self.env, config.ppo.num_steps, discount=config.ppo.discount, gae_lambda=config.ppo.gae_lambda,
-            reward_scale=config.ppo.reward_scale,
-        )  # fmt: skip
-        self.iteration = 0
-        self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
-        """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""
-        self.synchronise = False
-        """Whether to wait for the device at the end of every part, to tell their times apart; for benchmarks."""
-
-    def collect(self) -> None:
-        """Let the policy act for one rollout."""
-        with on_threads(1):
-            self._collect()
-
-    def _collect(self) -> None:
-        env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
-        rollout.noise.normal_(generator=ppo.generator)
-        clock = _Clock(self)
-        for t in range(rollout.num_steps):
-            rollout.obs[t] = env.obs
-            ppo.act(env.obs, rollout.noise[t], rollout.action[t], rollout.mean[t])
-            clock.lap("policy")
-            step = env.step(rollout.action[t])
-            clock.lap("env")
-            rollout.record(t, step, loop.weight)
-            loop.advance(step)
-            clock.lap("goals")
-        rollout.obs[-1] = env.obs
-
-    def iterate(self) -> dict[str, float]:
-        """One rollout and what is learnt from it.
-
-        Returns:
-            The row of ``progress.csv``.
-
-        Raises:
-            SimulationError: If a number is not finite. This trainer is spoilt then; the last checkpoint is not.
-        """
-        self.iteration += 1
-        try:
-            self.collect()
-            self.env.check()
-            if self.env.may_go_on_invalid:
-                self.rollout.exclude_invalid()
-            _check_obs(self.rollout.obs[-1])
-            clock = _Clock(self)
-            learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
-            self.ppo.check()
-            clock.lap("update")
-            with on_threads(1):
-                selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
-            self.loop.selector.check()
-            clock.lap("selector")
-        except SimulationError as error:
-            raise SimulationError(f"Iteration {self.iteration}: {error}") from error
-        rollout = self.rollout
-        transitions = rollout.reward.numel()
-        crashes = int(rollout.terminated.sum())
-        reward = rollout.reward.mean(dtype=torch.float64).item() + self.env.crash_penalty * crashes / transitions
-        return {
-            "iteration": self.iteration,
-            "env_steps": self.iteration * rollout.num_steps,
-            "transitions": self.iteration * transitions,
-            "reward": reward,
-            "crashes": crashes,
-            "crashes_per_1000": 1000 * crashes / transitions,
-            "selected_share": self.loop.interactions.active.float().mean().item(),
-            **learner,
-            **selector,
-            **self.env.report(),
-        }
-
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {
-            "iteration": self.iteration,
-            "made_for": _identity(self.config),
-            "ppo": self.ppo.state_dict(),
-            "loop": self.loop.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``.
-
-        Raises:
-            RunError: If it is that of another environment or another network size.
-        """
-        try:
-            made_for = _completed(state["made_for"])
-            if made_for != _identity(self.config):
-                raise ValueError(f"it was made for {made_for}, this run is {_identity(self.config)}.")
-            self.ppo.load_state_dict(state["ppo"])
-            self.loop.load_state_dict(state["loop"])
-        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise RunError(f"The checkpoint is that of another environment or network size: {reason}") from error
-        self.iteration = state["iteration"]
-
-
-def _identity(config: TrainConfig) -> dict:
-    """What a checkpoint must have in common with the run that goes on from it."""
-    return {"env": to_dict(config.env), "selector": to_dict(config.goals), "num_envs": config.num_envs}
-
-
-def _completed(identity: dict) -> dict:
-    """The identity that an older version wrote, with the defaults of fields that configurations have got since."""
-    kinds = {"env": EnvConfig, "selector": SelectorConfig}
-    return identity | {name: to_dict(from_dict(cls, identity[name])) for name, cls in kinds.items()}
-
-
-def _check_obs(obs: Tensor) -> None:
-    """Raise ``SimulationError`` if an observation is not finite: what broke on a rollout's last step shows there."""
-    if not bool(obs.isfinite().all()):
-        world = int((~obs.isfinite()).any(dim=1).nonzero()[0])
-        raise SimulationError(f"World {world}: its observation is not finite.")
-
-
-class _Clock:
-    """Adds up the time between laps."""
-
-    def __init__(self, trainer: Trainer) -> None:
-        self._seconds = trainer.seconds
-        self._device = trainer.env.device if trainer.synchronise and trainer.env.device.type == "cuda" else None
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        if self._device is not None:
-            torch.cuda.synchronize(self._device)
-        now = time.perf_counter()
-        self._seconds[name] += now - self._last
-        self._last = now
 
 
 def provenance() -> dict[str, str]:
@@ -338,7 +123,7 @@ def _check_memory(config: TrainConfig) -> None:
 
 def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
     """Take over the networks of another run, whose observations must mean the same."""
-    state = load_tensors(origin.path / "checkpoint.pt", "checkpoint", SCHEMA)
+    state = load_checkpoint(origin)
     try:
         layout = load_policy(origin.path).layout
         if layout != trainer.env.layout:
@@ -347,6 +132,15 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise RunError(f"The networks of {origin.path} do not fit this run: {reason}") from error
+
+
+def load_checkpoint(folder: RunFolder) -> dict:
+    """What a run's checkpoint holds, of this version or of the one before.
+
+    Raises:
+        RunError: If there is none, or it is broken or foreign.
+    """
+    return load_tensors(folder.path / "checkpoint.pt", "checkpoint", CHECKPOINT_SCHEMA, oldest=1)
 
 
 def load(folder: RunFolder, config: TrainConfig) -> Trainer:
@@ -359,9 +153,15 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
     Raises:
         RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
     """
+    state = load_checkpoint(folder)
+    if state["schema"] != CHECKPOINT_SCHEMA:
+        raise RunError(
+            f"{folder.path / 'checkpoint.pt'} has the schema {state['schema']}, of an earlier version, and cannot be "
+            "resumed; evaluate its policy, or start a run with its networks by --init-from."
+        )
     torch.set_num_threads(config.threads)
     trainer = build(config, resolve_device(config.device))
-    trainer.load_state_dict(load_tensors(folder.path / "checkpoint.pt", "checkpoint", SCHEMA))
+    trainer.load_state_dict(state)
     return trainer
 
 
@@ -380,9 +180,7 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
     config = read_config(folder)
     if env_steps is not None:
         if env_steps < config.env_steps:
-            raise RunError(
-                f"A resumed run takes only a larger budget: it had {config.env_steps} steps, got {env_steps}."
-            )
+            raise RunError(f"--env-steps must exceed the {config.env_steps} already set, got {env_steps}.")
         config = replace(config, env_steps=env_steps)
     if device is not None:
         config = replace(config, device="cuda" if resolve_device(device).type == "cuda" else "cpu")
@@ -414,9 +212,10 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     Raises:
         RunError: If they cannot be written; the ones of before are whole.
     """
-    save_tensors(folder.path / "checkpoint.pt", {"schema": SCHEMA, **trainer.state_dict()})
-    ppo = trainer.config.ppo
-    save_policy(folder.path / "policy.pt", trainer.ppo.actor, ppo.hidden, ppo.activation, trainer.env)
+    save_tensors(folder.path / "checkpoint.pt", {"schema": CHECKPOINT_SCHEMA, **trainer.state_dict()})
+    ppo, env = trainer.config.ppo, trainer.env
+    policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
+    save_policy(folder.path / "policy.pt", policy)
 
 
 def train(

@@ -9,29 +9,17 @@ import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, Self, final
+from typing import TYPE_CHECKING, Self, final
 
 import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least, check_range
+from deimos.nn.layout import ObsField, goal_slice
 
 if TYPE_CHECKING:
     import mujoco
     import numpy as np
-
-
-@dataclass(frozen=True)
-class ObsField:
-    """A run of components of the observation."""
-
-    name: str
-    size: int
-    unit: str
-    scale: float | tuple[float, ...]
-    """The policy sees the physical value times this; one number for all components or one for each."""
-    seen_by: Literal["both", "actor", "critic"] = "both"
-    """Who sees it; what only the critic sees is privileged, for a simulator alone. The goal is seen by both."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +103,7 @@ class Env(abc.ABC):
     """What stands where in the observation; the field named ``goal`` is the goal slot."""
     action_dim: int
     action_bound: float
-    """Actions are clipped to [-action_bound, action_bound]; may be infinite."""
+    """Bound of every component of an action, in absolute value; may be infinite. See ``action_range``."""
     dt: float
     """Duration of a step [s]; 1 where the world has no seconds."""
     goal_period: int
@@ -222,6 +210,12 @@ class Env(abc.ABC):
         return None
 
     @property
+    def action_range(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest value of every component of an action, beyond which it is clipped, on the CPU."""
+        bound = torch.full((self.action_dim,), self.action_bound)
+        return -bound, bound
+
+    @property
     def obs_dim(self) -> int:
         """Components of the observation."""
         return sum(field.size for field in self.layout)
@@ -229,12 +223,7 @@ class Env(abc.ABC):
     @property
     def goal_slice(self) -> slice:
         """Where the goal sits in the observation."""
-        start = 0
-        for field in self.layout:
-            if field.name == "goal":
-                return slice(start, start + field.size)
-            start += field.size
-        raise ValueError("The layout has no field named 'goal'.")
+        return goal_slice(self.layout)
 
     @property
     def goal_dim(self) -> int:

@@ -1,15 +1,13 @@
-"""A worker of a study: the process that trains and judges one cell.
+"""One cell of a study: ``run`` trains and evaluates it, in whatever process an engine calls it.
 
-``python -m deimos.study.cell STUDY NAME RUNNER`` goes on from the cell's last checkpoint. It ends at once
-when the process RUNNER, which holds the cell's lease, is gone, and exits with 130 after SIGINT.
+``python -m deimos.study.cell STUDY NAME`` is the worker of ``deimos.study.engine.LocalProcesses``: a byte on its
+standard input asks it to stop, and when that input ends, its runner is gone and it ends at once.
 """
 
 import os
 import shutil
-import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,19 +19,21 @@ from deimos.run import training
 from deimos.run.evaluation import evaluate, weights_hash
 from deimos.run.folder import RunError, RunFolder
 from deimos.sim.shared import one_stream
-from deimos.study.folder import StudyFolder, curve_row, result_rows
+from deimos.study.folder import StudyFolder
+from deimos.study.lock import hold
 from deimos.study.plan import Cell
+from deimos.study.results import result
 
 STOPPED = 130
-WATCH_SECONDS = 0.2
+PATIENCE_SECONDS = 5.0  # a worker whose runner was killed needs a moment to see it
 
 
 class _Interrupted(Exception):
     pass
 
 
-def work(study: StudyFolder, cell: Cell, stopped: Callable[[], bool]) -> bool:
-    """Train, evaluate and enter a cell into the study's tables, from wherever it stands.
+def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: False) -> bool:
+    """Train and evaluate a cell from wherever it stands, and write its ``result.json``.
 
     Args:
         study: The study.
@@ -44,26 +44,26 @@ def work(study: StudyFolder, cell: Cell, stopped: Callable[[], bool]) -> bool:
         Whether the cell is finished.
 
     Raises:
-        RunError: If a file cannot be read or written, or the run cannot begin.
+        RunError: If another process works on it, a file cannot be read or written, or the run cannot begin.
         SimulationError: If a number is not finite.
     """
-    path = study.cell_path(cell) / "run"
-    device = training.resolve_device(cell.config.device)
-    with one_stream(device):
-        if (path / "checkpoint.pt").exists():
-            trainer, run = training.resume(path)
-        else:
-            shutil.rmtree(path, ignore_errors=True)  # it was killed before its first checkpoint
-            trainer, run = training.start(cell.config, path, None)
-        if not training.train(trainer, run, stopped=stopped) or stopped():
-            return False
-        try:
-            rows = _evaluated(run, cell, device, stopped)
-        except _Interrupted:
-            return False
-    study.curves.append([curve_row(cell, run)])
-    study.results.append(result_rows(cell, run, rows))
-    return True
+    with hold(study.cell_path(cell) / "lock", f"Cell {cell.name}", patience=PATIENCE_SECONDS):
+        path = study.cell_path(cell) / "run"
+        device = training.resolve_device(cell.config.device)
+        with one_stream(device):
+            if (path / "checkpoint.pt").exists():
+                trainer, folder = training.resume(path)
+            else:
+                shutil.rmtree(path, ignore_errors=True)  # it was killed before its first checkpoint
+                trainer, folder = training.start(cell.config, path, None)
+            if not training.train(trainer, folder, stopped=stopped) or stopped():
+                return False
+            try:
+                rows = _evaluated(folder, cell, device, stopped)
+            except _Interrupted:
+                return False
+        RunFolder(study.cell_path(cell)).write_json("result.json", result(cell, folder, rows))
+        return True
 
 
 def _evaluated(run: RunFolder, cell: Cell, device: torch.device, stopped: Callable[[], bool]) -> list[dict]:
@@ -87,25 +87,24 @@ def _evaluated(run: RunFolder, cell: Cell, device: torch.device, stopped: Callab
     return [row for row in rows if row["weights"] == weights]
 
 
-def _watch(runner: int) -> None:
-    """End this process as soon as its runner is gone: another one may take over the cell then."""
-    while os.getppid() == runner:
-        time.sleep(WATCH_SECONDS)
-    os._exit(1)
-
-
-def main(arguments: list[str]) -> int:
-    """Run the worker; returns the exit code."""
-    study, name, runner = StudyFolder(Path(arguments[0])), arguments[1], int(arguments[2])
-    threading.Thread(target=_watch, args=(runner,), daemon=True).start()
-    asked: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, frame: asked.append(number))
+def main(arguments: list[str], stopped: Callable[[], bool] = lambda: False) -> int:
+    """Work on the cell that the arguments name; returns the exit code."""
+    study, name = StudyFolder(Path(arguments[0])), arguments[1]
     try:
-        return 0 if work(study, study.cell(name), lambda: bool(asked)) else STOPPED
+        return 0 if run(study, study.cell(name), stopped) else STOPPED
     except (RunError, SimulationError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 2
 
 
+def _listen(stop: threading.Event) -> None:
+    """Set ``stop`` at the first byte of the standard input, and end this process where that ends."""
+    while os.read(0, 1):  # not sys.stdin: a thread that waits in it would hold its lock when Python shuts down
+        stop.set()
+    os._exit(1)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    asked = threading.Event()
+    threading.Thread(target=_listen, args=(asked,), daemon=True).start()
+    sys.exit(main(sys.argv[1:], asked.is_set))

@@ -1,41 +1,26 @@
-"""The command line of a study: ``deimos study run | show | merge | report | presets | coverage``."""
+"""The commands of ``deimos study``: options and a function for each."""
 
 import contextlib
 import math
 import re
-import shutil
 import statistics
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import tyro
-from rich.console import Console, Group
-from rich.live import Live
+from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 from deimos.checks import check_at_least
 from deimos.run.folder import RunError
 from deimos.study import plan
-from deimos.study.folder import StudyFolder, identity
-from deimos.study.presets import PRESETS
-from deimos.study.results import check_comparable, merge, results
+from deimos.study.engine import LocalProcesses
+from deimos.study.folder import StudyFolder
+from deimos.study.results import check_comparable, identity, merge
 from deimos.study.runner import Progress, Runner
-
-USAGE = """usage: deimos study COMMAND [OPTIONS]
-
-commands:
-  run        train and evaluate a grid of environments, methods and seeds; goes on where it was stopped
-  show       where a study stands
-  merge      add the results of other studies to one
-  report     statistics, figures, claims: one HTML page and its Markdown twin
-  presets    the ready-made studies
-  coverage   how often the intervals of the report contain the truth, on simulated data
-
-Every command explains its options with --help."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,38 +28,34 @@ class RunOptions:
     """Train and evaluate every cell of a study that is not finished yet."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder of the study. Machines that share it share the work."""
-    preset: str | None = None
-    """A ready-made study; deimos study presets lists them."""
+    """Folder of the study. One process works on it at a time."""
     file: Path | None = None
-    """A study in a TOML file (docs/study.md)."""
+    """The study, in a TOML file (docs/study.md). By default the one that was begun in the folder."""
     seeds: str | None = None
-    """Seeds in place of the study's: a number of them (10), a range (10-19) or a list (0,3,5)."""
+    """Seeds in place of the file's: a number of them (10), a range (10-19) or a list (0,3,5)."""
     methods: list[str] | None = None
-    """Methods in place of the study's."""
+    """Methods in place of the file's."""
     environments: list[str] | None = None
-    """Those of the study's environments that are wanted. By default all."""
+    """Those of the file's environments that are wanted. By default all."""
     num_envs: int | None = None
-    """Parallel worlds of the training, in place of the study's."""
+    """Parallel worlds of the training, in place of the file's."""
     env_steps: int | None = None
-    """Steps of every world, in place of the study's."""
+    """Steps of every world, in place of the file's."""
     device: Literal["auto", "cpu", "cuda"] | None = None
-    """Where to simulate and learn, in place of the study's. Part of what fixes a cell's numbers."""
+    """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
-    """CPU threads of every worker, in place of the study's, which is 1 unless said. Part of what fixes its numbers."""
+    """CPU threads of every worker, in place of the file's, which is 1 unless said. Part of what fixes its numbers."""
     workers: int = 1
-    """Cells at a time, at least 1."""
+    """Parallel runs, at least 1."""
     retry_failed: bool = False
     """Whether to try the cells again that were given up."""
 
     def __post_init__(self) -> None:
         check_at_least("workers", self.workers, 1)
-        if self.preset is not None and self.file is not None:
-            raise ValueError("preset and file exclude each other; a file can name its preset.")
         changes = ("seeds", "methods", "environments", "num_envs", "env_steps", "device", "threads")
         given = [name for name in changes if getattr(self, name) is not None]
-        if given and self.preset is None and self.file is None:
-            raise ValueError(f"{', '.join(given)} change a preset or a file; give one of them too.")
+        if given and self.file is None:
+            raise ValueError(f"{', '.join(given)} change a file; give one too.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +68,7 @@ class ShowOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MergeOptions:
-    """Add the results of other study folders to one: their rows and training curves, not their runs."""
+    """Add the results of other study folders to the tables of one: their rows and training curves, not their runs."""
 
     folder: tyro.conf.Positional[Path]
     """The folder that grows."""
@@ -100,66 +81,45 @@ class MergeOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Write results.csv and curves.csv into the folder of a study."""
+
+    folder: tyro.conf.Positional[Path]
+    """Folder of the study."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReportOptions:
     """Write report.html, report.md and the figures of a study."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder with results.csv and, for training curves, curves.csv."""
+    """Folder of the study, or of its exported tables."""
     out: Path | None = None
     """Where to write. By default the folder itself."""
-    resamples: int = 10_000
-    """Bootstrap resamples, at least 1000."""
-    seed: int = 0
-    """Seed of the bootstrap."""
-
-    def __post_init__(self) -> None:
-        check_at_least("resamples", self.resamples, 1000)
-        check_at_least("seed", self.seed, 0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PresetsOptions:
-    """List the ready-made studies."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CoverageOptions:
-    """Simulate how often the intervals of the report contain the truth."""
-
-    seeds: int = 10
-    """Size of every simulated population, at least 4."""
-    populations: int = 2000
-    """Simulated populations, at least 100."""
-    resamples: int = 2000
-    """Bootstrap resamples of each, at least 1000."""
-    seed: int = 0
-    """Seed of it all."""
-
-    def __post_init__(self) -> None:
-        for name, least in (("seeds", 4), ("populations", 100), ("resamples", 1000), ("seed", 0)):
-            check_at_least(name, getattr(self, name), least)
 
 
 def run(options: RunOptions, stopped: Callable[[], bool] = lambda: False) -> None:
     """Work on a study until it is finished.
 
     Raises:
-        RunError: If the study is not well described, or if a cell has failed; the rest are finished then.
+        RunError: If the study is not well described or another process works on it, or if a cell has failed; the
+            rest are finished then.
         SystemExit: With 130, if it was stopped before the end.
     """
     study = StudyFolder(options.folder)
-    if options.preset is not None or options.file is not None:
-        cells = _described(options)
-        check_comparable([*study.results.read(), *map(identity, [*study.cells(), *cells])])
+    if options.file is not None:
+        cells = _described(options, options.file)
+        found = study.results()
+        check_comparable([*found.rows, *found.curves, *map(identity, [*study.cells(), *cells])])
         study.add(cells)
     if not study.cells():
-        raise RunError(f"{study.path} holds no study; begin one with --preset or --file.")
+        raise RunError(f"{study.path} holds no study; begin one with --file.")
     if options.retry_failed:
         study.forget_failures()
     with _live() as report:
-        end = Runner(study, options.workers).run(report, stopped)
+        end = Runner(study, LocalProcesses(study), options.workers).run(report, stopped)
     if end.finished + len(end.failed) < end.total:
-        print(f"Stopped with {end.finished} of {end.total} cells finished; go on with: "
+        print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
               f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
         raise SystemExit(130)
     if end.failed:
@@ -171,13 +131,12 @@ def run(options: RunOptions, stopped: Callable[[], bool] = lambda: False) -> Non
     print(study.path)
 
 
-def _described(options: RunOptions) -> list[plan.Cell]:
-    description = plan.read(options.file) if options.file is not None else plan.preset(options.preset or "")
+def _described(options: RunOptions, file: Path) -> list[plan.Cell]:
     names = ("num_envs", "env_steps", "device", "threads")
     train = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     seeds = None if options.seeds is None else parse_seeds(options.seeds)
     return plan.expand(
-        description, seeds=seeds, methods=options.methods, environments=options.environments, train=train
+        plan.read(file), seeds=seeds, methods=options.methods, environments=options.environments, train=train
     )
 
 
@@ -207,7 +166,7 @@ def show(options: ShowOptions) -> None:
         RunError: If there is no study.
     """
     study = StudyFolder(options.folder)
-    cells, rows = study.cells(), study.results.read()
+    cells, rows = study.cells(), study.results().rows
     if not cells and not rows:
         raise RunError(f"{study.path} holds no study and no results.")
     table = Table(title="Medians over seeds", title_justify="left")
@@ -216,10 +175,10 @@ def show(options: ShowOptions) -> None:
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
         groups.setdefault((row["environment"], row["goals"], row["goal_period"], row["method"]), []).append(row)
+    columns = {"crashes_per_1000": ".3g", "score": ".3f", "reward": ".4f", "fps": ".0f"}
     for (environment, goals, period, name), group in sorted(groups.items()):
-        numbers = [_median(row[column] for row in group) for column in ("crashes_per_1000", "score", "reward", "fps")]
-        cellsof = [f"{numbers[0]:.3g}", f"{numbers[1]:.3f}", f"{numbers[2]:.4f}", f"{numbers[3]:.0f}"]
-        table.add_row(environment, name, goals, str(period), str(len(group)), *cellsof)
+        medians = [format(_median(row[column] for row in group), form) for column, form in columns.items()]
+        table.add_row(environment, name, goals, str(period), str(len(group)), *medians)
     Console().print(table)
     if cells:
         finished = study.finished(cells)
@@ -247,6 +206,16 @@ def merge_folders(options: MergeOptions) -> None:
               f"only on the same kind of device with the same versions.")  # fmt: skip
 
 
+def export(options: ExportOptions) -> None:
+    """Write the tables of a study.
+
+    Raises:
+        RunError: If there are no results, or the folder cannot be written.
+    """
+    merge(options.folder, [options.folder])  # refuses a folder without results
+    print(options.folder / "results.csv")
+
+
 def report(options: ReportOptions) -> None:
     """Write the report.
 
@@ -255,89 +224,43 @@ def report(options: ReportOptions) -> None:
     """
     from deimos.study.report import write
 
-    if not results(options.folder).read():
-        raise RunError(f"{options.folder} holds no results; it is empty, or no study folder.")
-    print(write(options.folder, options.out or options.folder, resamples=options.resamples, seed=options.seed))
-
-
-def presets(options: PresetsOptions) -> None:
-    """Print the ready-made studies."""
-    table = Table(title="Presets", title_justify="left")
-    for name in ("preset", "what", "environments", "methods", "seeds"):
-        table.add_column(name)
-    for name, preset in PRESETS.items():
-        environments = ", ".join(each["name"] for each in preset["environment"])
-        table.add_row(name, preset["about"], environments, ", ".join(preset["methods"]), str(preset["seeds"]))
-    Console().print(table)
-
-
-def coverage(options: CoverageOptions) -> None:
-    """Print the table of coverages."""
-    from deimos.study.coverage import simulate
-
-    table = Table(title=f"Coverage of 95 % intervals, n = {options.seeds}", title_justify="left")
-    for name in ("statistic", "interval", "normal", "lognormal"):
-        table.add_column(name, justify="left" if name in ("statistic", "interval") else "right")
-    for row in simulate(options.seeds, options.populations, options.resamples, options.seed):
-        table.add_row(row.statistic, row.interval, f"{100 * row.normal:.1f} %", f"{100 * row.lognormal:.1f} %")
-    Console().print(table)
+    print(write(options.folder, options.out or options.folder))
 
 
 COMMANDS: dict[str, tuple[type, Callable[..., None]]] = {
     "run": (RunOptions, run),
     "show": (ShowOptions, show),
     "merge": (MergeOptions, merge_folders),
+    "export": (ExportOptions, export),
     "report": (ReportOptions, report),
-    "presets": (PresetsOptions, presets),
-    "coverage": (CoverageOptions, coverage),
 }
-"""Options and function of every command."""
+"""Options and function of every command; ``run`` also takes a function that says when to stop."""
 
 
 @contextlib.contextmanager
 def _live() -> Iterator[Callable[[Progress], None]]:
-    """Show a study's progress: a table that lives on a terminal, lines of what has ended elsewhere."""
+    """Show a study's progress: a line that changes on a terminal, a line for every cell that has ended elsewhere."""
     console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _Lines(console)
+    if console.is_terminal:
+        with console.status("") as status:
+            yield lambda progress: status.update(_summary(progress))
         return
-    with Live(console=console, auto_refresh=False) as live:
-        yield lambda progress: live.update(_picture(progress), refresh=True)
+    said: list[tuple[int, int]] = []
 
-
-class _Lines:
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._said: Any = None
-
-    def __call__(self, progress: Progress) -> None:
+    def lines(progress: Progress) -> None:
         state = (progress.finished, len(progress.failed))
-        if state != self._said:
-            self._said = state
-            self._console.print(_summary(progress), highlight=False, soft_wrap=True)
+        if [state] != said[-1:]:
+            said.append(state)
+            console.print(_summary(progress), highlight=False, soft_wrap=True, markup=False)
 
-
-def _picture(progress: Progress) -> Group:
-    table = Table(box=None)
-    for name in ("cell", "iteration", "FPS"):
-        table.add_column(name, justify="left" if name == "cell" else "right")
-    for cell in progress.running:
-        state = f"{cell.iteration}/{cell.iterations}" if cell.iteration < cell.iterations else "evaluating"
-        table.add_row(cell.name, state, f"{cell.fps:.0f}" if cell.fps else "-")
-    width = shutil.get_terminal_size().columns
-    failed = [Text(f"{name} failed: {error}"[:width], style="red") for name, error in progress.failed.items()]
-    return Group(Text(_summary(progress)), table, *failed)
+    yield lines
 
 
 def _summary(progress: Progress) -> str:
     parts = [f"{progress.finished} of {progress.total} cells finished"]
     if progress.failed:
         parts.append(f"{len(progress.failed)} failed")
-    if progress.elsewhere:
-        parts.append(f"{progress.elsewhere} on other machines")
-    training = [cell for cell in progress.running if cell.iteration < cell.iterations]
-    if training:
-        parts.append(f"{sum(cell.fps for cell in training):.0f} FPS")
+    parts += [f"{name} {share:.0%}" if share < 1 else f"{name} evaluating" for name, share in progress.running.items()]
     if progress.seconds_left:
         hours, rest = divmod(int(progress.seconds_left), 3600)
         parts.append(f"{hours}:{rest // 60:02d}:{rest % 60:02d} left")

@@ -2,22 +2,54 @@
 
 import copy
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from deimos.goals.methods import METHODS
 from deimos.run.folder import RunError
-from deimos.study.presets import DIRECTORS
-from deimos.study.results import check_one_population, curves, results
+from deimos.study.results import Results, Row
 from deimos.study.stats import Array
 
-DIRECTOR_METHODS = ("coop", *DIRECTORS, "antagonist")
-ENVIRONMENTS = ("absolute", "relative", "directional", "quad", "quad_arm")
-"""The thesis's, in its order."""
+_COLOURS = "#0072B2 #E69F00 #009E73 #CC79A7 #D55E00 #56B4E9 #7f7f7f #a6761d #332288 #e7298a".split()
+_MARKERS = "ovs^D<P>X*hpdH8"
+
+
+@dataclass(frozen=True)
+class Style:
+    """How methods are ordered and drawn; a caller gives what the study's own methods should look like."""
+
+    order: Sequence[str] = ()
+    """Environments and methods as tables and figures show them; others follow, by name."""
+    panels: Mapping[str, Sequence[str]] = field(default_factory=lambda: {"all methods": ()})
+    """Titles of the panels that methods are drawn in, with their methods; others are in the last."""
+    everywhere: str = ""
+    """A method whose training curve is in every panel, to compare with; empty for none."""
+    colours: Mapping[str, str] = field(default_factory=dict)
+    """Hexadecimal colours of methods; others have one of Okabe and Ito's or the like."""
+    reference: str = "uniform"
+    """The method that tables compare the others with."""
+
+    def complete(self, methods: Sequence[str]) -> "Style":
+        """The same with a colour for each of some methods."""
+        free = cycle([colour for colour in _COLOURS if colour not in self.colours.values()] or _COLOURS)
+        added = {name: next(free) for name in methods if name not in self.colours}
+        return replace(self, colours={**self.colours, **added})
+
+    def colour(self, method: str) -> str:
+        """The colour of a method, the same in every figure."""
+        return self.colours[method]
+
+    def marker(self, method: str) -> str:
+        """The marker of a method, the same in every figure."""
+        return _MARKERS[[*self.colours].index(method) % len(_MARKERS)]
+
+    def panel(self, method: str) -> str:
+        """Title of the panel that a method is drawn in."""
+        return next((title for title, names in self.panels.items() if method in names), [*self.panels][-1])
 
 
 @dataclass(frozen=True)
@@ -45,39 +77,48 @@ class Curve:
     """Mean reward per transition, shape (k,)."""
     crashes: Array
     """Crashes per 1000 transitions, shape (k,)."""
-    selected_share: Array
+    selected_fraction: Array
     """Share of the worlds whose goal the selector chose, shape (k,)."""
 
 
 class Data:
-    """All rows of a study folder. Rows of a weak adversary are counted, and left out of every sample."""
+    """The results of a study. Rows of a weak adversary are counted, and left out of every sample.
 
-    def __init__(self, rows: list[dict[str, Any]], lines: list[dict[str, Any]]) -> None:
-        check_one_population(rows, lines)
-        self.rows = rows
-        self.weak = [row for row in rows if row["weak_adversary"]]
-        self._samples: dict[tuple[Where, str], dict[int, dict[str, Any]]] = {}
-        for row in rows:
+    Args:
+        results: Rows and training curves.
+        style: How methods are ordered and drawn; methods without a colour get one.
+
+    Raises:
+        RunError: If they are no one study; see ``Results.check``.
+    """
+
+    def __init__(self, results: Results, style: Style | None = None) -> None:
+        results.check()
+        self.rows = results.rows
+        self.weak = [row for row in self.rows if row["weak_adversary"]]
+        self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
+        self._samples: dict[tuple[Where, str], dict[int, Row]] = {}
+        for row in self.rows:
             if not row["weak_adversary"]:
                 where = Where(row["environment"], row["goals"], row["goal_period"])
                 self._samples.setdefault((where, row["method"]), {})[row["seed"]] = row
         self._curves: dict[tuple[str, str], dict[int, Curve]] = {}
-        for line in lines:
-            columns = (np.array(line[name]) for name in ("env_steps", "reward", "crashes_per_1000", "selected_share"))
-            self._curves.setdefault((line["environment"], line["method"]), {})[line["seed"]] = Curve(*columns)
+        for line in results.curves:
+            names = ("env_steps", "reward", "crashes_per_1000", "selected_fraction")
+            curve = Curve(*(np.array(line[name]) for name in names))
+            self._curves.setdefault((line["environment"], line["method"]), {})[line["seed"]] = curve
 
     @classmethod
-    def read(cls, folder: Path) -> "Data":
-        """Read the tables of a study folder.
+    def read(cls, folder: Path, style: Style | None = None) -> "Data":
+        """Read the results of a folder.
 
         Raises:
-            RunError: If there are no results, a table has another schema, the cells of an environment were run with
-                different settings or those of a method with different selectors, or a policy stands there twice.
+            RunError: If there are none, a file is broken or of another schema, or they are no one study.
         """
-        rows = results(folder).read()
-        if not rows:
+        results = Results.read(folder)
+        if not results.rows:
             raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
-        return cls(rows, curves(folder).read())
+        return cls(results, style)
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
@@ -90,9 +131,8 @@ class Data:
 
     @property
     def environments(self) -> list[str]:
-        """Their names: the thesis's in its order, then the others."""
-        found = {row["environment"] for row in self.rows}
-        return [name for name in ENVIRONMENTS if name in found] + sorted(found - set(ENVIRONMENTS))
+        """Their names, in order."""
+        return self._sorted({row["environment"] for row in self.rows})
 
     def periods(self, environment: str) -> list[int]:
         """The T that an environment's policies were evaluated at."""
@@ -103,10 +143,14 @@ class Data:
         return [Where(environment, goals, period) for period in self.periods(environment)]
 
     def methods(self, environment: str) -> list[str]:
-        """Methods that an environment has results of: the Directors by rising p, then the others."""
-        found = {row["method"] for row in self.rows if row["environment"] == environment}
-        order = [*DIRECTOR_METHODS, *(name for name in METHODS if name not in DIRECTOR_METHODS)]
-        return [name for name in order if name in found] + sorted(found - set(order))
+        """Methods that an environment has results of, in order."""
+        return self._sorted({row["method"] for row in self.rows if row["environment"] == environment})
+
+    def _sorted(self, names: Collection[str]) -> list[str]:
+        """Names in order; the numbers in those that have no place in it count as numbers."""
+        known = [name for name in self.style.order if name in names]
+        parts = {name: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", name)] for name in names}
+        return known + sorted(set(names) - set(known), key=parts.__getitem__)
 
     def seeds(self, where: Where, methods: Sequence[str]) -> list[int]:
         """Seeds that all of some methods have a row of."""
@@ -143,7 +187,7 @@ class Data:
         return [found[seed] for seed in sorted(found)]
 
 
-def _metric(row: dict[str, Any], name: str) -> float:
+def _metric(row: Row, name: str) -> float:
     if name == "log_crashes":
         return math.log1p(row["crashes"])
     column, _, part = name.partition(":")

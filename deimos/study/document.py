@@ -1,4 +1,7 @@
-"""A page of headings, paragraphs, tables and figures, as one self-contained HTML file and as Markdown."""
+"""A page of texts, tables and figures, as one self-contained HTML file and as Markdown.
+
+A text is a heading (``## ...``), a list (lines of ``* ...``) or a paragraph, as in Markdown; nothing else is markup.
+"""
 
 import base64
 import html
@@ -14,32 +17,6 @@ th, td { border-bottom: 1px solid #ddd; padding: 0.25rem 0.6rem; text-align: lef
 th { border-bottom: 2px solid #888; } td { font-variant-numeric: tabular-nums; }
 figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 13px; }
 """
-
-
-@dataclass(frozen=True)
-class Heading:
-    """A heading."""
-
-    text: str
-    """Its text."""
-    level: int = 2
-    """1 for the title of the page."""
-
-
-@dataclass(frozen=True)
-class Paragraph:
-    """A paragraph of plain text."""
-
-    text: str
-    """Its text."""
-
-
-@dataclass(frozen=True)
-class Bullets:
-    """A list of plain texts."""
-
-    items: Sequence[str]
-    """One text each."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +39,12 @@ class Picture:
     """What it shows."""
 
 
-Block = Heading | Paragraph | Bullets | Table | Picture
+Block = str | Table | Picture
 
 
 def to_html(blocks: Sequence[Block], folder: Path) -> str:
     """The page as HTML that needs no other file: figures are inside."""
-    title = next((block.text for block in blocks if isinstance(block, Heading)), "")
+    title = next((block.lstrip("# ") for block in blocks if isinstance(block, str)), "")
     body = "\n".join(_html(block, folder) for block in blocks)
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
@@ -77,12 +54,13 @@ def to_html(blocks: Sequence[Block], folder: Path) -> str:
 
 def _html(block: Block, folder: Path) -> str:
     match block:
-        case Heading(text, level):
-            return f"<h{level}>{html.escape(text)}</h{level}>"
-        case Paragraph(text):
-            return f"<p>{html.escape(text)}</p>"
-        case Bullets(items):
-            return "<ul>" + "".join(f"<li>{html.escape(item)}</li>" for item in items) + "</ul>"
+        case str() if block.startswith("#"):
+            mark, text = block.split(" ", 1)
+            return f"<h{len(mark)}>{html.escape(text)}</h{len(mark)}>"
+        case str() if block.startswith("* "):
+            return "<ul>" + "".join(f"<li>{html.escape(item[2:])}</li>" for item in block.splitlines()) + "</ul>"
+        case str():
+            return f"<p>{html.escape(block)}</p>"
         case Table(header, rows):
             head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
             lines = ("".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows)
@@ -107,12 +85,8 @@ def to_markdown(blocks: Sequence[Block], pictures: str) -> str:
 
 def _markdown(block: Block, pictures: str) -> str:
     match block:
-        case Heading(text, level):
-            return f"{'#' * level} {text}"
-        case Paragraph(text):
-            return text
-        case Bullets(items):
-            return "\n".join(f"* {item}" for item in items)
+        case str():
+            return block
         case Table(header, rows):
             lines = [header, ["---"] * len(header), *rows]
             return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

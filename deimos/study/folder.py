@@ -1,22 +1,19 @@
-"""A study's folder: ``cells/NAME/`` for every cell, ``results.csv`` and ``curves.csv``.
+"""A study's folder: ``cells/NAME/`` for every cell, and the tables of an export or a merge.
 
-A cell's folder holds ``cell.json`` (what it is), ``run/`` (its run folder), ``log.txt`` (what the worker
-said), ``failures.jsonl`` (how it died) and its claims. Whether a cell is finished is what the table says.
+A cell's folder holds ``cell.json`` (what it is), ``run/`` (its run folder), ``result.json`` once it is finished,
+``log.txt`` (what its workers said) and ``failures.jsonl`` (how they died).
 """
 
 import contextlib
 import json
 import time
 from collections.abc import Iterable
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from deimos.run.folder import RunError, RunFolder
+from deimos.study.lock import hold
 from deimos.study.plan import Cell, read_cell
-from deimos.study.results import GrowingTable, curves, results
-
-ATTEMPTS = 2  # a cell that failed so often is left alone
+from deimos.study.results import Results
 
 
 class StudyFolder:
@@ -25,15 +22,21 @@ class StudyFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    @property
-    def results(self) -> GrowingTable:
-        """One row per policy and evaluation."""
-        return results(self.path)
+    def results(self) -> Results:
+        """The results that there are.
 
-    @property
-    def curves(self) -> GrowingTable:
-        """One row per training run."""
-        return curves(self.path)
+        Raises:
+            RunError: If a file is broken or of another schema.
+        """
+        return Results.read(self.path)
+
+    def hold(self) -> contextlib.AbstractContextManager[None]:
+        """Hold the study as the only process that works on it.
+
+        Raises:
+            RunError: If another one does, or another machine may.
+        """
+        return hold(self.path / "lock", str(self.path), one_machine=True)
 
     def cell_path(self, cell: Cell) -> Path:
         """Folder of a cell."""
@@ -75,17 +78,16 @@ class StudyFolder:
         cell = read_cell(path)
         if cell.name != name:
             raise RunError(
-                f"{path} was made by another version of Deimos, whose defaults or methods differ; go on with that "
+                f"{path} was made by another version of Deimos, whose defaults or methods differ; continue with that "
                 f"version, or begin a new study."
             )
         return cell
 
     def finished(self, cells: Iterable[Cell]) -> set[str]:
-        """Digests of those of ``cells`` whose rows are all in the table."""
-        rows: dict[str, set[tuple[str, int]]] = {}
-        for row in self.results.read():
-            rows.setdefault(row["hash"], set()).add((row["goals"], row["goal_period"]))
-        return {cell.digest for cell in cells if evaluations(cell) <= rows.get(cell.digest, set())}
+        """Digests of those of ``cells`` that have results, in their folders or in the study's tables."""
+        found = [cell for cell in cells if not (self.cell_path(cell) / "result.json").exists()]
+        known = {row["hash"] for row in self.results().rows} if found else set()
+        return {cell.digest for cell in cells} - {cell.digest for cell in found if cell.digest not in known}
 
     def failures(self, cell: Cell) -> list[str]:
         """How a cell's workers have died so far, one line each."""
@@ -104,62 +106,4 @@ class StudyFolder:
     def forget_failures(self) -> None:
         """Let every failed cell be tried again."""
         for path in self.path.glob("cells/*/failures.jsonl"):
-            with contextlib.suppress(FileNotFoundError):
-                path.unlink()
-
-
-def evaluations(cell: Cell) -> set[tuple[str, int]]:
-    """Goals and T of the rows that a cell leaves in the table."""
-    goals = ["naive", "adversary"] + (["oracle"] if cell.config.eval.oracle_worlds else [])
-    return {(name, period) for name in goals for period in cell.goal_periods}
-
-
-def result_rows(cell: Cell, run: RunFolder, evaluated: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows of the table of evaluations that a finished run gives.
-
-    Args:
-        cell: The cell.
-        run: Its run.
-        evaluated: The rows of its evaluations.
-    """
-    stored = run.read_json("config.json")
-    config = stored["config"]
-    versions = stored["versions"]
-    names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
-    shared = identity(cell) | {
-        "env_steps": config["env_steps"],
-        "trained_period": cell.config.env.goal_period,
-        "fps": _median([float(row["fps"]) for row in run.read_csv("timing.csv")]),
-        "device": config["device"],
-        "versions": " ".join(f"{name}={versions[name]}" for name in names),
-    }
-    rows = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in evaluated]
-    # Where a goal is all of a piece, its tracking is the reward.
-    return [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in rows]
-
-
-def curve_row(cell: Cell, run: RunFolder, points: int = 100) -> dict[str, Any]:
-    """The row of the table of training curves: means over as many stretches of the training as ``points``, or fewer."""
-    rows = run.read_csv("progress.csv")
-    count = min(points, len(rows))
-    bounds = [len(rows) * i // count for i in range(count + 1)]
-    stretches = [rows[low:high] for low, high in pairwise(bounds)]
-    means = {
-        name: tuple(sum(float(row[name]) for row in stretch) / len(stretch) for stretch in stretches)
-        for name in ("reward", "crashes_per_1000", "selected_share")
-    }
-    return identity(cell) | {"env_steps": tuple(float(stretch[-1]["env_steps"]) for stretch in stretches)} | means
-
-
-def identity(cell: Cell) -> dict[str, Any]:
-    """What a cell's rows in both tables begin with."""
-    return {
-        "environment": cell.environment, "method": cell.config.label, "seed": cell.config.seed,
-        "hash": cell.digest, "setting": cell.setting, "selector": cell.selector, "num_envs": cell.config.num_envs,
-    }  # fmt: skip
-
-
-def _median(values: list[float]) -> float:
-    middle = len(values) // 2
-    values = sorted(values)
-    return values[middle] if len(values) % 2 else (values[middle - 1] + values[middle]) / 2
+            path.unlink(missing_ok=True)

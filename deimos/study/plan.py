@@ -1,5 +1,6 @@
 """The grid of a study: which cells it has, and what fixes each of them."""
 
+import contextlib
 import hashlib
 import json
 import tomllib
@@ -10,17 +11,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from deimos.goals.methods import METHODS, method
+from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets
 from deimos.run.config import from_dict, to_dict
 from deimos.run.folder import RunError
 from deimos.run.training import TrainConfig
 from deimos.sim.env import EnvConfig
-from deimos.study.presets import PRESETS
 
 SCHEMA = 1  # of cell.json
-_KEYS = {"about", "preset", "seeds", "methods", "train", "environment"}
+_KEYS = {"base", "seeds", "methods", "train", "environment"}
 _ENVIRONMENT_KEYS = {"name", "preset", "env", "methods", "train", "goal_periods"}
 _GRID = {"env", "method", "selector", "seed", "evaluation"}  # of TrainConfig: the grid's, not the settings'
 
@@ -75,10 +75,11 @@ class Cell:
 
 def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
     """A selector's configuration with those of the methods that it names, as Schedule and Mix do."""
-    fields = to_dict(config)
+    fields, named = to_dict(config), {}
     hints = typing.get_type_hints(type(config))
-    names = [value for name, value in fields.items() if hints.get(name) is str and value in METHODS]
-    named = {name: _spelled_out(METHODS[name], (*known, name)) for name in names if name not in known}
+    for value in [value for name, value in fields.items() if hints.get(name) is str and value not in known]:
+        with contextlib.suppress(ValueError):  # it names no method
+            named[value] = _spelled_out(method(value), (*known, value))
     return fields | ({"methods": named} if named else {})
 
 
@@ -103,17 +104,6 @@ def read_cell(path: Path) -> Cell:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
 
 
-def preset(name: str) -> dict:
-    """The description of a ready-made study.
-
-    Raises:
-        RunError: If there is none of that name.
-    """
-    if name not in PRESETS:
-        raise RunError(f"There is no preset '{name}'; there are: {', '.join(PRESETS)}.")
-    return PRESETS[name]
-
-
 def read(path: Path) -> dict:
     """Read the description of a study from a TOML file.
 
@@ -121,17 +111,18 @@ def read(path: Path) -> dict:
     ``TrainConfig`` for all cells), and an ``[[environment]]`` for each environment or variant, with ``name``,
     ``env`` (its ``kind`` and fields) and, if they differ there, ``methods``, ``train`` and ``goal_periods``; its
     ``preset`` is one of ``deimos.run.presets``, where its environment and settings come from that are not said.
-    ``preset`` names a ready-made study, where everything comes from that is not said.
+    ``base`` names another such file, as seen from this one, where everything comes from that is not said.
 
     Raises:
-        RunError: If it cannot be read or is not TOML, or has other keys.
+        RunError: If it or its base cannot be read or is not TOML.
     """
     try:
         data = tomllib.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        return read(path.parent / data["base"]) | data if "base" in data else data
+    except RecursionError as error:
+        raise RunError(f"{path} is a base of itself.") from error
+    except (OSError, TypeError, ValueError) as error:
         raise RunError(f"{path} is not a study's TOML file ({error}).") from error
-    base = preset(data["preset"]) if "preset" in data else {}
-    return base | data
 
 
 def expand(

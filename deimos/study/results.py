@@ -1,22 +1,32 @@
-"""The tables of a study: CSV files that only grow, one line per policy and evaluation, or per training curve."""
+"""The results of a study: a row per policy and evaluation, and one per training curve.
+
+A cell leaves its own in ``result.json``. The tables ``results.csv`` and ``curves.csv`` are what is exported, merged and
+kept; a folder's results are those of its cells, and those of its tables that are of no cell there.
+"""
 
 import csv
-import fcntl
 import io
 import json
 import math
-import os
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
-from deimos.run.folder import RunError
+from deimos.run.folder import RunError, RunFolder
+from deimos.study.plan import Cell
+
+SCHEMA = 1  # of result.json
+Row = dict[str, Any]
 
 RESULT_COLUMNS: dict[str, type] = {
     # What was run.
     "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str,
     "num_envs": int, "env_steps": int, "trained_period": int,
-    # How it was judged.
+    # How it was evaluated.
     "goals": str, "goal_period": int, "eval_seed": int, "worlds": int, "steps": int,
     # What came out.
     "reward": float, "score": float, "return_per_step": float, "crashes": int, "crashes_per_1000": float,
@@ -27,215 +37,259 @@ RESULT_COLUMNS: dict[str, type] = {
     # By what.
     "fps": float, "weights": str, "device": str, "versions": str,
 }  # fmt: skip
-RESULT_KEY = ("hash", "goals", "goal_period")
 TIMED = ("fps",)
 """Columns that two runs of the same cell may differ in."""
 
 CURVE_COLUMNS: dict[str, type] = {
     "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
-    "env_steps": tuple, "reward": tuple, "crashes_per_1000": tuple, "selected_share": tuple,
+    "env_steps": tuple, "reward": tuple, "crashes_per_1000": tuple, "selected_fraction": tuple,
 }  # fmt: skip
-CURVE_KEY = ("hash",)
+TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
+FORMER_NAMES = {"selected_share": "selected_fraction"}
+"""Columns of version 0.1.0 that have another name today."""
 
 
-class GrowingTable:
-    """A CSV file with fixed columns to which several processes, on several machines, may append.
+@dataclass
+class Results:
+    """What a study has found."""
 
-    Rows of a key that is there already are left out. All rows of one ``append`` are one write under a
-    lock, and what a kill has left of half a line is cut off before the next.
-    """
+    rows: list[Row] = field(default_factory=list)
+    """One per policy and evaluation, with ``RESULT_COLUMNS``."""
+    curves: list[Row] = field(default_factory=list)
+    """One per training, with ``CURVE_COLUMNS``."""
 
-    def __init__(self, path: Path, columns: dict[str, type], key: tuple[str, ...]) -> None:
-        self.path = path
-        self.columns = columns
-        self.key = key
-
-    def read(self) -> list[dict[str, Any]]:
-        """All whole rows; none if there is no file. Empty cells are NaN in columns of numbers, else None.
-
-        Raises:
-            RunError: If the file has other columns, or holds what is no value of its column.
-        """
-        try:
-            text = self.path.read_text()
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError) as error:
-            raise RunError(f"{self.path} cannot be read ({error}).") from error
-        return self._parse(text)
-
-    def append(self, rows: Iterable[dict[str, Any]]) -> int:
-        """Add the rows whose key is new; returns how many.
+    @classmethod
+    def read(cls, folder: Path) -> "Results":
+        """The results of a study's folder, or of one that holds tables only; none where there is nothing.
 
         Raises:
-            RunError: If the file has other columns or cannot be written.
+            RunError: If a file is broken or of another schema.
         """
-        try:
-            with self.path.open("a+b") as file:
-                fcntl.flock(file, fcntl.LOCK_EX)
-                file.seek(0)
-                text = file.read().decode()
-                whole = text[: text.rfind("\n") + 1]
-                known = {self.key_of(row) for row in self._parse(whole)}
-                fresh = {self.key_of(row): row for row in rows if self.key_of(row) not in known}
-                if fresh:
-                    file.truncate(len(whole.encode()))
-                    file.write(self._format(fresh.values(), header=not whole).encode())
-                    file.flush()
-                    os.fsync(file.fileno())
-                return len(fresh)
-        except OSError as error:
-            raise RunError(f"{self.path} could not be written ({error.strerror}).") from error
+        found = cls()
+        for path in sorted(folder.glob("cells/*/result.json")):
+            data = RunFolder(path.parent).read_json(path.name)
+            if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+                raise RunError(f"{path} is not the result of a cell of schema {SCHEMA}.")
+            for row in data["rows"]:
+                found.rows.append({name: _value(kind, row.get(name)) for name, kind in RESULT_COLUMNS.items()})
+            found.curves.append({name: _value(kind, data["curve"][name]) for name, kind in CURVE_COLUMNS.items()})
+        found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())))
+        return found
 
-    def key_of(self, row: dict[str, Any]) -> tuple:
-        """What tells a row from all others."""
-        return tuple(row[name] for name in self.key)
+    def add(self, other: "Results") -> int:
+        """Take over the rows of cells that are not here yet; returns how many rows of evaluations that were."""
+        known, drawn = ({row["hash"] for row in rows} for rows in (self.rows, self.curves))
+        fresh = [row for row in other.rows if row["hash"] not in known]
+        self.rows += fresh
+        self.curves += [line for line in other.curves if line["hash"] not in drawn]
+        return len(fresh)
 
-    def _parse(self, text: str) -> list[dict[str, Any]]:
-        lines = text[: text.rfind("\n") + 1].splitlines()
-        if not lines:
-            return []
-        found = next(csv.reader(lines[:1]))
-        if found != list(self.columns):
-            missing = [name for name in self.columns if name not in found]
-            unknown = [name for name in found if name not in self.columns]
-            both = (("missing", missing), ("unknown", unknown))
-            parts = [f"{what}: {', '.join(names)}" for what, names in both if names]
-            reason = "; ".join(parts) or "its columns stand in another order"
-            raise RunError(f"{self.path} is a table of another schema; {reason}.")
-        rows = []
-        for number, values in enumerate(csv.reader(lines[1:]), start=2):
-            try:
-                rows.append({
-                    name: _value(kind, text) for (name, kind), text in zip(self.columns.items(), values, strict=True)
-                })  # fmt: skip
-            except ValueError as error:
-                raise RunError(f"{self.path}, line {number}, does not fit its columns ({error}).") from error
-        return rows
+    def check(self) -> None:
+        """Refuse what is no one study.
 
-    def _format(self, rows: Iterable[dict[str, Any]], header: bool) -> str:
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        if header:
-            writer.writerow(self.columns)
-        for row in rows:
-            writer.writerow([_text(row.get(name)) for name in self.columns])
-        return out.getvalue()
+        Raises:
+            RunError: If what cannot be compared is mixed, or a policy is there twice: one of the two would silently
+                count for nothing.
+        """
+        check_comparable([*self.rows, *self.curves])
+        for rows, more in ((self.rows, ("goals", "goal_period")), (self.curves, ())):
+            names = ("environment", "method", "seed", *more)
+            for key, count in Counter(tuple(row[name] for name in names) for row in rows).items():
+                if count > 1:
+                    what = ", ".join(f"{name} {value}" for name, value in zip(names, key, strict=True))
+                    raise RunError(f"There are two rows of {what}; keep one of them in the folder.")
+
+    def write(self, folder: Path) -> None:
+        """Write the tables, each whole or not at all; numbers of a curve have five digits.
+
+        Raises:
+            RunError: If they cannot be written.
+        """
+        for rows, (name, columns) in zip((self.rows, self.curves), TABLES.items(), strict=True):
+            write_table(folder / name, columns, rows)
 
 
-def results(folder: Path) -> GrowingTable:
-    """The table of evaluations of a study folder."""
-    return GrowingTable(folder / "results.csv", RESULT_COLUMNS, RESULT_KEY)
-
-
-def curves(folder: Path) -> GrowingTable:
-    """The table of training curves of a study folder."""
-    return GrowingTable(folder / "curves.csv", CURVE_COLUMNS, CURVE_KEY)
-
-
-def merge(target: Path, sources: Iterable[Path]) -> tuple[int, int, int]:
-    """Add the rows of other study folders to one.
+def result(cell: Cell, run: RunFolder, evaluated: Iterable[Row], points: int = 100) -> Row:
+    """What a finished cell writes to its ``result.json``.
 
     Args:
-        target: The folder that grows; made if it is not there.
-        sources: Study folders; checked before anything is written.
+        cell: The cell.
+        run: Its run.
+        evaluated: The rows of its evaluations.
+        points: Stretches of the training, at most, that its curve has means over.
+    """
+    stored = run.read_json("config.json")
+    versions = stored["versions"]
+    names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
+    shared = identity(cell) | {
+        "env_steps": stored["config"]["env_steps"],
+        "trained_period": cell.config.env.goal_period,
+        "fps": median(float(row["fps"]) for row in run.read_csv("timing.csv")),
+        "device": stored["config"]["device"],
+        "versions": " ".join(f"{name}={versions[name]}" for name in names),
+    }
+    rows = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in evaluated]
+    # Where a goal has one group of components, its tracking is the reward.
+    rows = [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in rows]
+    return {"schema": SCHEMA, "rows": rows, "curve": identity(cell) | _curve(run.read_csv("progress.csv"), points)}
+
+
+def _curve(rows: list[dict[str, str]], points: int) -> Row:
+    """Means of the columns of ``progress.csv`` over as many stretches as ``points``, or fewer."""
+    rows = [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
+    count = min(points, len(rows))
+    bounds = [len(rows) * i // count for i in range(count + 1)]
+    stretches = [rows[low:high] for low, high in pairwise(bounds)]
+    means = {
+        name: [sum(float(row[name]) for row in stretch) / len(stretch) for stretch in stretches]
+        for name in ("reward", "crashes_per_1000", "selected_fraction")
+    }
+    return {"env_steps": [float(stretch[-1]["env_steps"]) for stretch in stretches]} | means
+
+
+def identity(cell: Cell) -> Row:
+    """What a cell's rows of both kinds begin with."""
+    return {
+        "environment": cell.environment, "method": cell.config.label, "seed": cell.config.seed,
+        "hash": cell.digest, "setting": cell.setting, "selector": cell.selector, "num_envs": cell.config.num_envs,
+    }  # fmt: skip
+
+
+def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
+    """Add the rows of other folders to the tables of one.
+
+    Args:
+        target: The folder whose tables are written; made if it is not there.
+        sources: Study folders; all are checked before anything is written.
 
     Returns:
         How many rows of evaluations were added, how many were there already, and how many of those
         have other numbers in the source: of those the first stay.
 
     Raises:
-        RunError: If a source has no results, a table has another schema, or the folders do not make one study.
+        RunError: If a folder has no results or those of another schema, or they do not make one study.
     """
-    tables = [(results(source).read(), curves(source).read()) for source in sources]
-    for source, (rows, _) in zip(sources, tables, strict=True):
-        if not rows:
+    merged = Results.read(target)
+    added = present = differing = 0
+    for source in sources:
+        found = Results.read(source)
+        if not found.rows:
             raise RunError(f"{source} holds no results; it is empty, or no study folder.")
-    ours = results(target)
-    known = {ours.key_of(row): row for row in ours.read()}
-    drawn = {curves(target).key_of(line): line for line in curves(target).read()}
-    present = differing = 0
-    for rows, lines in tables:
-        for row in rows:
-            old = known.setdefault(ours.key_of(row), row)
-            if old is not row:
-                present += 1
-                differing += any(_text(old[name]) != _text(row[name]) for name in ("weights", "crashes", "reward"))
-        drawn = {curves(target).key_of(line): line for line in lines} | drawn
-    check_one_population(list(known.values()), list(drawn.values()))
-    target.mkdir(parents=True, exist_ok=True)
-    added = 0
-    for rows, lines in tables:
-        added += ours.append(rows)
-        curves(target).append(lines)
+        known = {(row["hash"], row["goals"], row["goal_period"]): row for row in merged.rows}
+        for row in found.rows:
+            old = known.get((row["hash"], row["goals"], row["goal_period"]))
+            present += old is not None
+            differing += old is not None and any(
+                _text(old[name]) != _text(row[name]) for name in ("weights", "crashes", "reward")
+            )
+        added += merged.add(found)
+    merged.check()
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"The folder {target} cannot be made ({error.strerror}).") from error
+    merged.write(target)
     return added, present, differing
 
 
-def check_one_population(rows: list[dict[str, Any]], lines: list[dict[str, Any]]) -> None:
-    """Refuse tables of evaluations and of training curves that do not make one study.
+_SHARED = {  # what the rows that share the other columns must share too, with what to say if they do not
+    "setting": (
+        ("environment",),
+        "The cells of environment '{environment}' were run with {count} different settings ({found}) and cannot be "
+        "compared; keep one setting in a folder.",
+    ),
+    "selector": (
+        ("environment", "method"),
+        "Method '{method}' stands for {count} different selectors in environment '{environment}' ({found}), which are "
+        "no one population; keep one of them in a folder.",
+    ),
+}
 
-    Raises:
-        RunError: If what cannot be compared is mixed, or a policy stands there twice.
-    """
-    check_comparable([*rows, *lines])
-    _check_single(rows, ("environment", "method", "seed", "goals", "goal_period"))
-    _check_single(lines, ("environment", "method", "seed"))
 
-
-def check_comparable(rows: Iterable[dict[str, Any]]) -> None:
+def check_comparable(rows: Iterable[Row]) -> None:
     """Refuse to mix what cannot be compared: an environment has one setting, and a method in it one selector.
 
     Args:
-        rows: Rows of either table, or cells' identities.
+        rows: Rows of either kind, or cells' identities.
 
     Raises:
         RunError: If there are more.
     """
-    settings: dict[str, set[str]] = {}
-    selectors: dict[tuple[str, str], set[str]] = {}
-    for row in rows:
-        settings.setdefault(row["environment"], set()).add(row["setting"])
-        selectors.setdefault((row["environment"], row["method"]), set()).add(row["selector"])
-    for environment, found in settings.items():
-        if len(found) > 1:
-            raise RunError(
-                f"The cells of environment '{environment}' were run with {len(found)} different settings "
-                f"({', '.join(sorted(found))}) and cannot be compared; keep one setting in a folder."
-            )
-    for (environment, name), found in selectors.items():
-        if len(found) > 1:
-            raise RunError(
-                f"Method '{name}' stands for {len(found)} different selectors in environment '{environment}' "
-                f"({', '.join(sorted(found))}), which are no one population; keep one of them in a folder."
-            )
+    rows = list(rows)
+    for column, (names, message) in _SHARED.items():
+        values: dict[tuple, set[str]] = {}
+        for row in rows:
+            values.setdefault(tuple(row[name] for name in names), set()).add(row[column])
+        for key, found in values.items():
+            if len(found) > 1:
+                known = dict(zip(names, key, strict=True)) | {"count": len(found), "found": ", ".join(sorted(found))}
+                raise RunError(message.format(**known))
 
 
-def _check_single(rows: Iterable[dict[str, Any]], names: tuple[str, ...]) -> None:
-    """Refuse a policy that is there twice: one of the two would silently count for nothing."""
-    known: set[tuple] = set()
-    for row in rows:
-        key = tuple(row[name] for name in names)
-        if key in known:
-            what = ", ".join(f"{name} {value}" for name, value in zip(names, key, strict=True))
-            raise RunError(f"There are two rows of {what}; keep one of them in the table.")
-        known.add(key)
+def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
+    """All whole rows of a table, in which empty cells are NaN in columns of numbers, else None; none if it is missing.
+
+    Raises:
+        RunError: If it has other columns, or holds what is no value of its column.
+    """
+    try:
+        text = path.read_text()
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} cannot be read ({error}).") from error
+    lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())  # version 0.1.0 may have left half a line
+    names = [FORMER_NAMES.get(name, name) for name in next(lines, columns)]
+    if set(names) != set(columns):
+        both = (
+            ("missing", [n for n in columns if n not in names]),
+            ("unknown", [n for n in names if n not in columns]),
+        )
+        parts = [f"{what}: {', '.join(found)}" for what, found in both if found]
+        raise RunError(f"{path} is a table of another schema; {'; '.join(parts)}.")
+    rows = []
+    for number, values in enumerate(lines, start=2):
+        try:
+            rows.append({name: _value(columns[name], text) for name, text in zip(names, values, strict=True)})
+        except ValueError as error:
+            raise RunError(f"{path}, line {number}, does not fit its columns ({error}).") from error
+    return rows
 
 
-def _value(kind: type, text: str) -> Any:
+def write_table(path: Path, columns: dict[str, type], rows: Iterable[Row]) -> None:
+    """Write a table, whole or not at all.
+
+    Raises:
+        RunError: If it cannot be written.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_text(row.get(name)) for name in columns] for row in rows)
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        temporary.write_text(out.getvalue())
+        temporary.replace(path)
+    except OSError as error:
+        raise RunError(f"{path} could not be written ({error.strerror}).") from error
+
+
+def _value(kind: type, given: Any) -> Any:
+    """The value of a column, from the text in a table or from JSON; what is missing is NaN where numbers stand."""
     if kind is tuple:
-        return tuple(float(part) for part in text.split())
-    if kind is dict and text:
-        return json.loads(text)
-    if text == "":
-        return {int: math.nan, float: math.nan, dict: {}}.get(kind)
-    if kind is bool:
-        if text not in ("True", "False"):
-            raise ValueError(f"'{text}' is neither True nor False")
-        return text == "True"
-    return kind(text)
+        return tuple(map(float, given.split() if isinstance(given, str) else given or ()))
+    if kind is dict:
+        found = json.loads(given or "{}") if isinstance(given, str) else given or {}
+        return {name: math.nan if value is None else value for name, value in found.items()}
+    if given is None or given == "":
+        return math.nan if kind in (int, float) else None
+    if kind is bool and str(given) not in ("True", "False"):
+        raise ValueError(f"'{given}' is neither True nor False")
+    return str(given) == "True" if kind is bool else kind(given)
 
 
 def _text(value: Any) -> str:
+    """A cell of a table."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     if isinstance(value, tuple | list):

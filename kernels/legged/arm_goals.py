@@ -9,7 +9,7 @@ turns with the base's yaw alone. They are its distance, pitch (up positive) and 
     yaw      = 108 deg g_2                in [-108, 108] deg
 
 and the wanted place is distance (cos pitch cos yaw, cos pitch sin yaw, sin pitch). The numbers of a goal do not
-change while it is in force. Goals inside the robot's own body, or less than ``Arm.clearance`` above the ground
+change while it is active. Goals inside the robot's own body, or less than ``Arm.clearance`` above the ground
 where the robot is when they are drawn, are not valid and are drawn again. On level ground the lowest are 0.17 m
 above it.
 
@@ -21,13 +21,15 @@ import math
 import warp as wp
 
 from ..check import require, require_axes
+from ..episodes import Worlds
 from ..random import Purpose, uniform4
 from ..rotations import heading, rotate, rotate_about, rotate_by_heading
+from ..structs import StructTable
 from .arm_rewards import vecA
-from .height_scan import require_heights, sample_height
+from .height_scan import sample_height
 from .observation import base_quaternion
 from .rewards import LEG_JOINTS
-from .state import LocomotionParams, LocomotionState
+from .state import Ground, LeggedWorlds, LocomotionParams, Simulation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,14 +47,24 @@ FIRST_REDRAW = 2  # block of the draws of a goal that redraws begin with; six co
 class Arm:
     """The arm and what it is asked for."""
 
-    offset: wp.array[wp.vec3]  # (num_joints + 1,): of every joint, and of the end effector, in the frame before it [m]
-    axis: wp.array[wp.vec3]  # (num_joints,): of every joint
+    offset: wp.array[wp.vec3]  # of every joint, and of the end effector, in the frame before it [m]
+    axis: wp.array[wp.vec3]  # of every joint
     origin: wp.vec3  # of the goals, in the frame of the base's yaw, above the ground below the robot [m]
     body_low: wp.vec3  # corners of what goals keep out of, relative to the origin [m]
     body_high: wp.vec3
     clearance: float  # of goals above the ground [m]
     weight: vecA  # of the reward's terms
     obs_start: int  # where the end effector starts in the observation
+    error: wp.array[float]  # distance of the end effector from its goal at the end of the last step [m]
+
+
+ARM = StructTable(Arm, {"offset": ("num_links",), "axis": ("num_arm_joints",)})
+
+
+def check_arm(arm: Arm, legged: LeggedWorlds) -> None:
+    """Raise ``ValueError`` unless ``arm`` has the joints of ``legged`` that are not the legs'. Call it once."""
+    joints = legged.sizes["num_joints"] - LEG_JOINTS
+    ARM.require("arm", arm, legged.worlds.goal, num_arm_joints=joints, num_links=joints + 1, **legged.sizes)
 
 
 @wp.func
@@ -158,8 +170,8 @@ def is_valid(params: LocomotionParams, arm: Arm, heights: wp.array2d[float], spo
 
 @wp.func
 def draw_again(
-    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], spot: Spot, purpose: int, world: int, count: int,
-    index: int, scale: wp.array[float], first: wp.vec3,
+    params: LocomotionParams, arm: Arm, heights: wp.array2d[float], spot: Spot, seed: wp.uint32, purpose: int,
+    world: int, count: int, index: int, scale: wp.array[float], first: wp.vec3,
 ) -> wp.vec3:  # fmt: skip
     """``first`` if it is valid, else the first valid one of further draws from the same box, else the middle."""
     goal = first
@@ -167,7 +179,7 @@ def draw_again(
     while not is_valid(params, arm, heights, spot, goal):
         if draws == wp.static(MAX_DRAWS):
             return wp.vec3(0.0)
-        u = uniform4(params.seed, purpose, world, count, index, wp.static(FIRST_REDRAW - 1) + draws)
+        u = uniform4(seed, purpose, world, count, index, wp.static(FIRST_REDRAW - 1) + draws)
         for i in range(3):
             goal[i] = (2.0 * u[i] - 1.0) * scale[wp.static(GOAL_COMPONENT) + i]
         draws += 1
@@ -175,63 +187,43 @@ def draw_again(
 
 
 @wp.func
-def goal_in_force(state: LocomotionState, env: int) -> wp.vec3:
+def active_goal(worlds: Worlds, env: int) -> wp.vec3:
     """The arm's part of the goal."""
     g = wp.static(GOAL_COMPONENT)
-    return wp.vec3(state.goal[env, g], state.goal[env, g + 1], state.goal[env, g + 2])
+    return wp.vec3(worlds.goal[env, g], worlds.goal[env, g + 1], worlds.goal[env, g + 2])
 
 
 @wp.kernel
 def _locate_goals(
     # In
+    worlds: Worlds,
     params: LocomotionParams,
     arm: Arm,
-    heights: wp.array2d[float],
-    qpos: wp.array2d[float],
-    state: LocomotionState,
+    ground: Ground,
+    sim: Simulation,
     # Out
     point: wp.array[wp.vec3],
 ):
     env = wp.tid()
-    point[env] = point_of_goal(find_spot(params, arm, heights, qpos, env), goal_in_force(state, env))
+    point[env] = point_of_goal(find_spot(params, arm, ground.heights, sim.qpos, env), active_goal(worlds, env))
 
 
-def locate_goals(
-    params: LocomotionParams, arm: Arm, heights: wp.array, qpos: wp.array, state: LocomotionState, point: wp.array
-) -> None:
-    """Find where in the world the arms' goals are, for pictures.
-
-    Args:
-        params: What all worlds share.
-        arm: The arm.
-        heights: The height grid [m], float32, shape (nx, ny).
-        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
-        state: The worlds; only their goals are read.
-        point: Places [m], vec3, shape (num_envs,). Written.
-
-    Raises:
-        ValueError: If an array has another shape, dtype or device.
-    """
-    require("point", point, dtype=wp.vec3)
-    n = point.shape[0]
-    require_axes("qpos", qpos, 2)
-    require("qpos", qpos, dtype=wp.float32, shape=(n, qpos.shape[1]), like=point)
-    require_arm(arm, heights, qpos.shape[1] - 7, point)
-    require("state.goal", state.goal, dtype=wp.float32, shape=(n, GOAL_COMPONENT + 3), like=point)
-    wp.launch(
-        _locate_goals, dim=n, inputs=[params, arm, heights, qpos, state], outputs=[point], device=point.device
-    )  # fmt: skip
+def locate_goals(legged: LeggedWorlds, arm: Arm) -> wp.array:
+    """Where in the world the arms' goals are [m], vec3, shape (num_envs,); for pictures."""
+    point = wp.empty(legged.worlds.num_envs, dtype=wp.vec3, device=arm.error.device)
+    legged.launch(_locate_goals, len(point), arm, legged.ground, legged.sim, point)
+    return point
 
 
 @wp.kernel
 def _redraw_candidates(
     # In
+    worlds: Worlds,
     params: LocomotionParams,
     arm: Arm,
-    heights: wp.array2d[float],
-    qpos: wp.array2d[float],
+    ground: Ground,
+    sim: Simulation,
     row: wp.array[int],
-    goal_count: wp.array[int],
     scale: wp.array[float],
     # In and out
     candidate: wp.array3d[float],
@@ -241,67 +233,44 @@ def _redraw_candidates(
     g = wp.static(GOAL_COMPONENT)
     first = wp.vec3(candidate[i, k, g], candidate[i, k, g + 1], candidate[i, k, g + 2])
     goal = draw_again(
-        params, arm, heights, find_spot(params, arm, heights, qpos, env), wp.static(int(Purpose.CANDIDATE)),
-        params.world_offset + env, goal_count[env], k, scale, first,
+        params, arm, ground.heights, find_spot(params, arm, ground.heights, sim.qpos, env), worlds.seed,
+        wp.static(int(Purpose.CANDIDATE)), worlds.world_offset + env, worlds.goal_count[env], k, scale, first,
     )  # fmt: skip
     for c in range(3):
         candidate[i, k, g + c] = goal[c]
 
 
 def redraw_candidates(
-    params: LocomotionParams,
-    arm: Arm,
-    heights: wp.array,
-    qpos: wp.array,
-    row: wp.array,
-    goal_count: wp.array,
-    scale: wp.array,
-    candidate: wp.array,
-    *,
-    record: bool = False,
-) -> wp.Launch | None:
-    """Put valid goals in the place of those of ``draw_candidates`` that are not.
+    legged: LeggedWorlds, arm: Arm, row: wp.array, scale: wp.array, candidate: wp.array
+) -> wp.Launch:  # fmt: skip
+    """Record what puts valid goals in the place of those of ``draw_candidates`` that are not.
 
     The arm's part of such a candidate is drawn again from the same box until it is valid, which makes it uniform over
     the valid goals. What comes out depends on (seed, world, the number of the goal, k) alone where the ground is level;
     elsewhere also on where the robot is.
 
     Args:
-        params: What all worlds share.
+        legged: The worlds.
         arm: The arm.
-        heights: The height grid [m], float32, shape (nx, ny).
-        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
         row: Worlds that need a goal, int32, shape (n,), each in [0, num_envs).
-        goal_count: Goals that each world has received so far, int32, shape (num_envs,).
         scale: Half side of the box along every component, float32, shape (goal_dim,).
         candidate: Candidates, float32, shape (n, count, goal_dim). Updated.
-        record: Return the launch, to be replayed with ``launch()``, instead of making it.
+
+    Returns:
+        The launch, a thread for each candidate of each row.
 
     Raises:
         ValueError: If an array has another shape, dtype or device.
     """
-    require("row", row, dtype=wp.int32)
+    goal = legged.worlds.goal
+    require("row", row, dtype=wp.int32, shape=row.shape, like=goal)
+    require("scale", scale, dtype=wp.float32, shape=goal.shape[1:], like=goal)
     require_axes("candidate", candidate, 3)
-    shape = (row.shape[0], candidate.shape[1], GOAL_COMPONENT + 3)
-    require("candidate", candidate, dtype=wp.float32, shape=shape, like=row)
-    require("goal_count", goal_count, dtype=wp.int32, shape=goal_count.shape, like=row)
-    require("scale", scale, dtype=wp.float32, shape=shape[2:], like=row)
-    require_axes("qpos", qpos, 2)
-    require("qpos", qpos, dtype=wp.float32, shape=(goal_count.shape[0], qpos.shape[1]), like=row)
-    require_arm(arm, heights, qpos.shape[1] - 7, row)
+    require("candidate", candidate, shape=(len(row), candidate.shape[1], goal.shape[1]), like=goal)
     return wp.launch(
         _redraw_candidates,
-        dim=shape[:2],
-        inputs=[params, arm, heights, qpos, row, goal_count, scale],
-        outputs=[candidate],
+        dim=candidate.shape[:2],
+        inputs=[legged.worlds, legged.params, arm, legged.ground, legged.sim, row, scale, candidate],
         device=row.device,
-        record_cmd=record,
+        record_cmd=True,
     )
-
-
-def require_arm(arm: Arm, heights: wp.array, num_joints: int, like: wp.array) -> None:
-    """Raise ``ValueError`` unless ``arm`` has ``num_joints`` less the legs', and it and ``heights`` fit ``like``."""
-    joints = num_joints - LEG_JOINTS
-    require("arm.axis", arm.axis, dtype=wp.vec3, shape=(joints,), like=like)
-    require("arm.offset", arm.offset, dtype=wp.vec3, shape=(joints + 1,), like=like)
-    require_heights("heights", heights, like)

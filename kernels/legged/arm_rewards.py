@@ -1,13 +1,15 @@
 """The arm's part of a legged robot's reward: one ``@wp.func`` per term and one weight per term.
 
-To add a term, write its function, give it a weight in ``ArmWeights`` and a line in ``weighted_arm_terms``; the command
-line and the log find it by the weight's name. Every term is multiplied by its weight and by the step's duration, and
-joins those of the legs (``deimos.kernels.legged.rewards``) before their sum is clipped at 0.
+To add a term, write its function and give it a weight of the same name in ``ArmWeights``: kernels, command line and
+log find it by that name. Every term is multiplied by its weight and by the step's duration, and joins those of the legs
+(``deimos.kernels.legged.rewards``) before their sum is clipped at 0.
 """
 
 from dataclasses import dataclass, fields
 
 import warp as wp
+
+from .terms import functions_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,7 +72,13 @@ def arm_action_rate(m: ArmMotion) -> float:
     return m.action_change
 
 
+_FUNCTIONS = functions_of(ArmWeights, globals())
+
+
 @wp.func
 def weighted_arm_terms(m: ArmMotion, weight: vecA) -> vecA:
     """All terms, each times its weight and the step's duration; in the order of ``ARM_TERMS``."""
-    return wp.cw_mul(vecA(reach(m), precision(m), arm_energy(m), arm_action_rate(m)), weight) * m.dt
+    terms = vecA()
+    for k in range(wp.static(len(_FUNCTIONS))):
+        terms[k] = wp.static(_FUNCTIONS[k])(m) * weight[k] * m.dt
+    return terms

@@ -7,7 +7,7 @@ the largest of these sums over the substeps is the part's force.
 
 import warp as wp
 
-from ..check import require, require_axes
+from ..structs import StructTable
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,14 +17,24 @@ UNWATCHED = -2  # part of a geom whose contacts do not matter
 
 @wp.struct
 class Contacts:
-    """The simulator's contacts of one substep, over all worlds; mujoco-warp's layout."""
+    """The simulator's contacts of one substep, over all worlds, in mujoco-warp's layout, and what becomes of them."""
 
-    count: wp.array[int]  # (1,): contacts found, which may be more than there is room for
-    world: wp.array[int]  # (room,)
-    geom: wp.array[wp.vec2i]  # (room,): the two geoms
-    dim: wp.array[int]  # (room,): 1 without friction, 3 with a pyramidal friction cone
-    row: wp.array2d[int]  # (room, any): first row of the contact in ``force``, negative if it is not in the solution
-    force: wp.array2d[float]  # (num_envs, rows): constraint forces [N]
+    count: wp.array[int]  # contacts found, which may be more than the buffer holds
+    world: wp.array[int]
+    geom: wp.array[wp.vec2i]  # the two geoms
+    dim: wp.array[int]  # 1 without friction, 3 with a pyramidal friction cone
+    row: wp.array2d[int]  # first row of the contact in ``force``, negative if it is not in the solution
+    force: wp.array2d[float]  # constraint forces [N]
+    geom_part: wp.array[int]  # part of every geom, or ``TERRAIN`` or ``UNWATCHED``
+    part_force: wp.array3d[float]  # normal forces of every substep [N]; zero it before the first
+    peak: wp.array[int]  # most contacts over all worlds, and most constraint rows of a world with a contact, so far
+
+
+CONTACTS = StructTable(Contacts, {
+    "count": (1,), "world": ("buffer",), "geom": ("buffer",), "dim": ("buffer",), "row": ("buffer", "edges"),
+    "force": ("num_envs", "rows"), "geom_part": ("num_geoms",), "part_force": ("substeps", "num_envs", "parts"),
+    "peak": (2,),
+})  # fmt: skip
 
 
 @wp.func
@@ -54,15 +64,13 @@ def peak_force(part_force: wp.array3d[float], env: int, part: int) -> float:
 @wp.kernel
 def _gather_contacts(
     # In
-    contacts: Contacts,
-    geom_part: wp.array[int],
     substep: int,
     num_threads: int,
     # In and out
-    part_force: wp.array3d[float],
-    peak: wp.array[int],
+    contacts: Contacts,
 ):
     first = wp.tid()
+    peak = contacts.peak
     found = contacts.count[0]
     if first == 0:
         wp.atomic_max(peak, 0, found)
@@ -76,59 +84,26 @@ def _gather_contacts(
         if rows > peak[1]:  # reading first spares nearly all of the atomics
             wp.atomic_max(peak, 1, rows)
         pair = contacts.geom[i]
-        a = geom_part[pair[0]]
-        b = geom_part[pair[1]]
+        a = contacts.geom_part[pair[0]]
+        b = contacts.geom_part[pair[1]]
         if wp.min(a, b) == wp.static(TERRAIN) and wp.max(a, b) >= 0:
             push = normal_force(dim, row, contacts.force, world)
-            wp.atomic_add(part_force, substep, world, wp.max(a, b), push)
+            wp.atomic_add(contacts.part_force, substep, world, wp.max(a, b), push)
 
 
-def gather_contacts(
-    contacts: Contacts,
-    geom_part: wp.array,
-    part_force: wp.array,
-    peak: wp.array,
-    *,
-    substep: int,
-    record: bool = False,
-) -> wp.Launch | None:
-    """Add the normal forces between each part and the terrain to one substep of ``part_force``.
+def gather_contacts(contacts: Contacts, *, substep: int) -> None:
+    """Add the normal forces between each part and the terrain to one substep of ``part_force``; raise ``peak``.
 
     Args:
-        contacts: The simulator's contacts of this substep.
-        geom_part: Part of every geom, or ``TERRAIN`` or ``UNWATCHED``, int32, shape (num_geoms,).
-        part_force: Normal forces [N], float32, shape (substeps, num_envs, parts). Added to: zero it
-            before the first substep.
-        peak: int32, shape (2,). Raised to the number of contacts over all worlds, and to the largest
-            number of constraint rows that a world with a contact uses.
+        contacts: The contacts of this substep, as ``CONTACTS`` says; only the substep is checked here.
         substep: Which substep this is, in [0, substeps).
-        record: Return the launch, to be replayed with ``launch()``, instead of making it.
 
     Raises:
-        ValueError: If an array has another shape, dtype or device, or the substep is out of range.
+        ValueError: If the substep is out of range.
     """
-    require("geom_part", geom_part, dtype=wp.int32)
-    require_axes("geom_part", geom_part, 1)
-    require_axes("part_force", part_force, 3)
-    require("part_force", part_force, dtype=wp.float32, shape=part_force.shape, like=geom_part)
-    require("peak", peak, dtype=wp.int32, shape=(2,), like=geom_part)
-    room = contacts.world.shape
-    for name, dtype in (("world", wp.int32), ("geom", wp.vec2i), ("dim", wp.int32)):
-        require(f"contacts.{name}", getattr(contacts, name), dtype=dtype, shape=room, like=geom_part)
-    require("contacts.count", contacts.count, dtype=wp.int32, shape=(1,), like=geom_part)
-    require_axes("contacts.row", contacts.row, 2)
-    require("contacts.row", contacts.row, dtype=wp.int32, shape=(*room, contacts.row.shape[1]), like=geom_part)
-    require_axes("contacts.force", contacts.force, 2)
-    rows = (part_force.shape[1], contacts.force.shape[1])
-    require("contacts.force", contacts.force, dtype=wp.float32, shape=rows, like=geom_part)
-    if not 0 <= substep < part_force.shape[0]:
-        raise ValueError(f"substep must be in [0, {part_force.shape[0]}), got {substep}.")
-    num_threads = 1 if geom_part.device.is_cpu else max(1, room[0])
-    return wp.launch(
-        _gather_contacts,
-        dim=num_threads,
-        inputs=[contacts, geom_part, substep, num_threads],
-        outputs=[part_force, peak],
-        device=geom_part.device,
-        record_cmd=record,
-    )
+    substeps = contacts.part_force.shape[0]
+    if not 0 <= substep < substeps:
+        raise ValueError(f"substep must be in [0, {substeps}), got {substep}.")
+    device = contacts.world.device
+    num_threads = 1 if device.is_cpu else max(1, contacts.world.shape[0])
+    wp.launch(_gather_contacts, dim=num_threads, inputs=[substep, num_threads], outputs=[contacts], device=device)

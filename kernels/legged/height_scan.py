@@ -3,8 +3,6 @@
 import numpy as np
 import warp as wp
 
-from ..check import require, require_axes
-
 wp.set_module_options({"enable_backward": False})
 
 
@@ -49,13 +47,6 @@ def sample_minimum(heights: wp.array2d[float], cell: float, corner: wp.vec2, x: 
     i = cell_below((x - corner[0]) / cell, heights.shape[0] - 2)
     j = cell_below((y - corner[1]) / cell, heights.shape[1] - 2)
     return wp.min(wp.min(heights[i, j], heights[i + 1, j]), heights[i, j + 1])
-
-
-def require_heights(name: str, heights: wp.array, like: wp.array) -> None:
-    """Raise ``ValueError`` unless ``heights`` is a grid of at least 2 x 2 samples, on the device of ``like``."""
-    require_axes(name, heights, 2)
-    shape = tuple(max(2, samples) for samples in heights.shape)
-    require(name, heights, dtype=wp.float32, shape=shape, like=like)
 
 
 def scan_points(length: float = 1.6, width: float = 1.0, spacing: float = 0.1) -> np.ndarray:

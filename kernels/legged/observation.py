@@ -2,22 +2,23 @@
 
 import warp as wp
 
-from ..check import require, require_axes
+from ..episodes import Worlds, write_goal
 from ..random import Purpose, uniform4
 from ..rotations import down_in_body, heading, rotate_by_heading, rotate_inverse
-from .height_scan import require_heights, sample_minimum
+from .height_scan import sample_minimum
 from .state import (
-    GOAL_START,
     HEIGHT_BOUND,
     HEIGHT_SCALE,
     JOINT_SPEED_SCALE,
     RATE_SCALE,
     VELOCITY_SCALE,
+    Ground,
     Joints,
+    LeggedWorlds,
     LocomotionParams,
     LocomotionState,
-    require_obs,
-    require_state,
+    Sensing,
+    Simulation,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -42,97 +43,69 @@ def base_rate(qvel: wp.array2d[float], env: int) -> wp.vec3:
 
 
 @wp.func
-def write_goal(env: int, goal: wp.array2d[float], goal_scale: wp.array[float], obs: wp.array2d[float]):
-    """Write the goal slot."""
-    for k in range(goal.shape[1]):
-        obs[env, wp.static(GOAL_START) + k] = goal[env, k] * goal_scale[k]
-
-
-@wp.func
-def write_proprioception(
-    env: int,
-    joints: Joints,
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    state: LocomotionState,
-    goal_scale: wp.array[float],
-    obs: wp.array2d[float],
-):
+def write_proprioception(env: int, worlds: Worlds, joints: Joints, sim: Simulation, state: LocomotionState):
     """Write everything but what comes after the last action, without noise."""
-    velocity = base_velocity(qpos, qvel, env)
-    rate = base_rate(qvel, env)
-    down = down_in_body(base_quaternion(qpos, env))
+    velocity = base_velocity(sim.qpos, sim.qvel, env)
+    rate = base_rate(sim.qvel, env)
+    down = down_in_body(base_quaternion(sim.qpos, env))
     for i in range(3):
-        obs[env, i] = velocity[i] * wp.static(VELOCITY_SCALE)
-        obs[env, 3 + i] = rate[i] * wp.static(RATE_SCALE)
-        obs[env, 6 + i] = down[i]
-    write_goal(env, state.goal, goal_scale, obs)
+        worlds.obs[env, i] = velocity[i] * wp.static(VELOCITY_SCALE)
+        worlds.obs[env, 3 + i] = rate[i] * wp.static(RATE_SCALE)
+        worlds.obs[env, 6 + i] = down[i]
+    write_goal(env, worlds)
     num_joints = state.action.shape[1]
-    start = wp.static(GOAL_START) + state.goal.shape[1]
+    start = worlds.goal_start + worlds.goal.shape[1]
     for j in range(num_joints):
-        obs[env, start + j] = qpos[env, 7 + j] - joints.pose[j]
-        obs[env, start + num_joints + j] = qvel[env, 6 + j] * wp.static(JOINT_SPEED_SCALE)
-        obs[env, start + 2 * num_joints + j] = state.action[env, j]
+        worlds.obs[env, start + j] = sim.qpos[env, 7 + j] - joints.pose[j]
+        worlds.obs[env, start + num_joints + j] = sim.qvel[env, 6 + j] * wp.static(JOINT_SPEED_SCALE)
+        worlds.obs[env, start + 2 * num_joints + j] = state.action[env, j]
 
 
 @wp.kernel
 def _finish_obs(
+    # In and out
+    worlds: Worlds,
     # In
     params: LocomotionParams,
+    ground: Ground,
+    sensing: Sensing,
+    sim: Simulation,
     mask: wp.array[wp.bool],
     wanted: wp.bool,
-    heights: wp.array2d[float],
-    point: wp.array[wp.vec2],
-    noise: wp.array[float],
-    qpos: wp.array2d[float],
-    episode_count: wp.array[int],
-    episode_step: wp.array[int],
     env_stride: int,
     block_stride: int,
-    # In and out
-    obs: wp.array2d[float],
 ):
     # A block is four components, as many as one draw gives.
     first_env, first_block = wp.tid()
+    obs = worlds.obs
     num_blocks = (obs.shape[1] + 3) // 4
     for env in range(first_env, mask.shape[0], env_stride):
         if mask[env] != wanted:
             continue
-        direction = heading(wp.vec4(qpos[env, 3], qpos[env, 4], qpos[env, 5], qpos[env, 6]))
+        x = sim.qpos[env, 0]
+        y = sim.qpos[env, 1]
+        direction = heading(base_quaternion(sim.qpos, env))
         for block in range(first_block, num_blocks, block_stride):
             u = wp.vec4(0.5)
             if params.noise:
                 u = uniform4(
-                    params.seed, wp.static(int(Purpose.NOISE)), params.world_offset + env, episode_count[env],
-                    episode_step[env], block,
+                    worlds.seed, wp.static(int(Purpose.NOISE)), worlds.world_offset + env, worlds.episode_count[env],
+                    worlds.episode_step[env], block,
                 )  # fmt: skip
             for lane in range(wp.min(4, obs.shape[1] - 4 * block)):
                 i = 4 * block + lane
                 seen = obs[env, i]
                 k = i - params.scan_start
                 if k >= 0:
-                    offset = rotate_by_heading(direction, point[k][0], point[k][1])
-                    ground = sample_minimum(
-                        heights, params.cell, params.corner, qpos[env, 0] + offset[0], qpos[env, 1] + offset[1]
-                    )
+                    offset = rotate_by_heading(direction, sensing.point[k][0], sensing.point[k][1])
+                    height = sample_minimum(ground.heights, params.cell, params.corner, x + offset[0], y + offset[1])
                     bound = wp.static(HEIGHT_BOUND)
-                    clearance = qpos[env, 2] - params.standing_height - ground
+                    clearance = sim.qpos[env, 2] - params.standing_height - height
                     seen = wp.static(HEIGHT_SCALE) * wp.clamp(clearance, -bound, bound)
-                obs[env, i] = seen + noise[i] * (2.0 * u[lane] - 1.0)
+                obs[env, i] = seen + sensing.noise[i] * (2.0 * u[lane] - 1.0)
 
 
-def finish_obs(
-    params: LocomotionParams,
-    mask: wp.array,
-    heights: wp.array,
-    point: wp.array,
-    noise: wp.array,
-    qpos: wp.array,
-    state: LocomotionState,
-    obs: wp.array,
-    *,
-    wanted: bool,
-) -> None:
+def finish_obs(legged: LeggedWorlds, mask: wp.array, *, wanted: bool) -> None:
     """Write the heights around every robot and add the noise, in the worlds where ``mask`` is ``wanted``.
 
     A height is seen as 5 clip(z - standing height - ground, -1 m, 1 m), z being the base's, at points that turn with
@@ -141,35 +114,10 @@ def finish_obs(
     the step size of the other weights.
 
     Args:
-        params: What all worlds share.
-        mask: bool, shape (num_envs,).
-        heights: The height grid [m], float32, shape (nx, ny).
-        point: Points in the frame of the robot's yaw [m], vec2, shape (obs_dim - params.scan_start,).
-        noise: Half width of the uniform noise of every component, as the policy sees it, float32, shape (obs_dim,).
-        qpos: Positions, float32, shape (num_envs, 7 + num_joints).
-        state: The worlds; its clocks address the draws.
-        obs: Observations, float32, shape (num_envs, obs_dim). Updated.
+        legged: The worlds; their observations are updated, their clocks address the draws.
+        mask: One of their masks, bool, shape (num_envs,).
         wanted: Value of ``mask`` where to write.
-
-    Raises:
-        ValueError: If an array has another shape, dtype or device.
     """
-    require("mask", mask, dtype=wp.bool)
-    require_heights("heights", heights, mask)
-    require_axes("qpos", qpos, 2)
-    require("qpos", qpos, dtype=wp.float32, shape=(mask.shape[0], qpos.shape[1]), like=mask)
-    require_state(state, mask.shape[0], qpos.shape[1] - 7, mask)
-    require_obs("obs", obs, state, mask)
-    n, obs_dim = obs.shape
-    require("point", point, dtype=wp.vec2, shape=(obs_dim - params.scan_start,), like=mask)
-    require("noise", noise, dtype=wp.float32, shape=(obs_dim,), like=mask)
+    n, obs_dim = legged.worlds.obs.shape
     threads = (1, 1) if mask.device.is_cpu else (n, (obs_dim + 3) // 4)
-    wp.launch(
-        _finish_obs,
-        dim=threads,
-        inputs=[
-            params, mask, wanted, heights, point, noise, qpos, state.episode_count, state.episode_step, *threads,
-        ],
-        outputs=[obs],
-        device=mask.device,
-    )  # fmt: skip
+    legged.launch(_finish_obs, threads, legged.ground, legged.sensing, legged.sim, mask, wanted, *threads)

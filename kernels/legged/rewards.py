@@ -1,7 +1,7 @@
 """The legged robots' reward: one ``@wp.func`` per term and one weight per term.
 
-To add a term, write its function, give it a weight in ``RewardWeights`` and a line in
-``weighted_terms``; the command line, the log and the tests find it by the weight's name.
+To add a term, write its function and give it a weight of the same name in ``RewardWeights``: kernels, command line
+and log find it by that name.
 
 The terms and their weights are those of Legged Gym's A1 (Rudin et al., *Learning to Walk in Minutes Using
 Massively Parallel Deep Reinforcement Learning*, CoRL 2021, table 2, with the A1's configuration), plus
@@ -12,6 +12,8 @@ Massively Parallel Deep Reinforcement Learning*, CoRL 2021, table 2, with the A1
 from dataclasses import dataclass, fields
 
 import warp as wp
+
+from .terms import functions_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -162,20 +164,13 @@ def air_time(m: LegMotion) -> float:
     return 0.0
 
 
+_FUNCTIONS = functions_of(RewardWeights, globals())
+
+
 @wp.func
 def weighted_terms(m: LegMotion, weight: vecT) -> vecT:
     """All terms, each times its weight and the step's duration; in the order of ``TERMS``."""
-    terms = vecT(
-        linear_tracking(m),
-        yaw_tracking(m),
-        vertical_speed(m),
-        roll_pitch_rate(m),
-        tilt(m),
-        torque(m),
-        joint_acceleration(m),
-        action_rate(m),
-        joint_limit(m),
-        collision(m),
-        air_time(m),
-    )
-    return wp.cw_mul(terms, weight) * m.dt
+    terms = vecT()
+    for k in range(wp.static(len(_FUNCTIONS))):
+        terms[k] = wp.static(_FUNCTIONS[k])(m) * weight[k] * m.dt
+    return terms

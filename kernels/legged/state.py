@@ -1,22 +1,29 @@
 """What the kernels of the legged robots share: parameters, states, results.
 
-The first twelve joints are those of the legs (``deimos.kernels.legged.rewards``), further ones belong to what
-the robot carries. A goal begins with the velocity goal (v_x, v_y, yaw rate); further components are
-the affair of the kernels of what is carried. The observation is Legged Gym's (Rudin et al. 2021)::
+The first twelve joints are those of the legs (``deimos.kernels.legged.rewards``), further ones those of an arm. A goal
+begins with the velocity goal (v_x, v_y, yaw rate); further components are the arm's (``deimos.kernels.legged.arm``).
+The observation is Legged Gym's (Rudin et al. 2021)::
 
     velocity 3, angular velocity 3, gravity 3, goal G, joint angles J, joint velocities J, last action J,
-    anything else, heights
+    the arm's, heights
 
 with G components of the goal and J joints. Frames are the base's own but for the goal, which is meant in
 the same frame, and the heights.
+
+Every array is in a struct, and every struct has a table of shapes. ``LeggedWorlds`` puts the structs together and
+checks them, once: the launchers take it as it is.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import warp as wp
 
-from ..check import require, require_axes
-from .rewards import TERMS, vec12, vecT
+from ..episodes import WORLDS, Worlds
+from ..structs import StructTable
+from .rewards import LEG_JOINTS, TERMS, vec12, vecT
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,7 +41,6 @@ FOOT_FORCE = 1.0  # [N] that makes a contact of a foot
 LIMB_FORCE = 0.1  # [N] that makes a collision of a thigh or calf
 
 BROKEN = ("action", "position", "velocity", "speed", "contacts", "goal")  # causes of an invalid world, by their bit
-COUNTERS = ("foot_contact", "level", "goal_clock", "episode_step", "episode_count", "goal_count")  # of a state
 
 
 class LevelRule(IntEnum):
@@ -45,8 +51,7 @@ class LevelRule(IntEnum):
     REWARD = 1
     """Up if the mean linear tracking is at least 0.8 without a crash, down if it is below 0.5 or after a crash."""
     DISPLACEMENT = 2
-    """Legged Gym's: up if the robot is more than half a tile away from its start, down if it is less
-    than half of what its last goal asked for."""
+    """The same with the agreement of the robot's displacements and those of its goals' paths (``levels``)."""
 
 
 @wp.struct
@@ -54,12 +59,7 @@ class LocomotionParams:
     """What all worlds share."""
 
     dt: float  # duration of a step [s]
-    goal_period: int  # T: steps that a goal is in force
-    time_limit: int  # steps of an episode
     stagger: wp.bool  # whether the clocks of a world's first episode start at random steps
-    seed: wp.uint32  # of every draw
-    world_offset: int  # global number of world 0
-    action_bound: float  # actions are clipped to [-action_bound, action_bound]
     noise: wp.bool  # whether observations are noisy
     push_interval: int  # steps from push to push, 0 for none
     push_speed: float  # bound of the velocity that a push sets [m/s]
@@ -82,102 +82,172 @@ class LocomotionParams:
     corner: wp.vec2  # its first sample [m]
     low: wp.vec2  # least and largest x and y of the terrain; beyond them an episode is truncated [m]
     high: wp.vec2
-    half_tile: float  # half side of a tile [m]
 
 
 @wp.struct
 class Joints:
-    """The robot's joints. Arrays of shape (num_joints,)."""
+    """The robot's joints."""
 
     pose: wp.array[float]  # angles at an action of zero [rad]
     action_scale: wp.array[float]  # what an action of one adds to the target [rad]
     low: wp.array[float]  # range [rad]
     high: wp.array[float]
+    action_low: wp.array[float]  # actions are clipped to what takes the target to an end of the range
+    action_high: wp.array[float]
 
 
 @wp.struct
 class Ground:
     """The terrain."""
 
-    heights: wp.array2d[float]  # (nx, ny) [m]
-    origin: wp.array2d[wp.vec3]  # (levels, columns): where robots start [m]
+    heights: wp.array2d[float]  # [m]
+    origin: wp.array2d[wp.vec3]  # where robots start on the tile of every level and column [m]
+
+
+@wp.struct
+class Sensing:
+    """How the policy sees the worlds."""
+
+    noise: wp.array[float]  # half width of the uniform noise of every component of the observation
+    point: wp.array[wp.vec2]  # where heights are read, in the frame of the robot's yaw [m]
 
 
 @wp.struct
 class LocomotionState:
-    """What a bit-exact resume needs beyond the simulator's own state; (num_envs,) unless it says otherwise."""
+    """What a bit-exact resume needs beyond ``Worlds`` and the simulator's own state."""
 
-    goal: wp.array2d[float]  # (num_envs, goal_dim); velocity goals in [m/s] and [rad/s]
-    action: wp.array2d[float]  # (num_envs, num_joints): the last action, bounded
-    joint_speed: wp.array2d[float]  # (num_envs, num_joints): at the end of the last step [rad/s]
-    air_time: wp.array2d[float]  # (num_envs, 4): of every foot since it left the ground [s]
+    action: wp.array2d[float]  # the last action, bounded
+    joint_speed: wp.array2d[float]  # at the end of the last step [rad/s]
+    air_time: wp.array2d[float]  # of every foot since it left the ground [s]
     foot_contact: wp.array[int]  # bit i: foot i touched the ground on the last step
     tracked: wp.array[wp.vec2]  # sum of the linear tracking in this episode, and its steps
     level: wp.array[int]
-    goal_clock: wp.array[int]  # steps that the goal has been in force
-    episode_step: wp.array[int]  # steps since the reset
-    episode_count: wp.array[int]  # resets so far
-    goal_count: wp.array[int]  # goals received so far, first goals apart
+    goal_start: wp.array[wp.vec3]  # where the robot was when its goal began: x and y [m], and the goal's clock
+    progress: wp.array[wp.vec4]  # how well displacements agree with paths, see ``follow_path``
 
 
 @wp.struct
 class LocomotionStep:
-    """What one step gives back; (num_envs,) unless it says otherwise."""
+    """What a step gives back beyond ``Worlds``, whose ``tracking`` begins with linear and yaw."""
 
-    obs: wp.array2d[float]  # (num_envs, obs_dim)
-    reward: wp.array[float]  # at least 0, against the goal that was in force
-    tracking: wp.array2d[float]  # (num_envs, groups of the goal): in [0, 1]; linear and yaw come first
-    term: wp.array2d[float]  # (num_envs, NUM_COLUMNS and those of what is carried): what the reward is the sum of
-    terminated: wp.array[wp.bool]  # crashed
-    truncated: wp.array[wp.bool]  # cut off without a crash: time limit, off the terrain, or invalid
-    goal_due: wp.array[wp.bool]  # the goal has been in force for its whole period, and the state is valid
-    invalid: wp.array[wp.bool]  # the state is not physical any more
-    fault: wp.array[int]  # (3,): invalid world-steps so far, lowest world among them, lowest world with a broken action
-    cause: wp.array[int]  # bits of BROKEN on the last invalid step of this world
-    value: wp.array[float]  # the value that was at fault then
+    term: wp.array2d[float]  # what the reward is the sum of: ``COLUMNS``, then the arm's terms
+    value: wp.array[float]  # the value that was at fault on the last invalid step of this world
 
 
 @wp.struct
 class Simulation:
-    """The simulator's arrays, first axis num_envs but for ``part_force``."""
+    """The simulator's arrays."""
 
     qpos: wp.array2d[float]  # base position 3 [m], quaternion 4 (w, x, y, z), joint angles [rad]
     qvel: wp.array2d[float]  # base velocity 3 in the world [m/s], rate 3 in the base [rad/s], joint velocities [rad/s]
     ctrl: wp.array2d[float]  # target angles [rad]
     torque: wp.array2d[float]  # [N m]
-    part_force: wp.array3d[float]  # (substeps, num_envs, parts): normal forces on the terrain [N]
+    part_force: wp.array3d[float]  # of every substep: normal forces of the parts on the terrain [N]
     overflow: wp.array[int]  # bits of what the simulator ran out of
 
 
 COLUMNS = (*TERMS, "clipping")  # of ``LocomotionStep.term``; what clipping at 0 added comes last
 NUM_COLUMNS = len(COLUMNS)
 
+JOINTS = StructTable(Joints, dict.fromkeys(Joints.vars, ("num_joints",)))
+GROUND = StructTable(Ground, {"heights": ("nx", "ny"), "origin": ("levels", "columns")})
+SENSING = StructTable(Sensing, {"noise": ("obs_dim",), "point": ("num_points",)})
+STATE = StructTable(LocomotionState, {
+    "action": ("num_envs", "num_joints"), "joint_speed": ("num_envs", "num_joints"), "air_time": ("num_envs", NUM_FEET),
+})  # fmt: skip
+STEP = StructTable(LocomotionStep, {"term": ("num_envs", "num_terms")})
+SIMULATION = StructTable(Simulation, {
+    "qpos": ("num_envs", "nq"), "qvel": ("num_envs", "nv"), "ctrl": ("num_envs", "num_joints"),
+    "torque": ("num_envs", "num_joints"), "part_force": ("substeps", "num_envs", NUM_PARTS),
+})  # fmt: skip
+TABLES = {
+    "worlds": WORLDS, "joints": JOINTS, "ground": GROUND, "sensing": SENSING, "state": STATE, "out": STEP,
+    "sim": SIMULATION,
+}  # fmt: skip
 
-def require_state(state: LocomotionState, num_envs: int, num_joints: int, like: wp.array) -> None:
-    """Raise ``ValueError`` unless every array of ``state`` is as long as its struct says.
+
+def build(table: StructTable, device: str, **values: Any) -> Any:
+    """A struct of these values, one for every array of its table: numbers are copied, Warp arrays kept as they are."""
+    struct = table.struct()
+    for name in table.names:
+        value = values[name]
+        if not isinstance(value, wp.array):
+            value = wp.array(value, dtype=table.dtype(name), device=device)
+        setattr(struct, name, value)
+    return struct
+
+
+def make_params(**values: Any) -> LocomotionParams:
+    """Params of these values: all of them, by name."""
+    if values.keys() != LocomotionParams.vars.keys():
+        raise ValueError(f"params must be {', '.join(LocomotionParams.vars)}, got {', '.join(values)}.")
+    params = LocomotionParams()
+    for name, value in values.items():
+        setattr(params, name, value)
+    return params
+
+
+def sizes(
+    *, num_envs: int, num_joints: int, substeps: int, num_points: int, heights: Sequence[int],
+    tiles: Sequence[int] = (1, 1), goal_dim: int = 3, num_groups: int = 2, num_terms: int = NUM_COLUMNS,
+    arm_fields: int = 0,
+) -> dict[str, int]:  # fmt: skip
+    """The sizes that the tables name.
 
     Args:
-        state: The worlds.
-        num_envs: Their number.
-        num_joints: Number of joints.
-        like: An array on whose device they must be.
+        num_envs: Number of worlds.
+        num_joints: Joints of a robot, those of the legs first.
+        substeps: Substeps of a control step.
+        num_points: Heights in the observation.
+        heights: Samples of the height grid along each axis, at least 2.
+        tiles: Levels and columns of the terrain.
+        goal_dim: Components of a goal, those of the velocity goal first.
+        num_groups: Groups of components, linear and yaw first.
+        num_terms: Columns of what the reward is the sum of.
+        arm_fields: Components of the observation between the last action and the heights.
+
+    Raises:
+        ValueError: If there are less than the first ones of something.
     """
-    widths = {"goal": max(3, state.goal.shape[1]), "action": num_joints, "joint_speed": num_joints}
-    for name, width in (widths | {"air_time": NUM_FEET}).items():
-        require(f"state.{name}", getattr(state, name), dtype=wp.float32, shape=(num_envs, width), like=like)
-    require("state.tracked", state.tracked, dtype=wp.vec2, shape=(num_envs,), like=like)
-    for name in COUNTERS:
-        require(f"state.{name}", getattr(state, name), dtype=wp.int32, shape=(num_envs,), like=like)
+    found = {
+        "num_envs": num_envs, "num_origins": 0, "num_joints": num_joints, "action_dim": num_joints,
+        "nq": 7 + num_joints, "nv": 6 + num_joints, "substeps": substeps, "num_points": num_points,
+        "nx": heights[0], "ny": heights[1], "levels": tiles[0], "columns": tiles[1], "goal_dim": goal_dim,
+        "num_groups": num_groups, "num_terms": num_terms,
+        "obs_dim": GOAL_START + goal_dim + 3 * num_joints + arm_fields + num_points,
+    }  # fmt: skip
+    least = {"num_joints": LEG_JOINTS, "goal_dim": 3, "num_groups": 2, "num_terms": NUM_COLUMNS, "nx": 2, "ny": 2}
+    for name, bound in least.items():
+        if found[name] < bound:
+            raise ValueError(f"{name} must be at least {bound}, got {found[name]}.")
+    return found
 
 
-def require_joints(joints: Joints, num_joints: int, like: wp.array) -> None:
-    """Raise ``ValueError`` unless ``joints`` are that many, on the device of ``like``."""
-    for name in Joints.vars:
-        require(f"joints.{name}", getattr(joints, name), dtype=wp.float32, shape=(num_joints,), like=like)
+@dataclass(frozen=True, kw_only=True)
+class LeggedWorlds:
+    """All that the kernels of legged robots read and write, checked once.
 
+    Args:
+        sizes: What ``sizes`` gives.
 
-def require_obs(name: str, obs: wp.array, state: LocomotionState, like: wp.array) -> None:
-    """Raise ``ValueError`` unless ``obs`` has a row for every world, with room for goal and joints of ``state``."""
-    require_axes(name, obs, 2)
-    least = GOAL_START + state.goal.shape[1] + 3 * state.action.shape[1]
-    require(name, obs, dtype=wp.float32, shape=(state.goal.shape[0], max(least, obs.shape[1])), like=like)
+    Raises:
+        ValueError: If an array has another shape, dtype or device than its table says.
+    """
+
+    sizes: dict[str, int]
+    params: LocomotionParams
+    worlds: Worlds
+    joints: Joints
+    ground: Ground
+    sensing: Sensing
+    state: LocomotionState
+    out: LocomotionStep
+    sim: Simulation
+
+    def __post_init__(self) -> None:
+        for name, table in TABLES.items():
+            table.require(name, getattr(self, name), self.worlds.goal, **self.sizes)
+
+    def launch(self, kernel: wp.Kernel, dim: Any, *inputs: Any) -> None:
+        """Launch a kernel of these worlds; its first arguments are ``worlds`` and ``params``, then come ``inputs``."""
+        wp.launch(kernel, dim, inputs=[self.worlds, self.params, *inputs], device=self.worlds.goal.device)

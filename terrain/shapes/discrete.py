@@ -1,16 +1,13 @@
 """Raised and sunk rectangles."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_at_least, check_positive, check_ramp
-from ..mesh import terraces
-from ..shape import Ramp, TileShape, at
+from deimos.checks import check_at_least
 
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from ..mesh import Mesh, terraces
+from ..shape import Ramp, TileShape, at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +28,7 @@ class Shape(TileShape):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ramp("height", self.height)
         check_at_least("count", self.count, 0)
-        check_positive("raster", self.raster)
         shortest, longest = self.sides
         room = self.tile - 2 * self.raster
         if not 0 < shortest <= longest <= room:
@@ -43,7 +38,7 @@ class Shape(TileShape):
         """From a sunk rectangle to a raised one [m]."""
         return 2 * at(self.height, difficulty)
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         h = at(self.height, difficulty)
         x, y = (self._spans(generator) for _ in range(2))

@@ -1,26 +1,22 @@
-"""Level ground."""
+"""Flat ground."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh import rings
+from ..mesh import Mesh, rings
 from ..shape import TileShape
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Level ground at every difficulty."""
+    """Flat ground at every difficulty."""
 
     @property
     def standing_room(self) -> float:
         """All of it."""
         return self.tile
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         return rings(np.array([self.tile / 2]), np.zeros(1))

@@ -1,21 +1,16 @@
 """A gap around the middle."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
-from ..mesh import rings
+from ..mesh import Mesh, rings
 from ..shape import Ramp, TileShape, at
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """A level middle that is cut off by a trench."""
+    """A flat middle that is cut off by a trench."""
 
     width: Ramp = (0.0, 1.0)
     """Width of the trench at difficulty 0 and at 1 [m], each at least 0; Legged Gym's 1.0 d."""
@@ -24,15 +19,13 @@ class Shape(TileShape):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ramp("width", self.width)
-        check_positive("depth", self.depth)
         if self.platform + 2 * max(self.width) >= self.tile:
             raise ValueError(
                 f"tile must be larger than platform + 2 width = {self.platform + 2 * max(self.width):g} m, "
                 f"got {self.tile:g} m."
             )
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         middle = self.platform / 2
         half_sides = np.array([self.tile / 2, middle + at(self.width, difficulty), middle])

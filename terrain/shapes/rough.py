@@ -1,17 +1,14 @@
 """Uniformly noised ground."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp, check_range
-from ..mesh import sheet
+from deimos.checks import check_range
+
+from ..mesh import Mesh, sheet
 from ..noise import draw_noise
 from ..shape import Ramp, TileShape, at
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,11 +27,9 @@ class Shape(TileShape):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ramp("amplitude", self.amplitude)
-        check_positive("quantum", self.quantum)
         check_range("spacing", self.spacing, 0.01, self.tile / 4)
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         amplitude = at(self.amplitude, difficulty)
         line, height = draw_noise(generator, self.tile, self.spacing, amplitude, self.quantum, self.platform)

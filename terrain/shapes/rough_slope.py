@@ -1,17 +1,15 @@
 """Slopes with uniform noise on them."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp, check_range
-from ..mesh import sheet
+from deimos.checks import check_range
+
+from ..mesh import Mesh, sheet
 from ..noise import draw_noise, interpolate
 from ..shape import Ramp, TileShape, at
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +31,7 @@ class Shape(TileShape):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ramp("gradient", self.gradient)
-        check_ramp("amplitude", self.amplitude)
-        check_positive("quantum", self.quantum)
         check_range("spacing", self.spacing, 0.01, self.tile / 4)
-        check_positive("room", self.room)
         if self.room > self.platform:
             raise ValueError(f"room must be at most platform = {self.platform:g} m, got {self.room:g} m.")
 
@@ -46,7 +40,7 @@ class Shape(TileShape):
         """The square without noise."""
         return self.room
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         amplitude = at(self.amplitude, difficulty)
         coarse, noise = draw_noise(generator, self.tile, self.spacing, amplitude, self.quantum, self.room)

@@ -2,27 +2,23 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
-from ..mesh import rings
+from ..mesh import Mesh, rings
 from ..shape import Ramp, TileShape, at
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Square steps around a level middle, with vertical risers.
+    """Square steps around a flat middle, with vertical risers.
 
     The first tread is at height 0 along the edge of the tile. As many steps follow as leave the platform free.
     """
 
     platform: float = 2.6
-    """Least side of the level middle [m], positive and smaller than the tile. Legged Gym asks for 3 m, and its
+    """Least side of the flat middle [m], positive and smaller than the tile. Legged Gym asks for 3 m, and its
     loop ends at 2.6 m."""
     direction: Literal["up", "down"] = "up"
     """Way out of the middle: up out of a hollow, or down a hill."""
@@ -30,11 +26,6 @@ class Shape(TileShape):
     """Height of a step at difficulty 0 and at 1 [m], each at least 0; Legged Gym's 0.05 + 0.18 d."""
     tread: float = 0.3
     """Depth of a step [m], positive."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ramp("height", self.height)
-        check_positive("tread", self.tread)
 
     @property
     def num_steps(self) -> int:
@@ -45,7 +36,7 @@ class Shape(TileShape):
         """Height of every step [m]."""
         return at(self.height, difficulty)
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         k = np.arange(self.num_steps + 1)
         rise = k * self.step(difficulty)

@@ -1,21 +1,16 @@
 """Stepping stones."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_positive, check_ramp
-from ..mesh import blocks, join, rings
-from ..shape import Ramp, TileShape, at
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from ..mesh import Mesh, blocks, join, rings
+from ..shape import Ramp, TileShape, at, check_ramp
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Rows of square stones over a deep floor, each row shifted at random, around a level middle."""
+    """Rows of square stones over a deep floor, each row shifted at random, around a flat middle."""
 
     side: Ramp = (1.575, 0.075)
     """Side of a stone at difficulty 0 and at 1 [m], each positive; Legged Gym's 1.5 (1.05 - d). Changed as little
@@ -25,21 +20,19 @@ class Shape(TileShape):
     depth: float = 1.0
     """Depth of the floor [m], positive."""
     rim: float = 0.5
-    """Width of the level rim along the edge [m], positive."""
+    """Width of the flat rim along the edge [m], positive."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("side", "gap"):
             check_ramp(name, getattr(self, name), least=0.01)
-        check_positive("depth", self.depth)
-        check_positive("rim", self.rim)
         if self.platform + 2 * self.rim + 4 * max(self.gap) >= self.tile:
             raise ValueError(
                 f"tile must be larger than platform + 2 rim + 4 gap = "
                 f"{self.platform + 2 * self.rim + 4 * max(self.gap):g} m, got {self.tile:g} m."
             )
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         gap = at(self.gap, difficulty)
         bed = self.tile / 2 - self.rim  # half side of what the stones stand in

@@ -1,24 +1,21 @@
 """Waves."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import check_at_least, check_positive, check_ramp, check_range
-from ..mesh import sheet
-from ..shape import Ramp, TileShape, at
+from deimos.checks import check_at_least, check_range
 
-if TYPE_CHECKING:
-    from trimesh import Trimesh
+from ..mesh import Mesh, sheet
+from ..shape import Ramp, TileShape, at
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Round hills and hollows, the product of a sine along x and one along y, fading out around a level middle."""
+    """Round hills and hollows, the product of a sine along x and one along y, fading out around a flat middle."""
 
     platform: float = 1.0
-    """Side of the level middle [m], positive and smaller than the tile."""
+    """Side of the flat middle [m], positive and smaller than the tile."""
     height: Ramp = (0.0, 0.2)
     """Height from a hollow to a hill at difficulty 0 and at 1 [m], each at least 0."""
     count: int = 4
@@ -30,12 +27,10 @@ class Shape(TileShape):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ramp("height", self.height)
         check_at_least("count", self.count, 1)
-        check_positive("fade", self.fade)
         check_range("spacing", self.spacing, 0.01, self.tile / self.count / 8)
 
-    def surface(self, difficulty: float, generator: np.random.Generator) -> "Trimesh":
+    def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         cells = round(self.tile / self.spacing)
         middle = self.platform / 2

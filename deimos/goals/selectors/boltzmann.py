@@ -10,8 +10,7 @@ from deimos.checks import check_range
 from deimos.goals import picks
 from deimos.goals.fear_selector import FearSelector, FearSelectorConfig
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import Spaces
-from deimos.learn.rollout import Rollout
+from deimos.goals.selector import Spaces, Transitions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +40,8 @@ class Boltzmann(FearSelector):
     """See ``Config``."""
 
     config: Config
+    # A run that goes on with a larger budget keeps the schedule that it began with.
+    saved = (*FearSelector.saved, "beta", "_steps")
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         super().__init__(config, spaces, seed)
@@ -52,18 +53,8 @@ class Boltzmann(FearSelector):
         """See ``FearSelector.choose``."""
         return picks.in_proportion(torch.softmax(self.beta * score, dim=1), draw)
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``."""
         way = min(1.0, interactions.now / self._steps) if self._steps else 1.0
         self.beta = self.config.beta_start + way * (self.config.beta - self.config.beta_start)
         return super().learn(interactions, rollout) | {"fear/beta": self.beta}
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return super().state_dict() | {"beta": self.beta, "steps": self._steps}
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        super().load_state_dict(state)
-        # A run that goes on with a larger budget keeps the schedule that it began with.
-        self.beta, self._steps = state["beta"], state["steps"]

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from deimos.checks import check_at_least
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
-from deimos.learn.rollout import Rollout
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +40,7 @@ class Curriculum(GoalSelector):
     """See ``Config``."""
 
     first_goals_scaled = True
+    saved = ("_range", "share", "_since", "_counted_at", "_sum", "_count")
 
     def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config
@@ -61,7 +61,7 @@ class Curriculum(GoalSelector):
         """See ``GoalSelector.propose``."""
         return uniform_proposal(candidates, draws[:, 0])
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Widen the range of every group that was tracked well under the range that it has."""
         done = interactions.resolved()
         done = done.where(done.resolved > self._counted_at)
@@ -79,17 +79,3 @@ class Curriculum(GoalSelector):
             if self._count[i] >= self.config.min_interactions:
                 self._since[i], self._sum[i], self._count[i] = interactions.now, 0.0, 0
         return row
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        lists: dict[str, list] = {
-            "share": self.share, "since": self._since, "sum": self._sum, "count": self._count,
-        }  # fmt: skip
-        copies = {name: list(values) for name, values in lists.items()}
-        return {"range": self._range.clone(), "counted_at": self._counted_at} | copies
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self._range.copy_(state["range"])
-        self.share, self._since, self._counted_at = list(state["share"]), list(state["since"]), state["counted_at"]
-        self._sum, self._count = list(state["sum"]), list(state["count"])

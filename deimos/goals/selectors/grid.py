@@ -8,8 +8,7 @@ from torch import Tensor
 from deimos.checks import check_at_least, check_positive
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
-from deimos.learn.rollout import Rollout
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +50,8 @@ class Grid(GoalSelector):
         ValueError: If a group's grid would have more than 2^20 cells.
     """
 
+    saved = ("_weights", "_seen", "_half", "_learnt_at", "fitted")
+
     def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config
         self.num_candidates = config.candidates
@@ -60,7 +61,7 @@ class Grid(GoalSelector):
         largest = config.bins ** max(len(group) for group in self._groups)
         if largest > 2**20:
             raise ValueError(f"bins must give at most 2^20 cells per group, got {config.bins} bins: {largest} cells.")
-        self._weights = [self._initial(len(group), device) for group in self._groups]
+        self._weights = tuple(self._initial(len(group), device) for group in self._groups)
         self._seen = torch.zeros(spaces.goal_dim, device=device)  # largest candidate so far, per component
         self._half = torch.zeros(spaces.goal_dim, device=device)  # what the cells are cut from
         self._learnt_at = 0  # step of the last call of learn
@@ -94,7 +95,7 @@ class Grid(GoalSelector):
         share = goal / (2 * self._half) + 0.5
         return (share * self.config.bins).long().clamp(0, self.config.bins - 1)
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Raise the weights around the cells of goals that were tracked well."""
         done = interactions.resolved()
         done = done.where(done.resolved > self._learnt_at)
@@ -121,21 +122,3 @@ class Grid(GoalSelector):
         for _ in range(dims):  # the neighbourhood is a box, so it is summed along one component after another
             hits = torch.tensordot(hits, near, dims=([0], [0]))
         weights.add_(self.config.growth * hits).clamp_(max=1.0)
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return {
-            "weights": [weights.clone() for weights in self._weights],
-            "seen": self._seen.clone(),
-            "half": self._half.clone(),
-            "learnt_at": self._learnt_at,
-            "fitted": self.fitted,
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        for weights, saved in zip(self._weights, state["weights"], strict=True):
-            weights.copy_(saved)
-        self._seen.copy_(state["seen"])
-        self._half.copy_(state["half"])
-        self._learnt_at, self.fitted = state["learnt_at"], state["fitted"]

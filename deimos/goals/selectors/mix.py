@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import check_range
+from deimos.goals.methods import method
 from deimos.goals.selector import Delegate, GoalSelector, Proposal, SelectorConfig, Spaces, uniform_proposal
 
 
@@ -19,8 +20,6 @@ class Config(SelectorConfig):
     """Share of uniform goals, in [0, 1]."""
 
     def __post_init__(self) -> None:
-        from deimos.goals.methods import method
-
         method(self.base)
         check_range("share", self.share, 0.0, 1.0)
 
@@ -33,8 +32,6 @@ class Mix(Delegate):
     """See ``Config``. The uniform goals have no score and are marked as probes."""
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
-        from deimos.goals.methods import method
-
         self.config = config
         self.parts = (method(config.base).build(spaces, seed),)
 
@@ -56,3 +53,11 @@ class Mix(Delegate):
             probe=free if own.probe is None else free | own.probe,
             note=None if own.note is None else own.note * ~free,
         )
+
+    def state_dict(self) -> dict:
+        """See ``GoalSelector.state_dict``."""
+        return self.current.state_dict()
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``GoalSelector.load_state_dict``."""
+        self.current.load_state_dict(state)

@@ -13,8 +13,7 @@ from torch import Tensor
 from deimos.checks import check_at_least, check_positive, check_range
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions, Resolved
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces
-from deimos.learn.rollout import Rollout
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +55,7 @@ class PLR(GoalSelector):
     """See ``Config``."""
 
     needs_rollout = True
+    saved = ("_level", "_score", "_made", "_seen", "_upto", "_carry", "_learnt_at", "replaying")
 
     def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config
@@ -88,7 +88,7 @@ class PLR(GoalSelector):
         note = (place + 1) * replayed
         return Proposal(picks.take(candidates, pick), score, learn, probe=~replayed, note=note)
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Score what has resolved, refresh the levels that were replayed, and keep the best new ones."""
         if rollout is None:
             raise ValueError("plr scores goals by advantages, so it needs the learner's rollout, got None.")
@@ -105,7 +105,7 @@ class PLR(GoalSelector):
             "plr/replayed": (~done.probe).float().mean().item(),
         }
 
-    def _positive_value_loss(self, interactions: Interactions, done: Resolved, rollout: Rollout) -> Tensor:
+    def _positive_value_loss(self, interactions: Interactions, done: Resolved, rollout: Transitions) -> Tensor:
         """Mean of max(advantage, 0) over every resolved interaction, shape (n,); interactions span rollouts."""
         begin = interactions.now - rollout.num_steps
         upto = torch.nn.functional.pad(rollout.advantage.clamp(min=0).cumsum(0), (0, 0, 1, 0))
@@ -127,7 +127,7 @@ class PLR(GoalSelector):
         Many worlds replay the same level at once: its score is the mean over them.
         """
         place = (done.note - 1).clamp(min=0)
-        # What was issued on the step of a lesson was issued before it, from the levels of before.
+        # What was issued on the step of an update was issued before it, from the levels of before.
         valid = (done.note > 0) & (self._made[place] < done.issued)
         place = place[valid]
         self._score.scatter_reduce_(0, place, loss[valid], "mean", include_self=False)
@@ -154,15 +154,3 @@ class PLR(GoalSelector):
         weight = (1 - mix) * by_score / by_score.sum().clamp(min=1e-300)
         weight += mix * by_age / by_age.sum().clamp(min=1.0)
         self._upto = weight.cumsum(0).float()
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        names = ("level", "score", "made", "seen", "upto", "carry")
-        tensors = {name: getattr(self, f"_{name}").clone() for name in names}
-        return tensors | {"learnt_at": self._learnt_at, "replaying": self.replaying}
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        for name in ("level", "score", "made", "seen", "upto", "carry"):
-            getattr(self, f"_{name}").copy_(state[name])
-        self._learnt_at, self.replaying = state["learnt_at"], state["replaying"]

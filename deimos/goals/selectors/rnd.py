@@ -9,19 +9,19 @@ from torch import Tensor, nn
 from deimos.checks import SimulationError, check_at_least, check_choice, check_positive
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Whitening, uniform_proposal
-from deimos.learn.rollout import Rollout
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 from deimos.nn.adam import Adam
-from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp, operations, weights_of
+from deimos.nn.fusion import fused_scores
+from deimos.nn.networks import Activation, Backprop, ManyCandidates, Whitening, flatten_parameters, mlp
 from deimos.nn.ranks import mean_over_ranks
-from deimos.nn.seeds import generator, restore, weights_from
+from deimos.nn.seeds import generator
 
 CLIP = 5.0  # bound of whitened inputs, as in the paper
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """The goal whose (state, goal in force, next goal) a trained network predicts a frozen random one worst on."""
+    """The goal whose (state, active goal, next goal) a trained network predicts a frozen random one worst on."""
 
     rule: Literal["argmax", "proportional"] = "argmax"
     """Take the most surprising candidate, or draw in proportion to the surprise."""
@@ -62,28 +62,35 @@ class Config(SelectorConfig):
 class RND(GoalSelector):
     """See ``Config``. Until inputs have been seen, and so can be whitened, it is uniform."""
 
+    saved = (
+        "predictor", "target", "optimizer", "generator", "_uniform", "_moments", "_mean", "_scale", "_learnt_at",
+        "fitted",
+    )  # fmt: skip
+
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
         inputs = spaces.state_dim + 2 * spaces.goal_dim
-        with weights_from(seed, "rnd weights"):
-            self.target = mlp(inputs, (config.target,), config.features, config.activation)
-            self.predictor = mlp(inputs, (config.predictor,), config.features, config.activation)
-            for layer in (*self.target, *self.predictor):
-                if isinstance(layer, nn.Linear):
-                    nn.init.orthogonal_(layer.weight, 2**0.5)
-            # The difference of two networks of one hidden layer is one such network, at half of the calls.
-            units = (config.target + config.predictor,)
-            self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
+        weights = generator(seed, "rnd weights")
+        self.target, self.predictor = (
+            mlp(inputs, (units,), config.features, config.activation, weights)
+            for units in (config.target, config.predictor)
+        )
+        for layer in (*self.target, *self.predictor):
+            if isinstance(layer, nn.Linear):
+                nn.init.orthogonal_(layer.weight, 2**0.5, generator=weights)
         self.target.to(spaces.device)
         self.predictor.to(spaces.device)
+        # The difference of two networks of one hidden layer is one such network, at half of the calls.
+        units = (config.target + config.predictor,)
+        self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
         self._parameters, _ = flatten_parameters(self.predictor)
         self._join()
         self._error = ManyCandidates(self._difference, spaces.goal_dim)
         self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
         self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=spaces.device))
         self.generator = generator(seed, "rnd minibatches", spaces.device)
-        # Inputs are whitened by the moments of states, goals in force and *uniform* candidates; those of the
+        # Inputs are whitened by the moments of states, active goals and *uniform* candidates; those of the
         # chosen goals would drift with what is chosen.
         self._uniform = torch.full((spaces.num_envs, spaces.goal_dim), torch.nan, device=spaces.device)
         self._moments = torch.zeros(3, inputs, dtype=torch.float64, device=spaces.device)  # count, sum, of squares
@@ -91,7 +98,7 @@ class RND(GoalSelector):
         self._context = slice(0, inputs - spaces.goal_dim)
         self._goal = slice(inputs - spaces.goal_dim, inputs)
         whitening = Whitening(self._mean[self._goal], self._scale[self._goal], CLIP)
-        self._fused = spaces.fuse(self._difference, spaces.goal_dim, whitening=whitening) if spaces.fuse else None
+        self._fused = fused_scores(self._difference, spaces.goal_dim, whitening=whitening)
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
         """Whether it has seen anything yet; before, nothing can be whitened."""
@@ -110,12 +117,7 @@ class RND(GoalSelector):
         context = self._whiten(torch.cat([state, goal], dim=1), self._context)
         if self._fused is not None:
             return self._fused(context, candidates)
-        scores = []
-        # Features of all candidates together would not fit a cache; fresh memory for them costs more than the products.
-        size = self._error.contexts_at_once(candidates.shape[1])
-        for known, part in zip(context.split(size), candidates.split(size), strict=True):
-            scores.append(self._error(known, self._whiten(part, self._goal)).square_().mean(2))
-        return scores[0] if len(scores) == 1 else torch.cat(scores)
+        return self._error(context, self._whiten(candidates, self._goal)).square_().mean(2)
 
     @torch.no_grad()
     def _join(self) -> None:
@@ -133,7 +135,7 @@ class RND(GoalSelector):
         return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-CLIP, CLIP)
 
     @torch.no_grad()
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Whiten by, and learn from, what was issued since the last time; no outcome is needed."""
         env, state, goal, next_goal = interactions.issued(self._learnt_at)
         self._learnt_at = interactions.now
@@ -179,38 +181,12 @@ class RND(GoalSelector):
         self._join()
         return (total / (len(inputs) * self.config.features)).item()
 
-    def operations(self, decisions: float, transitions: int) -> float:
-        """See ``GoalSelector.operations``."""
-        score = self._error.operations(decisions, self.num_candidates)
-        return score + decisions * (operations(self.target) + 3 * operations(self.predictor)) * self.config.epochs
-
     def check(self) -> None:
         """See ``GoalSelector.check``."""
         if not bool(self._parameters.isfinite().all()):
             raise SimulationError("A weight of the RND predictor is not finite after a fit.")
 
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return {
-            "predictor": weights_of(self.predictor),
-            "target": weights_of(self.target),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            "uniform": self._uniform.clone(),
-            "moments": self._moments.clone(),
-            "mean": self._mean.clone(),
-            "scale": self._scale.clone(),
-            "learnt_at": self._learnt_at,
-            "fitted": self.fitted,
-        }
-
     def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.predictor.load_state_dict(state["predictor"])
-        self.target.load_state_dict(state["target"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        restore(self.generator, state["generator"])
-        for name in ("uniform", "moments", "mean", "scale"):
-            getattr(self, f"_{name}").copy_(state[name])
-        self._learnt_at, self.fitted = state["learnt_at"], state["fitted"]
+        """See ``Stateful.load_state_dict``."""
+        super().load_state_dict(state)
         self._join()

@@ -1,12 +1,15 @@
 """One method first, another later (thesis: VDS, then Director p75 from half of the training on)."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+
+from torch import Tensor
 
 from deimos.checks import SimulationError
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import Critic, Delegate, GoalSelector, SelectorConfig, Spaces
-from deimos.learn.rollout import Rollout
+from deimos.goals.methods import method
+from deimos.goals.selector import Delegate, GoalSelector, SelectorConfig, Spaces, Transitions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +29,6 @@ class Config(SelectorConfig):
     """Share of the training after which it switches, in (0, 1)."""
 
     def __post_init__(self) -> None:
-        from deimos.goals.methods import method
-
         for name in (self.first, self.second):
             method(name)
         if not 0.0 < self.at < 1.0:
@@ -41,9 +42,10 @@ class Config(SelectorConfig):
 class Schedule(Delegate):
     """See ``Config``."""
 
-    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
-        from deimos.goals.methods import method
+    # A run that goes on with a larger budget keeps the schedule that it began with.
+    saved = ("parts", "switched", "_switch", "_keys")
 
+    def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.parts = tuple(method(name).build(spaces, seed) for name in (config.first, config.second))
         self._switch = config.at * spaces.require_total_steps("schedule")
@@ -56,16 +58,16 @@ class Schedule(Delegate):
         """See ``Delegate.current``."""
         return self.parts[self.switched]
 
-    def critic(self) -> Critic | None:
+    def critic(self) -> Callable[[Tensor], Tensor] | None:
         """See ``GoalSelector.critic``."""
         # The baseline stays with whoever has it: the learner's own has learnt nothing meanwhile.
         return self.current.critic() or self.parts[0].critic()
 
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``GoalSelector.learn``."""
         row = {"schedule/switched": float(self.switched)}
         first, second = self.parts
-        # The scores at issue are those of whoever chose: the other one must not judge itself by them.
+        # The scores at issue are those of whoever chose: the other one must not be evaluated by them.
         of_first, of_second = interactions, interactions.without_scores()
         if self.switched:
             of_first, of_second = of_second, of_first
@@ -86,15 +88,3 @@ class Schedule(Delegate):
                 part.check()
             except SimulationError as error:
                 raise SimulationError(f"{name}: {error}") from error
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        parts = [part.state_dict() for part in self.parts]
-        return {"parts": parts, "switched": self.switched, "switch": self._switch, "keys": self._keys}
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        for part, saved in zip(self.parts, state["parts"], strict=True):
-            part.load_state_dict(saved)
-        # A run that goes on with a larger budget keeps the schedule that it began with.
-        self.switched, self._switch, self._keys = state["switched"], state["switch"], state["keys"]

@@ -4,6 +4,7 @@ Where critics that saw the same task disagree about a goal, there is something t
 its own, bootstrapped from its own values: regressed on one shared target they would soon agree.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,15 +14,14 @@ from torch import Tensor
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import Critic, GoalSelector, Proposal, SelectorConfig, Spaces
-from deimos.learn.ppo import advantages
-from deimos.learn.rollout import Rollout
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions
 from deimos.nn.adam import Adam
 from deimos.nn.ensemble import Stack, deviation
 from deimos.nn.matmul import on_threads
-from deimos.nn.networks import Activation, mlp, operations
+from deimos.nn.networks import Activation, mlp
 from deimos.nn.ranks import mean_over_ranks
-from deimos.nn.seeds import generator, restore, weights_from
+from deimos.nn.returns import advantages
+from deimos.nn.seeds import generator
 
 WORKSPACE = 2**24  # numbers that the inputs of the candidates of decisions made at once may take
 
@@ -90,17 +90,18 @@ class VDS(GoalSelector):
     """See ``Config``."""
 
     needs_rollout = True
+    saved = ("_parameters", "optimizer", "generator")
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config, self._spaces = config, spaces
         self.num_candidates = config.candidates
         inputs, device = spaces.state_dim + spaces.goal_dim, spaces.device
-        nets = []
-        for k in range(config.critics):
-            with weights_from(seed, f"vds critic {k}"):
-                nets.append(mlp(inputs, config.hidden, 1, config.activation).to(device))
-        self.stack = Stack(nets, spaces.fuse_critics)
-        self.optimizer = Adam(self.stack.parameters, torch.tensor(config.learning_rate, device=device))
+        streams = (generator(seed, f"vds critic {k}") for k in range(config.critics))
+        self.stack = Stack([
+            mlp(inputs, config.hidden, 1, config.activation, weights).to(device) for weights in streams
+        ])  # fmt: skip
+        self._parameters = self.stack.parameters
+        self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
         self.generator = generator(seed, "vds minibatches", device)
         self._known: tuple[Tensor, Tensor] | None = None  # a whole rollout's observations and their values
 
@@ -116,9 +117,9 @@ class VDS(GoalSelector):
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
 
-    def critic(self) -> Critic | None:
+    def critic(self) -> Callable[[Tensor], Tensor] | None:
         """See ``GoalSelector.critic``."""
-        return self if self.config.role == "replace" else None
+        return self.value if self.config.role == "replace" else None
 
     def value(self, obs: Tensor) -> Tensor:
         """Mean value over the ensemble, shape (...,), of observations of shape (..., obs_dim)."""
@@ -133,7 +134,7 @@ class VDS(GoalSelector):
         return self.stack.values(inputs).view(len(self.stack.nets), *obs.shape[:-1])
 
     @torch.no_grad()
-    def learn(self, interactions: Interactions, rollout: Rollout | None) -> dict[str, float]:
+    def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Move every critic towards the lambda-returns that it sees itself."""
         if rollout is None:
             raise ValueError("vds learns values, so it needs the learner's rollout, got None.")
@@ -152,41 +153,37 @@ class VDS(GoalSelector):
         size = num_envs // count  # what does not divide evenly is left out, another part every time
         return torch.randperm(num_envs, generator=self.generator, device=device)[: count * size].view(count, size)
 
-    def _targets(self, rollout: Rollout, worlds: Tensor) -> tuple[Tensor, Tensor]:
+    def _targets(self, rollout: Transitions, worlds: Tensor) -> tuple[Tensor, Tensor]:
         """Values before the update and lambda-returns, shape (K, num_steps, worlds of each)."""
         shared = self.config.data == "all"
         if shared and self._known is not None and self._known[0] is rollout.obs:
-            value = self._known[1]
+            value = self._known[1]  # the learner has asked for them
         elif shared:
             value = self.values(rollout.obs)
         else:
             value = self._own_values(rollout.obs, worlds)
-        next_value = value[:, 1:]
-        if len(rollout.final_obs):
-            step, world = rollout.truncated.nonzero(as_tuple=True)
-            final = torch.zeros(len(worlds), *rollout.truncated.shape, device=value.device)
-            final[:, step, world] = self.values(rollout.final_obs[step, world])
-            own = final.gather(2, worlds.unsqueeze(1).expand(-1, rollout.num_steps, -1))
-            next_value = torch.where(_of_worlds(rollout.truncated, worlds), own, next_value)
-        old = value[:, :-1]
-
-        def along_time(tensor: Tensor) -> Tensor:  # (K, num_steps, m) -> (num_steps, K * m)
-            return tensor.transpose(0, 1).flatten(1)
-
+        old, next_value = value.transpose(0, 1)[:-1], value.transpose(0, 1)[1:]  # (num_steps, K, worlds of each)
+        reward, terminated, truncated = (
+            tensor[:, worlds] for tensor in (rollout.reward, rollout.terminated, rollout.truncated)
+        )
+        step, world, obs = rollout.cut_off()
+        if len(step):
+            final = torch.zeros(*rollout.truncated.shape, len(worlds), device=value.device)
+            final[step, world] = self.values(obs).t()
+            member = torch.arange(len(worlds), device=value.device).unsqueeze(1)
+            next_value = torch.where(truncated, final[:, worlds, member], next_value)
         advantage = advantages(
-            along_time(_of_worlds(rollout.reward, worlds)) * rollout.reward_scale, along_time(old),
-            along_time(next_value), along_time(_of_worlds(rollout.terminated, worlds)),
-            along_time(_of_worlds(rollout.truncated, worlds)),
+            reward * rollout.reward_scale, old, next_value, terminated, truncated,
             discount=rollout.discount, gae_lambda=rollout.gae_lambda,
         )  # fmt: skip
-        return old, advantage.view(rollout.num_steps, len(worlds), -1).transpose(0, 1) + old
+        return old.transpose(0, 1), (advantage + old).transpose(0, 1)
 
     def _own_values(self, obs: Tensor, worlds: Tensor) -> Tensor:
         """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
         own = self._spaces.state_then_goal(obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds of each, inputs)
         return self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
 
-    def _fit(self, rollout: Rollout, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
+    def _fit(self, rollout: Transitions, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
         """Adam on the clipped value loss; returns its mean over critics and minibatches.
 
         As PPO, it learns nothing, and gives NaN, where fewer transitions count than a minibatch has.
@@ -201,48 +198,23 @@ class VDS(GoalSelector):
         if bool(mean_over_ranks(weight.sum(1).min()) < size):
             return float("nan")
         obs = self._spaces.state_then_goal(rollout.obs[:-1]).flatten(0, 1)
-        lesson = self.stack.gradients(
+        update = self.stack.gradients(
             obs.index_select(0, place.flatten()).view(*order.shape, -1), old.flatten(1).gather(1, order),
             returns.flatten(1).gather(1, order), weight, self.config.clip,
         )  # fmt: skip
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
-        # A thread of torch's that has had work goes on waiting for more, and would take the processor from the lessons.
+        # A thread of torch's that has had work goes on waiting for more, and would take the processor from the updates.
         with on_threads(1):
             for _ in range(self.config.epochs):
                 for start in range(0, minibatches * size, size):
-                    losses += lesson(range(start, start + size))
+                    losses += update(range(start, start + size))
                     mean_over_ranks(self.stack.parameters.grad)
                     self.stack.clip_gradients(self.config.max_grad_norm)
                     self.optimizer.step()
         return losses.mean().item() / (self.config.epochs * minibatches)
 
-    def operations(self, decisions: float, transitions: int) -> float:
-        """See ``GoalSelector.operations``."""
-        rows = transitions * (self.config.critics if self.config.data == "all" else 1)
-        learning = rows * operations(self.stack.nets[0]) * (1 + 3 * self.config.epochs)  # values, then the passes
-        return learning + decisions * self.num_candidates * self.config.critics * operations(self.stack.nets[0])
-
     def check(self) -> None:
         """See ``GoalSelector.check``."""
-        if not bool(self.stack.parameters.isfinite().all()):
+        if not bool(self._parameters.isfinite().all()):
             raise SimulationError("A weight of the VDS ensemble is not finite after a fit.")
-
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return {
-            "parameters": self.stack.parameters.detach().clone(),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.stack.parameters.data.copy_(state["parameters"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        restore(self.generator, state["generator"])
-
-
-def _of_worlds(tensor: Tensor, worlds: Tensor) -> Tensor:
-    """The columns of ``tensor``, shape (steps, num_envs), that each critic has, shape (K, steps, worlds of each)."""
-    return tensor[:, worlds].transpose(0, 1)

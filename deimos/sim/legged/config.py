@@ -5,12 +5,14 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from deimos import terrain
+from deimos import plugins, terrain
 from deimos.checks import check_at_least, check_choice, check_positive, check_range
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import LevelRule
 from deimos.sim.env import EnvConfig
+from deimos.sim.legged import robots
 from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
+from deimos.sim.legged.robots import Robot
 from deimos.terrain import Terrain
 
 
@@ -18,15 +20,17 @@ from deimos.terrain import Terrain
 class LocomotionConfig(EnvConfig):
     """A legged robot on a terrain. Defaults are Legged Gym's but for those that say otherwise."""
 
+    robot: str = "go1"
+    """Who walks, a name of ``deimos.sim.legged.robots``."""
     terrain: str = "flat"
     """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a saved terrain."""
     goal_period: int = 500
-    """T: steps that a goal is in force, at least 1 and at most an episode."""
+    """T: steps that a goal is active, at least 1 and at most an episode."""
     episode_steps: int = 1000
     """Steps after which an episode is truncated, at least 1."""
     levels: Literal["reward", "displacement", "frozen"] = "reward"
-    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far it got (Legged
-    Gym), or nothing."""
+    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far its goals led it
+    beside how far they should have (an arc where they ask for yaw; less than 0.3 m does not count), or nothing."""
     start_levels: int = 6
     """Levels that first episodes are drawn from, at least 1."""
     rewards: RewardWeights = field(default_factory=RewardWeights)
@@ -46,12 +50,12 @@ class LocomotionConfig(EnvConfig):
     """Whether observations are noisy."""
     stagger: bool = True
     """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
-    stiffness: float = 30.0
-    """Position gain of the legs' joints [N m/rad], positive. Legged Gym's A1, a lighter robot, has 20."""
-    damping: float = 0.8
-    """Velocity gain of the legs' joints [N m s/rad], positive. Legged Gym's A1 has 0.5."""
-    action_scale: float = 0.25
-    """What an action of one adds to a target angle [rad], positive."""
+    stiffness: float | None = None
+    """Position gain of the legs' joints [N m/rad], positive; by default the robot's own."""
+    damping: float | None = None
+    """Velocity gain of the legs' joints [N m s/rad], positive; by default the robot's own."""
+    action_scale: float | None = None
+    """What an action of one adds to a target angle of the legs [rad], positive; by default the robot's own."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     """The simulator's settings."""
 
@@ -63,9 +67,10 @@ class LocomotionConfig(EnvConfig):
             raise ValueError(
                 f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
             )
+        check_choice("robot", self.robot, plugins.names(robots))
         check_choice("levels", self.levels, [rule.name.lower() for rule in LevelRule])
-        for name in ("stiffness", "damping", "action_scale"):
-            check_positive(name, getattr(self, name), finite=True)
+        for name, gain in self._gains().items():
+            check_positive(name, gain, finite=True)
         for name in ("air_time_target", "payload", "push_interval", "push_speed"):
             check_range(name, getattr(self, name), 0, 1e6)
         check_weights("rewards", self.rewards)
@@ -84,6 +89,15 @@ class LocomotionConfig(EnvConfig):
         return replace(
             self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
         )
+
+    def make_robot(self) -> Robot:
+        """The robot, in free space."""
+        return plugins.load(robots, self.robot).build(**self._gains())
+
+    def _gains(self) -> dict[str, float]:
+        """The gains that are not the robot's own."""
+        gains = {name: getattr(self, name) for name in ("stiffness", "damping", "action_scale")}
+        return {name: gain for name, gain in gains.items() if gain is not None}
 
     def load_terrain(self) -> Terrain | None:
         """The terrain; ``None`` for flat ground.

@@ -4,43 +4,43 @@ The task is Legged Gym's (Rudin et al. 2021) as Gauthier's thesis uses it (4.1.2
 rise and fall with the reward.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import warp as wp
+from torch import Tensor
 
 from deimos import terrain
-from deimos.kernels.episodes import RESUMED, WORLDS
+from deimos.kernels.legged import state as tables
 from deimos.kernels.legged.height_scan import scan_points
+from deimos.kernels.legged.levels import update_levels
 from deimos.kernels.legged.observation import finish_obs
-from deimos.kernels.legged.reset import reset_worlds, update_levels
+from deimos.kernels.legged.reset import reset_worlds
 from deimos.kernels.legged.rewards import LEG_JOINTS, vec12, vecT
 from deimos.kernels.legged.state import (
     BROKEN,
     COLUMNS,
     HEIGHT_SCALE,
     JOINT_SPEED_SCALE,
-    NUM_FEET,
     RATE_SCALE,
     VELOCITY_SCALE,
-    Ground,
-    Joints,
+    LeggedWorlds,
     LevelRule,
     LocomotionParams,
-    LocomotionState,
-    LocomotionStep,
-    Simulation,
 )
-from deimos.kernels.legged.step import apply_actions, judge_step
+from deimos.kernels.legged.step import apply_actions, evaluate_step
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.sim.env import ObsField
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.engines.mujoco_warp import Captured, Physics
+from deimos.sim.legged.goal_parts import GoalPart
 from deimos.sim.legged.robots import Robot
-from deimos.sim.shared import Shared, warp_device
+from deimos.sim.shared import warp_device
 from deimos.sim.warp_env import WarpEnv
 from deimos.terrain import Terrain
 
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
 SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
 MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
-ACTION_BOUND = 100.0  # Legged Gym's: far beyond what a policy does, so that only nonsense is clipped
 SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
 EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
 NOWHERE = 1e9  # [m]; a plane has no edge
@@ -62,17 +61,13 @@ NOISE = {
 class Locomotion(WarpEnv):
     """A legged robot in many worlds; see ``LocomotionConfig``.
 
-    Actions are differences from the default pose, in units of ``action_scale``.
-
-    What the robot carries has its joints after those of the legs and may add components to the goal, fields to the
-    observation and terms to the reward: set the class's attributes and override ``_judge_carried``,
-    ``_reset_carried`` and ``_finish_candidates``.
+    Actions are differences from the default pose, in units of every joint's ``action_scale``, and clipped to what takes
+    the target angle to an end of the joint's range.
 
     Args:
         config: The task.
         robot: Who does it.
-        goal_range: Half side of the box of goals along every component, [m/s], [m/s], [rad/s] first.
-        goal_scale: What the policy sees goals multiplied by, a number for every component.
+        parts: What its goals are made of; the velocity goal comes first.
         num_envs: Number of worlds.
         device: Where they are simulated.
         seed: Seed of every draw.
@@ -80,52 +75,44 @@ class Locomotion(WarpEnv):
     """
 
     config: LocomotionConfig
-    goal_groups: tuple[slice, ...] = (slice(0, 2), slice(2, 3))
     may_go_on_invalid = True
-    goal_unit = "m/s, m/s, rad/s"
-    """Units of the goal's components."""
-    carried_fields: tuple[ObsField, ...] = ()
-    """What the observation has between the last action and the heights."""
-    noise = NOISE
-    """Half width of the noise of every noisy field of the observation, in its unit."""
-    columns: tuple[str, ...] = COLUMNS
-    """What the reward is the sum of: those of ``deimos.kernels.legged.step``, then the terms of what is carried."""
+    quantities = BROKEN
 
     def __init__(
-        self,
-        config: LocomotionConfig,
-        robot: Robot,
-        goal_range: tuple[float, ...],
-        goal_scale: tuple[float, ...],
-        num_envs: int,
-        device: torch.device,
-        seed: int,
-        env_offset: int = 0,
-    ) -> None:
-        self.robot = robot
-        self.points = scan_points()
+        self, config: LocomotionConfig, robot: Robot, parts: Sequence[GoalPart], num_envs: int, device: torch.device,
+        seed: int, env_offset: int = 0,
+    ) -> None:  # fmt: skip
+        self.robot, self.parts, self.points = robot, tuple(parts), scan_points()
+        ends = accumulate((size for part in parts for size in part.groups), initial=0)
+        self.goal_groups = tuple(slice(start, stop) for start, stop in pairwise(ends))
+        self.columns = (*COLUMNS, *(name for part in parts for name in part.columns))
+        """What the reward is the sum of: the legs' terms, what clipping adds, and the terms of the goal's parts."""
         super().__init__(
-            config, num_envs, device, seed, env_offset, layout=self._make_layout(goal_scale), goal_range=goal_range,
-            action_dim=len(robot.pose), action_bound=ACTION_BOUND,
-            dt=config.physics.timestep * config.physics.substeps, time_limit=config.episode_steps,
+            config, num_envs, device, seed, env_offset,
+            layout=_layout(robot, parts, len(self.points)), goal_range=[half for part in parts for half in part.range],
+            action_dim=len(robot.joints), action_bound=_action_bound(robot), dt=config.physics.control_period,
+            time_limit=config.episode_steps,
         )  # fmt: skip
         ground = config.load_terrain()
         self.terrain = ground or terrain.flat()
-        self._goal_scale, self._mask, self._first_range = (
-            self.worlds.goal_scale, self.worlds.mask, self.worlds.first_range,
-        )  # fmt: skip
-        self._allocate()
         self.physics = self._build_physics(ground)
-        self._params = self._make_params(ground)
-        self._wire()
-        self._capture()
+        self.tensors = self.physics.tensors | self.tensors
+        self.legged = self._join(ground)
+        """All that the kernels work on."""
+        self.term = wp.to_torch(self.legged.out.term)
+        """What the last reward is the sum of, shape (num_envs, len(columns))."""
+        self._launches = [part.bind(self.legged) for part in parts]
+        self.errors = {name: error for part in self._launches for name, error in part.errors.items()}
+        self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=device)
+        self._steps_reported = 0
+        self._begin()
 
     def _build_physics(self, ground: Terrain | None) -> Physics:
         """The simulator, with a friction and a payload for every world unless they are fixed."""
         config, n = self.config, self.num_envs
         self._set_rows(torch.arange(n))
         draw_uniforms(
-            self._row.array, self.state_arrays.episode_count, self._draw.array,
+            self._row.array, self.worlds.episode_count, self._draw.array,
             seed=self._seed, purpose=Purpose.FRICTION, world_offset=self._offset,
         )  # fmt: skip
         u = self._draw.array.numpy().astype(np.float64)
@@ -137,18 +124,50 @@ class Locomotion(WarpEnv):
             payload=config.payload * (2.0 * u[:, 1] - 1.0) if config.payload > 0 else None,
         )  # fmt: skip
 
+    def _join(self, ground: Terrain | None) -> LeggedWorlds:
+        """Join the arrays of worlds, simulator, robot and terrain for the kernels."""
+        land, joints = self.terrain, self.robot.joints
+        sizes = tables.sizes(
+            num_envs=self.num_envs, num_joints=len(joints), substeps=self.config.physics.substeps,
+            num_points=len(self.points), heights=land.heights.shape, tiles=land.origins.shape[:2],
+            goal_dim=self.goal_dim, num_groups=len(self.goal_groups), num_terms=len(self.columns),
+            arm_fields=sum(field.size for part in self.parts for field in part.fields),
+        )  # fmt: skip
+        numbers = {name: size for name, size in sizes.items() if name != "num_envs"}
+        low, high = np.array([joint.range for joint in joints]).T
+        action_low, action_high = np.array([joint.action_range for joint in joints]).T
+        scale, device = [joint.action_scale for joint in joints], warp_device(self.device)
+        simulation = {name: getattr(self.physics, name) for name in tables.SIMULATION.names}
+        return LeggedWorlds(
+            sizes=sizes,
+            params=self._make_params(ground),
+            worlds=self.worlds,
+            joints=tables.build(
+                tables.JOINTS,
+                device,
+                pose=self.robot.pose,
+                action_scale=scale,
+                low=low,
+                high=high,
+                action_low=action_low,
+                action_high=action_high,
+            ),
+            ground=tables.build(tables.GROUND, device, heights=land.heights, origin=land.origins),
+            sensing=tables.build(tables.SENSING, device, noise=_noise(self.layout, self.parts), point=self.points),
+            state=self.allocate(tables.STATE, **numbers),
+            out=self.allocate(tables.STEP, resume=False, **numbers),
+            sim=tables.build(tables.SIMULATION, device, **simulation),
+        )
+
     def _make_params(self, ground: Terrain | None) -> LocomotionParams:
         """What the kernels need to know."""
         config, robot, land = self.config, self.robot, self.terrain
-        limits = self.physics.joint_range[:LEG_JOINTS]
+        limits = np.array([joint.range for joint in robot.joints[:LEG_JOINTS]])
         middle, half = limits.mean(axis=1), SOFT_LIMIT * np.ptp(limits, axis=1) / 2
         corner = np.array(land.corner)
         far = corner + (np.array(land.heights.shape) - 1) * land.cell
-        params = LocomotionParams()
-        values = {
-            "dt": self.dt, "goal_period": config.goal_period, "time_limit": config.episode_steps,
-            "stagger": config.stagger, "seed": self._seed, "world_offset": self._offset,
-            "action_bound": ACTION_BOUND, "noise": config.noise,
+        return tables.make_params(**{
+            "dt": self.dt, "stagger": config.stagger, "noise": config.noise,
             "push_interval": max(1, round(config.push_interval / self.dt)) if config.push_interval else 0,
             "push_speed": config.push_speed,
             "weight": vecT(*asdict(config.rewards).values()), "air_time_target": config.air_time_target,
@@ -160,136 +179,57 @@ class Locomotion(WarpEnv):
             "start_levels": config.start_levels, "cell": land.cell, "corner": wp.vec2(*land.corner),
             "low": wp.vec2(*(corner + EDGE)) if ground else wp.vec2(-NOWHERE),
             "high": wp.vec2(*(far - EDGE)) if ground else wp.vec2(NOWHERE),
-            "half_tile": land.tile / 2,
-        }  # fmt: skip
-        for name in LocomotionParams.vars:
-            setattr(params, name, values[name])
-        return params
+        })  # fmt: skip
 
-    def _make_layout(self, goal_scale: tuple[float, ...]) -> tuple[ObsField, ...]:
-        """Legged Gym's observation, with what is carried before the heights."""
-        joints = len(self.robot.pose)
-        return (
-            ObsField("linear_velocity", 3, "m/s", VELOCITY_SCALE),
-            ObsField("angular_velocity", 3, "rad/s", RATE_SCALE),
-            ObsField("gravity", 3, "1", 1.0),
-            ObsField("goal", len(goal_scale), self.goal_unit, goal_scale),
-            ObsField("joint_position", joints, "rad", 1.0),
-            ObsField("joint_velocity", joints, "rad/s", JOINT_SPEED_SCALE),
-            ObsField("last_action", joints, "1", 1.0),
-            *self.carried_fields,
-            ObsField("heights", len(self.points), "m", HEIGHT_SCALE),
-        )
+    def _begin(self) -> None:
+        """Record step and reset, each as one graph, and begin every world's first episode."""
+        run_step = Captured(self._run_step, self.device)
 
-    def _allocate(self) -> None:
-        n, joints = self.num_envs, self.action_dim
-        self.state_arrays, self.step_arrays = LocomotionState(), LocomotionStep()
-        rows = {"action": joints, "joint_speed": joints, "air_time": NUM_FEET}
-        for name in LocomotionState.vars:
-            if name in RESUMED:
-                setattr(self.state_arrays, name, getattr(self.worlds, name))
-                continue
-            shape = (n, rows[name]) if name in rows else n
-            shared = Shared.zeros(shape, LocomotionState.vars[name].type.dtype, self.device)
-            setattr(self.state_arrays, name, shared.array)
-            self.tensors[name] = shared.tensor
-            self._memory.append(shared.tensor)
-        term = Shared.zeros((n, len(self.columns)), wp.float32, self.device)
-        self._value = Shared.zeros(n, wp.float32, self.device)
-        for name in LocomotionStep.vars:
-            if name in WORLDS.names:
-                setattr(self.step_arrays, name, getattr(self.worlds, name))
-        self.step_arrays.term, self.step_arrays.value = term.array, self._value.array
-        self._memory += (term.tensor, self._value.tensor)
-        self.term = term.tensor
-        """What the last reward is the sum of, shape (num_envs, len(columns))."""
-        self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=self.device)
-        self._steps_reported = 0
+        def step() -> None:
+            run_step()
+            self._sums += self.term.sum(0)
+            self._steps_reported += 1
 
-    def _wire(self) -> None:
-        """Join the simulator's arrays and the robot's numbers to the kernels."""
-        name, robot, physics, land = warp_device(self.device), self.robot, self.physics, self.terrain
-        self.tensors = physics.tensors | self.tensors
-        self._joints, self._ground, self._sim = Joints(), Ground(), Simulation()
-        low, high = physics.joint_range.T
-        for key, value in (("pose", robot.pose), ("action_scale", robot.action_scale), ("low", low), ("high", high)):
-            setattr(self._joints, key, wp.array(np.asarray(value, np.float32), dtype=wp.float32, device=name))
-        self._ground.heights = wp.array(land.heights, dtype=wp.float32, device=name)
-        self._ground.origin = wp.array(land.origins, dtype=wp.vec3, device=name)
-        for key in Simulation.vars:
-            setattr(self._sim, key, getattr(physics, key))
-        self._points = wp.array(self.points, dtype=wp.vec2, device=name)
-        noise = [
-            self.noise.get(entry.name, 0.0) * scale
-            for entry in self.layout
-            for scale in np.broadcast_to(entry.scale, entry.size)
-        ]
-        self._noise = wp.array(noise, dtype=wp.float32, device=name)
-
-    def _capture(self) -> None:
-        """Record the step and the reset, each as one graph, and begin the first episodes."""
-        self._step_graph = Captured(self._run_step, self.device)
-        self.begin(self._count_step, Captured(self._run_reset, self.device), valid_goals=self._record_valid_goals())
+        validate = next((part.validate for part in self._launches if part.validate), None)
+        valid_goals = partial(validate, self._row.array, self._candidate_scale.array) if validate else None
+        self.begin(step, Captured(self._run_reset, self.device), valid_goals=valid_goals)
         self.physics.buffer_use()  # what the recording needed says nothing about these worlds
 
-    def _record_valid_goals(self) -> Callable[[wp.array], wp.Launch] | None:
-        """What makes valid goals of candidates; ``None`` where all are."""
-        return None
-
     def _run_step(self) -> None:
-        params, state, out, sim = self._params, self.state_arrays, self.step_arrays, self._sim
-        apply_actions(params, self._joints, self.worlds.action, state, sim, out.fault)
+        apply_actions(self.legged)
         self.physics.step()
-        self._judge_carried()
-        judge_step(params, self._joints, self.worlds.action, self._goal_scale, sim, state, out)
-        self._run_scan(out.invalid, wanted=False)
-
-    def _run_scan(self, mask: wp.array, *, wanted: bool) -> None:
-        finish_obs(
-            self._params, mask, self._ground.heights, self._points, self._noise, self._sim.qpos, self.state_arrays,
-            self.step_arrays.obs, wanted=wanted,
-        )  # fmt: skip
+        for part in self._launches:
+            part.evaluate()
+        evaluate_step(self.legged)
+        finish_obs(self.legged, self.worlds.invalid, wanted=False)
 
     def _run_reset(self) -> None:
-        params, state, out, sim, mask = (
-            self._params, self.state_arrays, self.step_arrays, self._sim, self._mask,
-        )  # fmt: skip
-        update_levels(
-            params, self._ground.origin, mask, out.terminated, out.truncated, out.invalid, sim.qpos, state
-        )  # fmt: skip
-        self.physics.reset(mask)
-        reset_worlds(
-            params, self._joints, self._ground, mask, self._first_range, self._goal_scale, state, sim.qpos,
-            sim.qvel, out.obs,
-        )  # fmt: skip
-        self._reset_carried()
-        self._run_scan(mask, wanted=True)
+        update_levels(self.legged)
+        self.physics.reset(self.worlds.mask)
+        reset_worlds(self.legged)
+        for part in self._launches:
+            part.reset()
+        finish_obs(self.legged, self.worlds.mask, wanted=True)
 
-    def _judge_carried(self) -> None:
-        """Launch what judges the robot's burden, before the whole step is judged."""
-
-    def _reset_carried(self) -> None:
-        """Launch what else the worlds of ``_mask`` need to begin an episode."""
-
-    def _count_step(self) -> None:
-        """Simulate one step, and add up what the report says."""
-        self._step_graph()
-        self._sums += self.term.sum(0)
-        self._steps_reported += 1
+    @property
+    def action_range(self) -> tuple[Tensor, Tensor]:
+        """See ``Env.action_range``: what takes the joints' targets to the ends of their ranges."""
+        low, high = torch.tensor([joint.action_range for joint in self.robot.joints]).T
+        return low, high
 
     def describe_fault(self, world: int) -> str:
         """See ``WarpEnv.describe_fault``."""
         cause = BROKEN[int(self._views["cause"][world]).bit_length() - 1]
-        value = float(self._value.tensor[world])
+        value = float(self.legged.out.value.numpy()[world])
         if cause == "contacts":
             return f"it lost contacts ({self.physics.explain_loss(int(value))})"
         unit = " m/s or rad/s" if cause == "speed" else ""
         return f"its {cause} was {value:g}{unit}"
 
     def report(self) -> dict[str, float]:
-        """What a log wants to know since the last call: means of the reward's terms per step, levels, buffers.
+        """What a log wants to know since the last call: means of the reward's terms per step, levels, buffers, errors.
 
-        The terms add up to the mean reward.
+        The terms add up to the mean reward; the errors are means over the worlds at this moment.
         """
         steps, self._steps_reported = max(self._steps_reported, 1), 0
         means = (self._sums / (steps * self.num_envs)).tolist()
@@ -302,6 +242,7 @@ class Locomotion(WarpEnv):
             "invalid_steps": invalid,
             "contact_use": use["contacts"] / use["max_contacts"],
             "row_use": use["rows"] / use["max_rows"],
+            **{_error_name(name): error.mean().item() for name, error in self.errors.items()},
         }
 
     def tiles(self) -> list[tuple[str, int]]:
@@ -317,3 +258,50 @@ class Locomotion(WarpEnv):
     def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData]":
         """See ``Env.scene``."""
         return self.physics.model, self.physics.to_mujoco(world)
+
+    def goal_point(self, world: int) -> np.ndarray | None:
+        """See ``Env.goal_point``."""
+        places = [part.points for part in self._launches if part.points]
+        return places[0]()[world] if places else None
+
+    def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
+        """See ``Env.reference_policy``. Nobody has written down how to walk."""
+        return None
+
+
+def _action_bound(robot: Robot) -> float:
+    """The largest action that any joint can do; those of every joint are in the robot's data."""
+    return max(abs(end) for joint in robot.joints for end in joint.action_range)
+
+
+def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:
+    """Legged Gym's observation, with the fields of the goal's parts before the heights."""
+    joints = len(robot.joints)
+    units = [unit for part in parts for unit in part.units]
+    scale = tuple(scale for part in parts for scale in part.scale)
+    return (
+        ObsField("linear_velocity", 3, "m/s", VELOCITY_SCALE),
+        ObsField("angular_velocity", 3, "rad/s", RATE_SCALE),
+        ObsField("gravity", 3, "1", 1.0),
+        ObsField("goal", len(scale), ", ".join(units), scale),
+        ObsField("joint_position", joints, "rad", 1.0),
+        ObsField("joint_velocity", joints, "rad/s", JOINT_SPEED_SCALE),
+        ObsField("last_action", joints, "1", 1.0),
+        *(field for part in parts for field in part.fields),
+        ObsField("heights", num_points, "m", HEIGHT_SCALE),
+    )
+
+
+def _noise(layout: Sequence[ObsField], parts: Sequence[GoalPart]) -> list[float]:
+    """Half width of the noise of every component of the observation, as the policy sees it."""
+    noise = dict(NOISE)
+    for part in parts:
+        noise |= part.noise
+    return [
+        noise.get(entry.name, 0.0) * scale for entry in layout for scale in np.broadcast_to(entry.scale, entry.size)
+    ]
+
+
+def _error_name(name: str) -> str:
+    """``end effector [m]`` as a column of a log."""
+    return name.partition(" [")[0].replace(" ", "_") + "_error"

@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from deimos.checks import check_at_least, check_positive
-from deimos.kernels.legged.contacts import TERRAIN, UNWATCHED, Contacts, gather_contacts
+from deimos.kernels.legged.contacts import CONTACTS, TERRAIN, UNWATCHED, Contacts, gather_contacts
 from deimos.sim.legged.height_field import add_height_field
 from deimos.sim.legged.robots import CONTACT_STIFFNESS, ROBOT_BIT, TERRAIN_BIT, VISUAL_GROUP, Robot
 from deimos.sim.shared import Shared, warp_device
@@ -43,12 +43,12 @@ class PhysicsConfig:
     line_search: int = 10
     """Bound of its line-search iterations, at least 1."""
     contacts: int = 0
-    """Room for contacts per world, shared by all worlds; 0 takes half of what touching with every geom would need, a
+    """Contact buffer size per world, shared by all worlds; 0 takes half of what touching with every geom would need, a
     quarter on a height field, but one for every pair of geoms that can touch at least, and all of it for 16 worlds
-    more. That is 63 % and 28 % for 512 Go1s."""
+    more. That is 69 % and 28 % for 512 Go1s."""
     rows: int = 0
-    """Room for constraint rows in each world; 0 takes what touching with every geom, all joints at limits, needs, four
-    fifths of it on a height field."""
+    """Buffer size for constraint rows in each world; 0 takes what touching with every geom, all joints at limits,
+    needs, four fifths of it on a height field."""
 
     def __post_init__(self) -> None:
         check_positive("timestep", self.timestep, finite=True)
@@ -56,6 +56,11 @@ class PhysicsConfig:
             check_at_least(name, getattr(self, name), 1)
         for name in ("contacts", "rows"):
             check_at_least(name, getattr(self, name), 0)
+
+    @property
+    def control_period(self) -> float:
+        """Time from one action to the next [s]."""
+        return self.timestep * self.substeps
 
 
 class Physics:
@@ -75,7 +80,7 @@ class Physics:
     """
 
     model: "mujoco.MjModel"
-    """The model with everything that is for the eye, for rendering and viewers."""
+    """The model with its visual geoms, for rendering and viewers."""
     qpos: wp.array
     """Positions, float32, shape (num_envs, nq)."""
     qvel: wp.array
@@ -88,8 +93,6 @@ class Physics:
     """Normal forces between each part of the robot and the terrain, float32, shape (substeps, num_envs, parts)."""
     overflow: wp.array
     """Bits of what ran out since they were last cleared, int32, shape (num_envs,)."""
-    joint_range: np.ndarray
-    """Lowest and highest angle of every joint [rad], shape (nu, 2)."""
     lost_contacts: int
     """The bits of ``overflow`` that mean that a contact or a constraint was left out."""
     tensors: dict[str, torch.Tensor]
@@ -125,7 +128,7 @@ class Physics:
             plain.delete(geom)
         model = plain.compile()
 
-        self.max_contacts, self.max_rows = _room(model, num_envs, config, plane=terrain is None)
+        self.max_contacts, self.max_rows = _buffer_sizes(model, num_envs, config, plane=terrain is None)
         batched: dict[str, int] = {}
         if friction is not None:
             batched |= {"geom_friction": num_envs}
@@ -143,7 +146,6 @@ class Physics:
         data = self._data
         self.qpos, self.qvel, self.ctrl, self.torque = data.qpos, data.qvel, data.ctrl, data.actuator_force
         self.overflow = data.overflow
-        self.joint_range = model.jnt_range[1:].copy()
         bits = mjw.OverflowType
         self.lost_contacts = int(
             bits.NEFC | bits.NJMAX_NNZ | bits.BROADPHASE | bits.NARROWPHASE | bits.CCD | bits.HFIELD | bits.EPA_HORIZON
@@ -182,15 +184,20 @@ class Physics:
         for index, names in enumerate(robot.parts):
             for name in names:
                 part[model.geom(name).id] = index
-        data, name = self._data, warp_device(self.device)
-        self._geom_part = wp.array(part, dtype=wp.int32, device=name)
+        data, device = self._data, warp_device(self.device)
         shape = (self.config.substeps, self.num_envs, len(robot.parts))
-        self.part_force = wp.zeros(shape, dtype=wp.float32, device=name)
+        self.part_force = wp.zeros(shape, dtype=wp.float32, device=device)
         self._peak = Shared.zeros(2, wp.int32, self.device)
         contacts = Contacts()
         contacts.count = data.nacon
         contacts.world, contacts.geom, contacts.dim = data.contact.worldid, data.contact.geom, data.contact.dim
         contacts.row, contacts.force = data.contact.efc_address, data.efc.force
+        contacts.geom_part = wp.array(part, dtype=wp.int32, device=device)
+        contacts.part_force, contacts.peak = self.part_force, self._peak.array
+        CONTACTS.require(
+            "contacts", contacts, self.part_force, num_envs=self.num_envs, num_geoms=model.ngeom, substeps=shape[0],
+            parts=shape[2], buffer=self.max_contacts, edges=contacts.row.shape[1], rows=contacts.force.shape[1],
+        )  # fmt: skip
         self._contacts = contacts
 
     def step(self) -> None:
@@ -202,7 +209,7 @@ class Physics:
             self.part_force.zero_()
             for substep in range(self.config.substeps):
                 self._mjw.step(self._model, self._data)
-                gather_contacts(self._contacts, self._geom_part, self.part_force, self._peak.array, substep=substep)
+                gather_contacts(self._contacts, substep=substep)
 
     def bare_step(self) -> None:
         """Launch the substeps of one control step and nothing else: the yardstick of benchmarks."""
@@ -230,8 +237,8 @@ class Physics:
     def explain_loss(self, bits: int) -> str:
         """Why contacts were lost, by the bits of ``overflow``, and what helps; reads the device."""
         bit, use = self._mjw.OverflowType, self.buffer_use()
-        rows = f"up to {use['rows']} constraint rows in a world were needed, with room for {use['max_rows']}"
-        contacts = f"up to {use['contacts']} contacts in all worlds were needed, with room for {use['max_contacts']}"
+        rows = f"up to {use['rows']} constraint rows in a world were needed, the buffer holds {use['max_rows']}"
+        contacts = f"up to {use['contacts']} contacts in all worlds were needed, the buffer holds {use['max_contacts']}"
         reasons = {
             bit.NEFC | bit.NJMAX_NNZ: f"{rows}; raise physics.rows",
             bit.BROADPHASE | bit.NARROWPHASE | bit.CCD: f"{contacts}; raise physics.contacts",
@@ -310,12 +317,12 @@ def _dress(spec: "mujoco.MjSpec", ground: "mujoco.MjsGeom") -> None:
     ground.material = "ground"
 
 
-def _room(model: "mujoco.MjModel", num_envs: int, config: PhysicsConfig, *, plane: bool) -> tuple[int, int]:
-    """Room for contacts in all worlds, and for constraint rows in each.
+def _buffer_sizes(model: "mujoco.MjModel", num_envs: int, config: PhysicsConfig, *, plane: bool) -> tuple[int, int]:
+    """Buffer sizes: contacts in all worlds, and constraint rows in each.
 
-    Room costs time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 120 rows
-    a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown about by their
-    own legs 93.
+    Buffers cost time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 136
+    rows a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown about by
+    their own legs 93.
     """
     contacts, pairs, rows = _largest_demand(model, plane=plane)
     contact_share, row_share = (1 / 2, 1.0) if plane else (1 / 4, 4 / 5)

@@ -1,4 +1,7 @@
-"""Robots, built in code from published numbers: one file, one robot or one part that can be mounted on one."""
+"""Legged robots, built in code from published numbers: one file, one robot, which ``--env.robot`` finds by its name.
+
+A robot's file holds ``build(*, stiffness, damping, action_scale) -> Robot``, three numbers that all have defaults.
+"""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -9,28 +12,66 @@ if TYPE_CHECKING:
 # Time constant [s] and damping ratio of contacts (solref); mjlab's. With MuJoCo's 0.02 s the centre of a landing foot
 # gets below the surface of a height field, where float32 sometimes finds a depth of metres.
 CONTACT_STIFFNESS = (0.01, 1.0)
-VISUAL_GROUP = 2  # geoms of this group are for the eye alone: the simulation leaves them out
+VISUAL_GROUP = 2  # geoms of this group are visual: the simulation leaves them out
 COLLISION_GROUP = 3  # MuJoCo's viewers hide this group by default
-TERRAIN_BIT, ROBOT_BIT = (
-    1,
-    2,
-)  # contype and conaffinity: robots touch the terrain, and of themselves only what asks for it
+TERRAIN_BIT, ROBOT_BIT = 1, 2  # contype and conaffinity: robots touch the terrain, and of themselves what asks for it
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joint:
+    """A hinge and its position actuator, of the same name."""
+
+    name: str
+    pose: float
+    """Angle at an action of zero [rad]."""
+    action_scale: float
+    """What an action of one adds to the target angle [rad]."""
+    range: tuple[float, float]
+    """Lowest and highest angle [rad]."""
+    stiffness: float
+    """Position gain [N m/rad]."""
+    damping: float
+    """Velocity gain [N m s/rad]."""
+    max_torque: float
+    """[N m]."""
+
+    @property
+    def action_range(self) -> tuple[float, float]:
+        """The actions that take the target angle to the ends of the range; beyond them actions are clipped."""
+        low, high = self.range
+        return (low - self.pose) / self.action_scale, (high - self.pose) / self.action_scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arm:
+    """An arm on the base, for goals of its end effector."""
+
+    offsets: tuple[Vector, ...]
+    """Place of every joint, then of the end effector, in the frame before it [m]; the first is in the base."""
+    axes: tuple[Vector, ...]
+    """Axis of every joint, in its frame."""
+    shoulder: Vector
+    """What goals are relative to, in the base [m]."""
+    body: tuple[Vector, Vector]
+    """Corners of the box in the base that goals keep out of [m]."""
+    radius: float
+    """How far goals stay away from that box and from the ground [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """A robot with a floating base, and what a task has to know about it.
+    """A robot with a floating base, and what a task and a deployment have to know about it.
 
     The first twelve joints are those of the four legs, leg by leg in the order front left, front
-    right, rear left, rear right, each hip, thigh, calf; a mounted arm adds its joints after them.
+    right, rear left, rear right, each hip, thigh, calf; an arm adds its joints after them.
     """
 
     spec: "mujoco.MjSpec"
-    """The model: one free joint, then one hinge and one position actuator for every joint."""
-    pose: tuple[float, ...]
-    """Angle of every joint at an action of zero [rad]."""
-    action_scale: tuple[float, ...]
-    """What an action of one adds to the target angle of every joint [rad]."""
+    """The model: one free joint, then the joints, each with its actuator."""
+    joints: tuple[Joint, ...]
+    """The joints, in the model's order."""
     parts: tuple[tuple[str, ...], ...]
     """Names of the geoms whose contacts with the terrain are watched: those of the base (touching the
     ground with them is a crash), of each foot, and of each limb that should not touch anything."""
@@ -41,3 +82,10 @@ class Robot:
     a reset, no foot is in the ground."""
     reach: float
     """Largest horizontal distance of a foot from the base's origin at a reset [m]."""
+    arm: Arm | None = None
+    """Its arm, if it has one."""
+
+    @property
+    def pose(self) -> tuple[float, ...]:
+        """Angle of every joint at an action of zero [rad]."""
+        return tuple(joint.pose for joint in self.joints)

@@ -8,14 +8,18 @@ Where the numbers come from:
 * Collision: the feet's radius is Menagerie's and the limbs' capsules are thickened from its own. The
   trunk is two capsules that fill mjlab's box of (0.26, 0.18, 0.1) m: mujoco-warp keeps at most 50 contacts of a
   geom with the prisms of a height field, and on cells of 0.05 m a box, or longer capsules, have more.
+* The hips are balls of mjlab's radius, where they stick out of the trunk: a Go1 that lies on its side touches the
+  ground with them. They are watched as parts of the base, since the thesis counts "any part of the robot's base"
+  as a crash and a hip holds the trunk's motors; without them a robot on its side rested on thighs and calves and
+  went on.
 * Gains: those of the Unitree A1 in Legged Gym (20 N m/rad, 0.5 N m s/rad) raised by half, since a Go1
   is heavier; the default pose is the A1's, with the rear thighs as the front ones so that it stands level.
 """
 
 from typing import TYPE_CHECKING
 
-from deimos.sim.legged.robots import ROBOT_BIT, TERRAIN_BIT, Robot
-from deimos.sim.legged.robots.primitives import add_actuator, add_hard_geom, add_inertia, add_look
+from deimos.sim.legged.robots import ROBOT_BIT, TERRAIN_BIT, Joint, Robot
+from deimos.sim.legged.robots._primitives import add_actuators, add_collision, add_inertia, add_visual
 
 if TYPE_CHECKING:
     import mujoco
@@ -28,6 +32,7 @@ HIP_X, HIP_Y = 0.1881, 0.04675  # [m], in the trunk
 THIGH_Y = 0.08  # [m], in the hip
 LINK = 0.213  # [m], length of thigh and of calf
 FOOT_RADIUS = 0.023  # [m]
+HIP_RADIUS = 0.05  # [m], mjlab's
 
 # Each is mass [kg], centre of mass [m], inertia about it (xx, yy, zz, xy, xz, yz) [kg m^2].
 TRUNK = (5.204, (0.0223, 0.002, -0.0005), (0.0168128, 0.0630095, 0.0716547, -2.297e-4, -2.946e-4, -4.19e-5))
@@ -48,6 +53,7 @@ POSE = {"hip": 0.1, "thigh": 0.8, "calf": -1.5}  # [rad]; the hip outward
 STIFFNESS, DAMPING = 30.0, 0.8  # [N m/rad], [N m s/rad]
 ACTION_SCALE = 0.25  # [rad]; Legged Gym's A1
 
+ALONG_Y = (0.70711, 0.70711, 0.0, 0.0)  # the orientation of a cylinder
 DARK, LIGHT, BLUE = (0.13, 0.14, 0.16, 1.0), (0.78, 0.8, 0.83, 1.0), (0.1, 0.45, 0.85, 1.0)
 
 
@@ -61,6 +67,19 @@ def build(*, stiffness: float = STIFFNESS, damping: float = DAMPING, action_scal
     """
     import mujoco
 
+    joints = tuple(
+        Joint(
+            name=f"{leg}_{joint}",
+            pose=(_left(leg) if joint == "hip" else 1) * POSE[joint],
+            range=RANGE[joint],
+            action_scale=action_scale,
+            stiffness=stiffness,
+            damping=damping,
+            max_torque=MAX_TORQUE[joint],
+        )
+        for leg in LEGS
+        for joint in JOINTS
+    )
     spec = mujoco.MjSpec()
     spec.modelname = "go1"
     spec.compiler.degree = False
@@ -70,17 +89,12 @@ def build(*, stiffness: float = STIFFNESS, damping: float = DAMPING, action_scal
     _add_trunk_geoms(trunk)
     for leg in LEGS:
         _add_leg(trunk, leg)
-    for leg in LEGS:
-        for joint in JOINTS:
-            add_actuator(
-                spec, f"{leg}_{joint}", stiffness=stiffness, damping=damping, max_torque=MAX_TORQUE[joint]
-            )  # fmt: skip
+    add_actuators(spec, joints)
     return Robot(
         spec=spec,
-        pose=tuple((_left(leg) if joint == "hip" else 1) * POSE[joint] for leg in LEGS for joint in JOINTS),
-        action_scale=(action_scale,) * 12,
+        joints=joints,
         parts=(
-            ("trunk_left", "trunk_right", "head"),
+            ("trunk_left", "trunk_right", "head", *(f"{leg}_hip" for leg in LEGS)),
             *((f"{leg}_foot",) for leg in LEGS),
             *((f"{leg}_{link}",) for leg in LEGS for link in ("thigh", "calf")),
         ),
@@ -118,10 +132,11 @@ def _add_leg(trunk: "mujoco.MjsBody", leg: str) -> None:
     ):
         body.add_joint(name=f"{leg}_{joint}", axis=axis, range=RANGE[joint], limited=True, armature=ARMATURE[joint])
         _add_mirrored(body, numbers, *turned)
+    _collide(hip, f"{leg}_hip", HIP_RADIUS, (0.0, left * 0.053, 0.0))
     _collide(thigh, f"{leg}_thigh", 0.015, (-0.02, 0, -0.02), (-0.01, 0, -0.19))
     _collide(calf, f"{leg}_calf", 0.012, (0.01, 0, -0.03), (0.004, 0, -0.17))
     _collide(calf, f"{leg}_foot", FOOT_RADIUS, (0, 0, -LINK))
-    _add_leg_look(hip, thigh, calf, left)
+    _add_leg_visuals(hip, thigh, calf, left)
 
 
 def _add_trunk_geoms(trunk: "mujoco.MjsBody") -> None:
@@ -130,30 +145,32 @@ def _add_trunk_geoms(trunk: "mujoco.MjsBody") -> None:
         _collide(trunk, name, 0.05, (-0.08, y, 0.0), (0.08, y, 0.0))
     _collide(trunk, "head", 0.06, (0.24, 0.0, 0.0))
 
-    add_look(trunk, "box", (0.185, 0.05, 0.05), (0.0, 0.0, 0.0), LIGHT)
-    add_look(trunk, "box", (0.13, 0.08, 0.035), (0.0, 0.0, 0.005), DARK)
-    add_look(trunk, "box", (0.15, 0.035, 0.012), (-0.01, 0.0, 0.055), DARK)
-    add_look(trunk, "box", (0.045, 0.04, 0.035), (0.225, 0.0, 0.015), LIGHT)
-    add_look(trunk, "ellipsoid", (0.035, 0.048, 0.042), (0.262, 0.0, 0.012), DARK)
-    add_look(trunk, "ellipsoid", (0.006, 0.03, 0.008), (0.295, 0.0, 0.014), BLUE)
+    add_visual(trunk, "box", (0.185, 0.05, 0.05), (0.0, 0.0, 0.0), LIGHT)
+    add_visual(trunk, "box", (0.13, 0.08, 0.035), (0.0, 0.0, 0.005), DARK)
+    add_visual(trunk, "box", (0.15, 0.035, 0.012), (-0.01, 0.0, 0.055), DARK)
+    add_visual(trunk, "box", (0.045, 0.04, 0.035), (0.225, 0.0, 0.015), LIGHT)
+    add_visual(trunk, "ellipsoid", (0.035, 0.048, 0.042), (0.262, 0.0, 0.012), DARK)
+    add_visual(trunk, "ellipsoid", (0.006, 0.03, 0.008), (0.295, 0.0, 0.014), BLUE)
 
 
-def _add_leg_look(hip: "mujoco.MjsBody", thigh: "mujoco.MjsBody", calf: "mujoco.MjsBody", left: int) -> None:
+def _add_leg_visuals(hip: "mujoco.MjsBody", thigh: "mujoco.MjsBody", calf: "mujoco.MjsBody", left: int) -> None:
     """Add what a leg looks like: two motor discs, a tapering thigh, a thin calf and a rubber foot."""
-    add_look(hip, "cylinder", (0.046, 0.03, 0.0), (0.0, 0.0, 0.0), DARK, quat=(0.70711, 0.0, 0.70711, 0.0))
-    add_look(hip, "cylinder", (0.046, 0.02, 0.0), (0.0, left * 0.035, 0.0), LIGHT, quat=(0.70711, 0.70711, 0.0, 0.0))
-    add_look(thigh, "cylinder", (0.045, 0.022, 0.0), (0.0, -left * 0.005, 0.0), DARK, quat=(0.70711, 0.70711, 0.0, 0.0))
-    add_look(thigh, "capsule", (0.026,), (-0.012, 0, -0.02), LIGHT, end=(-0.018, 0, -0.10))
-    add_look(thigh, "capsule", (0.018,), (-0.018, 0, -0.10), LIGHT, end=(0.0, 0, -LINK))
-    add_look(thigh, "cylinder", (0.022, 0.018, 0.0), (0.0, 0.0, -LINK), DARK, quat=(0.70711, 0.70711, 0.0, 0.0))
-    add_look(calf, "capsule", (0.013,), (0.0, 0, 0.0), DARK, end=(0.012, 0, -0.10))
-    add_look(calf, "capsule", (0.011,), (0.012, 0, -0.10), DARK, end=(0.0, 0, -LINK))
-    add_look(calf, "sphere", (FOOT_RADIUS,), (0.0, 0.0, -LINK), (0.05, 0.05, 0.05, 1.0))
+    add_visual(hip, "cylinder", (0.046, 0.03, 0.0), (0.0, 0.0, 0.0), DARK, quat=(0.70711, 0.0, 0.70711, 0.0))
+    add_visual(hip, "cylinder", (0.046, 0.02, 0.0), (0.0, left * 0.035, 0.0), LIGHT, quat=ALONG_Y)
+    add_visual(
+        thigh, "cylinder", (0.045, 0.022, 0.0), (0.0, -left * 0.005, 0.0), DARK, quat=(0.70711, 0.70711, 0.0, 0.0)
+    )
+    add_visual(thigh, "capsule", (0.026,), (-0.012, 0, -0.02), LIGHT, end=(-0.018, 0, -0.10))
+    add_visual(thigh, "capsule", (0.018,), (-0.018, 0, -0.10), LIGHT, end=(0.0, 0, -LINK))
+    add_visual(thigh, "cylinder", (0.022, 0.018, 0.0), (0.0, 0.0, -LINK), DARK, quat=ALONG_Y)
+    add_visual(calf, "capsule", (0.013,), (0.0, 0, 0.0), DARK, end=(0.012, 0, -0.10))
+    add_visual(calf, "capsule", (0.011,), (0.012, 0, -0.10), DARK, end=(0.0, 0, -LINK))
+    add_visual(calf, "sphere", (FOOT_RADIUS,), (0.0, 0.0, -LINK), (0.05, 0.05, 0.05, 1.0))
 
 
 def _collide(body: "mujoco.MjsBody", name: str, radius: float, start: tuple, end: tuple | None = None) -> None:
     """Add a sphere, or a capsule from ``start`` to ``end``, that touches the terrain but not the robot itself."""
-    geom = add_hard_geom(body, name, radius, start, end, contype=ROBOT_BIT, conaffinity=TERRAIN_BIT)
+    geom = add_collision(body, name, radius, start, end, contype=ROBOT_BIT, conaffinity=TERRAIN_BIT)
     if name.endswith("foot"):
         geom.condim = 3
         geom.priority = 1  # so that the foot's own friction counts, not the larger of the two

@@ -1,0 +1,119 @@
+"""``python -m benchmarks WHAT``: everything that is compared is measured in the same run."""
+
+import json
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+import warp as wp
+
+from benchmarks import director, particle, quad, terrain, training
+from benchmarks.timing import wide_console
+from deimos.checks import check_at_least
+from deimos.run.folder import RunError
+from deimos.run.training import TrainConfig, cores, provenance, resolve_device
+from deimos.sim.envs.particle import Config
+from deimos.sim.shared import one_stream
+from reproduction.thesis import TABLE_4_1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions:
+    """Measure speed; everything that is compared is measured in the same run."""
+
+    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain", "director"]]
+    """What to measure."""
+    json: Path | None = None
+    """Write all numbers to this file too."""
+    rounds: int = 7
+    """Rounds that a ratio is the median of, at least 1."""
+    threads: int = 0
+    """CPU threads, at least 0; 0 takes one per core."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to measure; auto takes the GPU where there is one."""
+
+    def __post_init__(self) -> None:
+        check_at_least("rounds", self.rounds, 1)
+        check_at_least("threads", self.threads, 0)
+        if self.json is not None and not self.json.parent.is_dir():
+            raise ValueError(f"json must be in a folder that exists, got {self.json}.")
+
+
+def run(options: BenchOptions) -> dict[str, Any]:
+    """Measure, print a table per subject, and write the JSON file if asked for.
+
+    Raises:
+        RunError: If CUDA is asked for and there is none.
+    """
+    device = resolve_device(options.device)
+    torch.set_num_threads(options.threads or cores())
+    results: dict[str, Any] = {
+        "versions": provenance(), "threads": torch.get_num_threads(), "device": str(device),
+    }  # fmt: skip
+    measure = {"particle": measure_particle, "terrain": measure_terrain, "director": measure_director}
+    with one_stream(device):
+        if options.what in measure:
+            results |= measure[options.what](options.rounds, device)
+        else:
+            results |= measure_legged(options.what.replace("-", "_"), options.rounds, device)
+    if options.json is not None:
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    return results
+
+
+def measure_particle(rounds: int, device: torch.device) -> dict[str, Any]:
+    """The step of Particle Gym, and Table 4.1 of the thesis for its three variants."""
+    results: dict[str, Any] = {"env": [particle.measure_env(n, device, rounds) for n in particle.SIZES]}
+    particle.print_env(results["env"], torch.get_num_threads(), str(device))
+    results["training"] = {}
+    for variant in ("directional", "absolute", "relative"):
+        config = replace(TrainConfig(), env=Config(variant=variant))
+        results["training"][variant] = training.measure_in_groups(
+            config, TABLE_4_1[variant], device, rounds, everything=variant == "directional"
+        )
+        training.print_training(f"{variant}, default sizes", results["training"][variant])
+    results["machine"] = training.machine(device)
+    for name, value in results["machine"].items():
+        wide_console().print(f"{name}: {value:.3g}", highlight=False)
+    return results
+
+
+def measure_legged(name: str, rounds: int, device: torch.device) -> dict[str, Any]:
+    """The step of a legged environment beside the bare simulator, and its column of the thesis's Table 4.1."""
+    results: dict[str, Any] = {"env": quad.measure_env(name, device, rounds)}
+    quad.print_env(name, results["env"])
+    results["training"] = quad.measure_training(name, device, 3 * rounds)
+    training.print_training(f"{name}, flat, T = {quad.PERIOD}", results["training"])
+    return results
+
+
+def measure_terrain(rounds: int, device: torch.device) -> dict[str, Any]:
+    """The making of terrains."""
+    results = terrain.measure(device, rounds)
+    terrain.show(results)
+    return results
+
+
+def measure_director(rounds: int, device: torch.device) -> dict[str, Any]:
+    """The Director in other people's loops."""
+    results = director.measure(device, rounds)
+    director.show(results)
+    return results
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line; returns the exit code."""
+    wp.config.quiet = True
+    try:
+        run(tyro.cli(BenchOptions, args=arguments, prog="python -m benchmarks"))
+    except (RunError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,255 @@
+"""``deimos terrain``: generate terrain as meshes, height grids, MuJoCo models and pictures."""
+
+import ast
+import dataclasses
+import inspect
+import itertools
+import textwrap
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from deimos.app import console
+from deimos.checks import RunError, check_range
+from deimos.terrain import catalog, export, presets
+from deimos.terrain.mesh import highest_riser, steepest_slope
+from deimos.terrain.preview import save_preview
+from deimos.terrain.world import Grid, Share, build_with_mesh, require_memory
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """What is written."""
+
+    out: tuple[Path, ...] = ()
+    """Files: .stl, .obj, .ply or .glb for the mesh, .npz for Deimos, .png for heights as 16-bit grey values."""
+    mjcf: Path | None = None
+    """Folder for a MuJoCo model; python -m mujoco.viewer --mjcf=FOLDER/terrain.xml shows it."""
+    preview: Path | None = None
+    """PNG file for a picture: shaded relief from above and an oblique view."""
+    force: bool = False
+    """Overwrite what exists."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileOptions(Outputs):
+    """What a single tile has besides the parameters of its shape."""
+
+    difficulty: float = 0.5
+    """From 0, the easiest, to 1."""
+    seed: int = 0
+    """Seed of what is random, at least 0."""
+    cell: float = 0.05
+    """Distance of two samples of the height grid [m]; must divide tile and border."""
+    border: float = 0.0
+    """Width of the flat border around the tile [m], at least 0."""
+    max_step: float = float("inf")
+    """Highest step that is allowed [m]."""
+
+    def __post_init__(self) -> None:
+        """Leave the checks to the shape and the grid that are made of it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GridOptions(Outputs):
+    """Build a grid: levels of rising difficulty along x, a column for each shape along y."""
+
+    preset: str | None = None
+    """go1 (the default) or legged-gym."""
+    file: Path | None = None
+    """TOML file with fields of the grid and a [[shape]] table for each shape; excludes --preset."""
+    shapes: tuple[str, ...] = ()
+    """Names of shapes that share the columns evenly, instead of those of the preset."""
+    seed: int | None = None
+    """Seed of all tiles, at least 0."""
+    difficulty: tuple[float, float] | None = None
+    """Difficulty of the first level and of the last, each in [0, 1]."""
+    levels: int | None = None
+    """Tiles along x, at least 1."""
+    columns: int | None = None
+    """Tiles along y, at least 1; with --shapes one for each by default."""
+    tile: float | None = None
+    """Side of a tile [m]."""
+    border: float | None = None
+    """Width of the flat border [m], at least 0."""
+    cell: float | None = None
+    """Distance of two samples of the height grid [m]; must divide tile and border. Robots take none below 0.05 m."""
+    max_step: float | None = None
+    """Highest step that any shape may have [m]."""
+
+    def grid(self) -> Grid:
+        """The grid that is asked for."""
+        names = ("seed", "levels", "columns", "tile", "border", "cell", "max_step")
+        changes: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        if self.difficulty is not None:
+            changes["easiest"], changes["hardest"] = self.difficulty
+        if self.file is not None and (self.preset is not None or self.shapes):
+            raise RunError("file excludes preset and shapes; name them in the file.")
+        if self.file is not None:
+            return presets.read_grid(self.file, **changes)
+        if not self.shapes:
+            return presets.preset(self.preset or "go1", **changes)
+        if self.preset is not None:
+            raise RunError("shapes excludes preset; give one of them.")
+        shares = tuple(Share(shape=catalog.make(name)) for name in self.shapes)
+        return Grid(shapes=shares, **({"columns": len(shares), "border": 1.0} | changes))
+
+
+def main(arguments: list[str], program: str) -> None:
+    """Run ``deimos terrain``."""
+    commands = {
+        "list": ("the shapes and their parameters, and the presets", show_list),
+        "shape": ("build one tile: deimos terrain shape stairs-up --out stairs.stl --preview stairs.png", build_shape),
+        "grid": ("build a grid of tiles, from a preset, a TOML file or a list of shapes", build_grid),
+    }
+    about = "Generates terrain for legged robots: triangle meshes, height grids, MuJoCo models, pictures."
+    try:
+        console.dispatch(commands, about, arguments, program)
+    except ValueError as error:  # a value that the terrain cannot have
+        raise RunError(str(error)) from error
+    except MemoryError as error:
+        raise RunError("There is not enough memory; enlarge cell, or ask for fewer levels or columns.") from error
+
+
+def show_list(arguments: list[str], program: str) -> None:
+    """Print every shape with its parameters, their defaults and their meaning, and the presets."""
+
+    @dataclasses.dataclass(frozen=True)
+    class ListOptions:
+        """Show the shapes with their parameters, and the presets."""
+
+    console.parse(ListOptions, arguments, program)
+    screen = Console(highlight=False, markup=False)
+    by_class: dict[type, list[str]] = {}
+    for name in catalog.names():
+        by_class.setdefault(catalog.shape_class(name), []).append(name)
+    for cls, names in by_class.items():
+        screen.print(", ".join(names), style="bold")
+        screen.print(" ".join((cls.__doc__ or "").split("\n\n")[0].split()))
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
+        docs = field_docs(cls)
+        for field in dataclasses.fields(cls):
+            if field.name != "direction":
+                values = field.default if isinstance(field.default, tuple) else (field.default,)
+                table.add_row(f"--{field.name}", " ".join(f"{value:g}" for value in values), Text(docs[field.name]))
+        screen.print(table, "")
+    for name in presets.preset_names():
+        grid = presets.preset(name)
+        parts = ", ".join(f"{part.share:g} {catalog.name_of(part.shape)}" for part in grid.shapes)
+        screen.print(f"preset {name}: {grid.levels} x {grid.columns} tiles; {parts}")
+
+
+def field_docs(cls: type) -> dict[str, str]:
+    """The docstring below each field of a dataclass and of those that it inherits from, on one line."""
+    docs: dict[str, str] = {}
+    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
+        body: list[Any] = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
+        for field, after in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
+                docs[ast.unparse(field.target)] = " ".join(ast.literal_eval(after.value).split())
+    return docs
+
+
+def build_shape(arguments: list[str], program: str) -> None:
+    """Build one tile."""
+    known = f"one of: {', '.join(catalog.names())}"
+    if not arguments or arguments[0].startswith("-"):
+        if not {"-h", "--help"} & set(arguments):
+            raise RunError(f"shape needs a name first, {known}.")
+        print(f"usage: {program} NAME [OPTIONS]\n\nNAME is {known}.\n{program} NAME --help explains its parameters.")
+        return
+    name, rest = arguments[0], arguments[1:]
+    options = console.parse(_shape_options(name), rest, f"{program} {name}")
+    check_range("difficulty", options.difficulty, 0, 1)
+    parameters = {field.name for field in dataclasses.fields(catalog.shape_class(name))} - {"direction"}
+    grid = Grid(
+        shapes=(Share(shape=catalog.make(name, {key: getattr(options, key) for key in parameters})),),
+        levels=1, columns=1, tile=options.tile, border=options.border, cell=options.cell, easiest=options.difficulty,
+        hardest=options.difficulty, max_step=options.max_step, seed=options.seed,
+    )  # fmt: skip
+    _make(grid, options, f"{name}, difficulty {options.difficulty:g}, seed {options.seed}")
+
+
+def _shape_options(name: str) -> type:
+    """``TileOptions`` with the parameters of a shape, whose direction is in its name."""
+    cls = catalog.shape_class(name)
+    direction = getattr(catalog.make(name), "direction", None)
+    fixed = [("direction", Annotated[Literal["up", "down"], tyro.conf.Suppress], dataclasses.field(default=direction))]
+    about = f"{name}: " + (cls.__doc__ or "").partition("\n\n")[0]
+    return dataclasses.make_dataclass(
+        "ShapeOptions", fixed if direction else [], bases=(TileOptions, cls), frozen=True, kw_only=True,
+        namespace={"__doc__": about},
+    )  # fmt: skip
+
+
+def build_grid(arguments: list[str], program: str) -> None:
+    """Build a grid."""
+    options: GridOptions = console.parse(GridOptions, arguments, program)
+    grid = options.grid()
+    _make(grid, options, f"{grid.levels} x {grid.columns} tiles of {grid.tile:g} m, seed {grid.seed}")
+
+
+def _make(grid: Grid, outputs: Outputs, title: str) -> None:
+    """Check, build, write and report; nothing is built where something could not be written."""
+    _check_outputs(outputs)
+    require_memory(grid)
+    console.quiet_warp()
+    start = time.perf_counter()
+    with console.stage_bar() as progress:
+        terrain, mesh = build_with_mesh(grid, progress=progress)
+        seconds = time.perf_counter() - start
+        jobs: dict[Path, Callable[[], None]] = {path: partial(export.save, path, terrain, mesh) for path in outputs.out}
+        if outputs.mjcf is not None:
+            jobs[outputs.mjcf] = partial(export.save_mjcf, outputs.mjcf, terrain)
+        if outputs.preview is not None:
+            jobs[outputs.preview] = partial(save_preview, outputs.preview, terrain, title)
+        for number, (path, job) in enumerate(jobs.items()):
+            progress(f"writing {path.name}", number / len(jobs))
+            job()
+    low, high = float(terrain.heights.min()) + 0.0, float(terrain.heights.max()) + 0.0  # no -0
+    nx, ny = terrain.heights.shape
+    levels = f"{grid.easiest:g} to {grid.hardest:g} in {grid.levels} levels"
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    table.add_row("extents [m]", " x ".join(f"{size:.3g}" for size in (*terrain.size, high - low)))
+    table.add_row("heights [m]", f"{low:.3f} to {high:.3f}")
+    table.add_row("difficulty", f"{grid.easiest:g}" if grid.levels == 1 else levels)
+    table.add_row("steepest slope", f"{steepest_slope(mesh):.3f} rise over run")
+    table.add_row("highest riser [m]", f"{highest_riser(mesh):.3f}")
+    table.add_row("mesh", f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
+    table.add_row("height grid", f"{nx:,} x {ny:,} samples, {terrain.cell:g} m apart")
+    table.add_row("time [s]", f"{seconds:.2f}")
+    screen = Console(highlight=False, markup=False)
+    screen.print(title, style="bold")
+    screen.print(table)
+    print(*jobs, sep="\n", end="\n" if jobs else "")
+
+
+def _check_outputs(outputs: Outputs) -> None:
+    """Raise ``RunError`` unless everything can be written."""
+    for path in outputs.out:
+        if path.suffix.lower() not in export.ENDINGS:
+            raise RunError(f"out must end in one of {', '.join(export.ENDINGS)}, got {path}.")
+    preview, mjcf = outputs.preview, outputs.mjcf
+    if preview is not None and preview.suffix.lower() != ".png":
+        raise RunError(f"preview must end in .png, got {preview}.")
+    if mjcf is not None and mjcf.exists() and not mjcf.is_dir():
+        raise RunError(f"mjcf must be a folder, but {mjcf} is a file.")
+    files = [*outputs.out, *([] if preview is None else [preview])]
+    folders = [path.parent for path in [*files, *([] if mjcf is None else [mjcf])]]
+    if missing := [folder for folder in folders if not folder.is_dir()]:
+        raise RunError(f"The folder {missing[0]} does not exist; make it first.")
+    files += [] if mjcf is None else [mjcf / name for name in export.MJCF_FILES]
+    for number, path in enumerate(files):
+        if path in files[:number]:
+            raise RunError(f"{path} is named twice.")
+        if path.is_dir():
+            raise RunError(f"{path} is a folder.")
+        if path.exists() and not outputs.force:
+            raise RunError(f"{path} exists and is not overwritten; choose another name, or add --force.")

@@ -1,0 +1,166 @@
+"""``deimos train``: train a policy and evaluate it, or resume an earlier run."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, make_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+
+from deimos import plugins
+from deimos.app import console, figures
+from deimos.app.evaluate import evaluate_run, title
+from deimos.checks import RunError
+from deimos.goals import selectors
+from deimos.run import presets, training
+from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig, Trainer
+from deimos.sim import envs
+from deimos.sim.shared import one_stream
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResumeOptions:
+    """Resume an earlier run from its last checkpoint."""
+
+    resume: Path
+    """Folder of the run."""
+    env_steps: int | None = None
+    """A larger budget: steps of every world in all. By default the one that the run had."""
+    device: Literal["auto", "cpu", "cuda"] | None = None
+    """Where to continue. By default where it was."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderOptions(TrainConfig):
+    """``TrainConfig`` and what belongs to the folder."""
+
+    out: Path | None = None
+    """Folder of the run, which must not exist. By default runs/ENV-METHOD-sSEED-TIME."""
+    resume: Path | None = None
+    """Resume the run in this folder from its last checkpoint; takes only --env-steps and --device."""
+    init_from: Path | None = None
+    """Start with the networks of the run in this folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstOptions:
+    """What decides which other options there are."""
+
+    resume: Path | None = None
+    """See ``ResumeOptions``."""
+    preset: str | None = None
+    """Name of a ready configuration to start from."""
+
+
+def main(arguments: list[str], program: str) -> None:
+    """Run ``deimos train``."""
+    first, rest = console.parse(FirstOptions, arguments, program, add_help=False, return_unknown_args=True)
+    if first.resume is not None:
+        _resume(console.parse(ResumeOptions, arguments, program))
+        return
+    _check_names(rest)
+    options, config = _train_options(), _preset(first.preset, rest)
+    default = options(**{field.name: getattr(config, field.name) for field in fields(config)})
+    _train(console.parse(options, rest, program, default=default))
+
+
+def _train(options: Any) -> None:
+    config = TrainConfig(**{field.name: getattr(options, field.name) for field in fields(TrainConfig)})
+    console.quiet_warp()
+    with one_stream(training.resolve_device(config.device)):
+        _run(*training.start(config, options.out, options.init_from))
+
+
+def _resume(options: ResumeOptions) -> None:
+    console.quiet_warp()
+    config = training.read_config(RunFolder.open(options.resume))
+    with one_stream(training.resolve_device(options.device or config.device)):
+        _run(*training.resume(options.resume, options.env_steps, options.device))
+
+
+def _run(trainer: Trainer, folder: RunFolder) -> None:
+    """Train, evaluate, draw and say where everything is."""
+    config = trainer.config
+    with console.stop_on_interrupt() as stopped:
+        with _training_bar(trainer) as report:
+            finished = training.train(trainer, folder, report, stopped)
+        if not finished or stopped():
+            print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
+            raise SystemExit(130)
+    rows = evaluate_run(folder, config.env, config.eval, trainer.env.device) if config.evaluation else []
+    figures.draw_summary(folder, title(config), rows)
+    total = sum(trainer.seconds.values())
+    if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
+        print("time:", *[f"{name} {100 * seconds / total:.1f} % " for name, seconds in trainer.seconds.items()])
+    print(folder.path)
+
+
+@contextlib.contextmanager
+def _training_bar(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
+    """Iteration, frames per second, reward, crashes per 1000 transitions, time left."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    numbers = "{task.fields[fps]:.0f} FPS  reward {task.fields[reward]:.3f}  crashes/1000 {task.fields[crashes]:.2f}"
+    columns = (
+        TextColumn("iteration {task.completed}/{task.total}"), BarColumn(), TextColumn(numbers), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(
+            "train", total=trainer.config.iterations, completed=trainer.iteration, fps=0.0, reward=0.0, crashes=0.0
+        )
+        yield lambda row, fps: progress.update(
+            task, completed=row["iteration"], fps=fps, reward=row["reward"], crashes=row["crashes_per_1000"]
+        )
+
+
+def _train_options() -> type:
+    """``FolderOptions`` with every environment and selector that there is."""
+    about = (
+        "Train a policy under a goal selector, then evaluate it against Naive and Adversary. "
+        f"--preset NAME starts from a ready configuration: {', '.join(presets.names())}."
+    )
+    default = next(field.default_factory for field in fields(TrainConfig) if field.name == "env")
+    return make_dataclass(
+        "TrainOptions",
+        [
+            ("env", _subcommands(envs), field(default_factory=default)),
+            ("selector", _subcommands(selectors, Annotated[None, tyro.conf.subcommand("none")]), field(default=None)),
+        ],
+        bases=(FolderOptions,), frozen=True, kw_only=True, namespace={"__doc__": about},
+    )  # fmt: skip
+
+
+def _subcommands(package: Any, *more: Any) -> Any:
+    options = [
+        Annotated[plugins.load(package, name).Config, tyro.conf.subcommand(name)] for name in plugins.names(package)
+    ]
+    return Union[tuple([*more, *options])]  # noqa: UP007 (a union of a computed list)
+
+
+def _preset(name: str | None, arguments: list[str]) -> TrainConfig:
+    """What the options start from: the preset of a name, or that of the environment."""
+    env = next((argument.removeprefix("env:") for argument in arguments if argument.startswith("env:")), None)
+    env = env and env.replace("-", "_")  # the name of its module
+    name = name or env or "particle"
+    try:
+        if env is not None and presets.environment(name) != env:
+            raise RunError(f"The preset '{name}' is for env:{presets.environment(name)}, not for env:{env}.")
+        return presets.preset(name)
+    except ValueError as error:
+        raise RunError(str(error)) from error
+
+
+def _check_names(arguments: list[str]) -> None:
+    """Refuse an unknown ``env:NAME`` or ``selector:NAME``; tyro would list the choices of the other.
+
+    Names are spelled with hyphens; tyro takes underscores too.
+    """
+    for kind, names in (("env", plugins.names(envs)), ("selector", ["none", *plugins.names(selectors)])):
+        known = [f"{kind}:{name.replace('_', '-')}" for name in names]
+        for argument in arguments:
+            if argument.startswith(f"{kind}:") and argument.replace("_", "-") not in known:
+                raise RunError(f"There is no '{argument}'; there are: {', '.join(known)}.")

@@ -1,0 +1,112 @@
+"""What becomes of goals between two steps, in Deimos' own loop as in other people's: outcomes first, then choices."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from deimos.goals.interactions import Interactions
+from deimos.goals.selector import GoalSelector, Spaces
+from deimos.nn.stateful import Stateful
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Where a step calls for a new goal."""
+
+    due: Tensor
+    """Worlds that live and whose goal's time is up, int64, shape (m,)."""
+    done: Tensor
+    """Worlds whose episode has ended, int64, shape (m,): they begin with a first goal."""
+    cut_off: Tensor
+    """Those of them that were truncated, int64, shape (m,)."""
+
+
+class GoalCore(Stateful):
+    """Joins a selector and the interactions of its goals.
+
+    It sees tensors only. Whoever owns the worlds calls ``advance`` after every step, and ``choose`` for the worlds
+    that are due.
+
+    Args:
+        selector: Who chooses.
+        spaces: The worlds.
+        window: Steps that resolved interactions are kept for; ``None`` for 2 T.
+    """
+
+    saved = ("selector", "interactions", "weight")
+
+    def __init__(self, selector: GoalSelector, spaces: Spaces, window: int | None = None) -> None:
+        self.selector = selector
+        self.goal_period = spaces.goal_period
+        window = window or 2 * self.goal_period
+        # No world resolves more within the window, since a crash is followed by a first goal of T steps.
+        capacity = math.ceil(window / self.goal_period) + 1
+        self.interactions = Interactions(
+            spaces.num_envs, spaces.state_dim, spaces.goal_dim, capacity, window, spaces.device,
+            groups=0 if spaces.groups == (slice(None),) else len(spaces.groups),
+        )  # fmt: skip
+        self.weight = torch.ones(spaces.num_envs, device=spaces.device)
+        """1 where the learner may use the transitions under the active goal, else 0, shape (num_envs,)."""
+        nobody = torch.zeros(0, dtype=torch.int64, device=spaces.device)
+        self._nothing = Changes(nobody, nobody, nobody)
+
+    def advance(
+        self, terminated: Tensor, truncated: Tensor, due: Tensor, reward: Tensor, tracking: Tensor | None = None
+    ) -> Changes:
+        """Count a step, and resolve the interactions that it ended, in one synchronisation.
+
+        Call it before anything is reset: an interaction whose T-th step is the time limit keeps its label.
+
+        Args:
+            terminated: True where the world crashed, bool, shape (num_envs,).
+            truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
+            due: True where the goal's time is up, bool, shape (num_envs,).
+            reward: Rewards, shape (num_envs,).
+            tracking: How well each group of goal components is met, in [0, 1], shape (num_envs, groups); ``None``
+                where there is one group and the reward says it.
+        """
+        self.interactions.advance(reward, terminated, tracking)
+        done = terminated | truncated
+        masks = torch.stack([due & ~done, done, truncated])
+        counts = masks.sum(1).tolist()
+        if not any(counts):
+            return self._nothing
+        # A known count spares the device another wait.
+        changes = Changes(*(
+            torch.nonzero_static(mask, size=count).squeeze(1) for mask, count in zip(masks, counts, strict=True)
+        ))  # fmt: skip
+        rows = torch.cat([changes.due, changes.done])
+        self.interactions.resolve(rows, terminated[rows], due[rows])
+        return changes
+
+    @torch.no_grad()
+    def choose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Tensor:
+        """Choose the next goals of the listed worlds, and begin their interactions.
+
+        Args:
+            rows: Worlds, int64, shape (B,), each once; nothing is pending in them.
+            state: Their states, shape (B, state_dim).
+            goal: Their goals until now, shape (B, goal_dim).
+            candidates: Independent uniform goals for each, shape (B, N, goal_dim).
+            draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4).
+
+        Returns:
+            Goals, shape (B, goal_dim).
+        """
+        chosen = self.selector.propose(rows, state, goal, candidates, draws)
+        self.interactions.open(
+            rows, state, goal, chosen.goal, chosen.score, self.goal_period, probe=chosen.probe, note=chosen.note
+        )
+        self.weight[rows] = 1.0 if chosen.learn is None else chosen.learn.float()
+        return chosen.goal
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``Stateful.load_state_dict``."""
+        kept = state["interactions"]
+        if "horizon" not in kept:  # written when every interaction had the same
+            marks = nn.functional.pad(kept["marks"], (0, 1), value=self.goal_period)
+            horizon = torch.full_like(kept["issued"], self.goal_period)
+            state = state | {"interactions": kept | {"issued_at": kept["issued"], "horizon": horizon, "marks": marks}}
+        super().load_state_dict(state)

@@ -1,0 +1,76 @@
+"""Counter-based random numbers, on any device: the very ones that ``kernels.random`` draws.
+
+A draw is a pure function of its address: *who* draws *what* for *which time*. So two halves of the worlds draw what
+the whole draws, and a resumed run goes on with the very numbers that it would have had. The generator is
+Philox4x32-10 of Salmon et al., *Parallel Random Numbers: As Easy as 1, 2, 3*, SC 2011.
+"""
+
+import math
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+_MULTIPLIERS = 0xD2511F53, 0xCD9E8D57  # the paper's constants, table 2 and section 3.3
+_WEYL = 0x9E3779B9, 0xBB67AE85
+_WORD = 0xFFFFFFFF
+
+
+class Purpose(IntEnum):
+    """What a number is drawn for: half of the key. Those below 16 are ``kernels.random``'s."""
+
+    GOAL = 0  # the choice of a goal: a GoalDirector draws what an environment draws for it
+    EXPLORATION = 16
+
+
+def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[int, int]) -> tuple[Tensor, ...]:
+    """Ten rounds of Philox4x32: four random 32-bit words for every counter.
+
+    Args:
+        counter: The four words of the counters, int64 in [0, 2^32), of shapes that broadcast.
+        key: Its two words, in [0, 2^32).
+    """
+    x0, x1, x2, x3 = counter
+    k0, k1 = key
+    for _ in range(10):
+        # An int64 keeps the low 64 bits of a product; what is above a word is taken off where it would matter.
+        p0, p1 = x0 * _MULTIPLIERS[0], x2 * _MULTIPLIERS[1]
+        x0 = ((p1 >> 32) ^ x1).bitwise_xor_(k0).bitwise_and_(_WORD)
+        x2 = ((p0 >> 32) ^ x3).bitwise_xor_(k1).bitwise_and_(_WORD)
+        x1, x3 = p1, p0
+        k0, k1 = (k0 + _WEYL[0]) & _WORD, (k1 + _WEYL[1]) & _WORD
+    return x0, x1 & _WORD, x2, x3 & _WORD
+
+
+def uniforms(seed: int, purpose: int, world: Tensor, count: Tensor) -> Tensor:
+    """Four independent uniform numbers in [0, 1), multiples of 2^-24, for every address, shape (..., 4).
+
+    Args:
+        seed: Seed of the run, in [0, 2^32).
+        purpose: What they are for.
+        world: Global numbers of the worlds, int64 in [0, 2^32), shape (...,).
+        count: How often each has drawn for this purpose, int64 in [0, 2^32), of a shape that broadcasts.
+    """
+    return torch.stack(_uniforms(seed, purpose, world, count, 0), dim=-1)
+
+
+def _uniforms(seed: int, purpose: int, world: Tensor, count: Tensor, block: int) -> list[Tensor]:
+    zero = torch.zeros((), dtype=torch.int64, device=world.device)
+    words = philox((world, count, zero, zero + block), (seed, purpose))
+    # The top 24 bits fill a float32 exactly, so 1.0 is never reached.
+    return [(word >> 8).float().mul_(2.0**-24) for word in words]
+
+
+def normals(seed: int, purpose: int, world: Tensor, count: Tensor, size: int) -> Tensor:
+    """Independent standard normal numbers for every address, shape (..., size); for the arguments see ``uniforms``.
+
+    By Box and Muller: two uniform numbers make two normal ones, none beyond sqrt(48 ln 2) = 5.77.
+    """
+    numbers: list[Tensor] = []
+    for block in range(-(-size // 4)):
+        u0, u1, u2, u3 = _uniforms(seed, purpose, world, count, block)
+        for first, second in ((u0, u1), (u2, u3)):
+            radius = torch.log1p(-first).mul_(-2.0).sqrt_()  # 1 - u is never 0
+            angle = second.mul_(2.0 * math.pi)
+            numbers += [angle.cos().mul_(radius), angle.sin().mul_(radius)]
+    return torch.stack(numbers[:size], dim=-1)

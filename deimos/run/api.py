@@ -1,0 +1,102 @@
+"""Training and evaluation as two functions, for programs."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from deimos.checks import RunError
+from deimos.learn.policy import load_policy
+from deimos.nn.matmul import on_threads
+from deimos.run import evaluation, training
+from deimos.run.evaluation import EvalConfig
+from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig
+from deimos.sim.env import EnvConfig
+from deimos.sim.shared import one_stream
+
+Progress = Callable[[str, float], None]
+"""Called now and then with the stage's name and the share of it that is done."""
+
+
+def train(config: TrainConfig | None = None, out: Path | str | None = None) -> Path:
+    """Train a policy and evaluate it.
+
+    Args:
+        config: What to train; ``None`` for the main job, Particle Gym under the Director.
+        out: Folder of the run, which must not exist; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
+
+    Returns:
+        The run's folder, for ``evaluate`` and ``load_policy``.
+
+    Raises:
+        RunError: If the folder exists, the worlds do not fit into memory, or a file cannot be written.
+        SimulationError: If a number is not finite; the last checkpoint is that of before.
+    """
+    config = config or TrainConfig()
+    device = training.resolve_device(config.device)
+    with on_threads(torch.get_num_threads()), one_stream(device):  # a run sets the number; the host gets its own back
+        trainer, folder = training.start(config, Path(out) if out is not None else None, init_from=None)
+        training.train(trainer, folder)
+        if config.evaluation:
+            evaluate_run(folder, config.env, config.eval, device)
+    return folder.path
+
+
+def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "auto", **changes: Any) -> list[dict]:
+    """Evaluate the policy of a run against uniform goals (Naive) and against a freshly trained Adversary.
+
+    Args:
+        run: The run's folder; its ``evaluation.json`` gains the rows.
+        goal_period: T: steps that a goal is active; ``None`` for that of training.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        changes: Fields of ``EvalConfig`` that differ from the run's, such as ``worlds``, ``steps`` or ``seed``.
+
+    Returns:
+        A row for each kind of goals; see ``evaluation.evaluate``.
+
+    Raises:
+        RunError: If it is not a run folder, or a value is not allowed.
+    """
+    folder = RunFolder.open(Path(run))
+    config = training.read_config(folder)
+    env_config, eval_config = configure_evaluation(config, goal_period, changes)
+    found = training.resolve_device(device)
+    with on_threads(config.threads or training.cores()), one_stream(found):  # the same numbers as at the run's end
+        return evaluate_run(folder, env_config, eval_config, found)
+
+
+def configure_evaluation(
+    config: TrainConfig, goal_period: int | None, changes: dict[str, Any]
+) -> tuple[EnvConfig, EvalConfig]:
+    """What a run's policy is evaluated in and how, where that differs from how the run was set up.
+
+    Raises:
+        RunError: If a value is not allowed.
+    """
+    try:
+        period = config.env.goal_period if goal_period is None else goal_period
+        env_config, eval_config = config.env.with_goal_period(period), replace(config.eval, **changes)
+        if eval_config.steps < 2 * period:
+            raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
+    except (TypeError, ValueError) as error:
+        raise RunError(str(error)) from error
+    return env_config, eval_config
+
+
+def evaluate_run(
+    folder: RunFolder, env_config: EnvConfig, eval_config: EvalConfig, device: torch.device,
+    progress: Progress = lambda stage, share: None,
+) -> list[dict]:  # fmt: skip
+    """Evaluate the folder's policy; rows of the same policy, goals and sizes are replaced, others are kept."""
+    policy = load_policy(folder.path, str(device))
+    known = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+    rows = evaluation.evaluate(policy.scaled, env_config, eval_config, device, progress)
+    rows = [row | {"weights": evaluation.weights_hash(policy.actor)} for row in rows]
+    key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
+    fresh = {tuple(row[name] for name in key) for row in rows}
+    kept = [row for row in known if tuple(row.get(name) for name in key) not in fresh]
+    folder.write_json("evaluation.json", kept + rows)
+    return rows

@@ -1,0 +1,114 @@
+"""What a legged robot's goal is made of: parts, each with its components and all that comes with them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, field
+
+import numpy as np
+import warp as wp
+from torch import Tensor
+
+from deimos.kernels.legged.arm import evaluate_arms, reset_arms
+from deimos.kernels.legged.arm_goals import ARM, Arm, check_arm, locate_goals, redraw_candidates
+from deimos.kernels.legged.arm_rewards import ARM_TERMS, ArmWeights, vecA
+from deimos.kernels.legged.state import RATE_SCALE, VELOCITY_SCALE, LeggedWorlds
+from deimos.sim.env import ObsField
+from deimos.sim.legged.robots import Robot
+
+
+@dataclass(frozen=True, kw_only=True)
+class Launches:
+    """What a part does in the worlds that it was bound to."""
+
+    evaluate: Callable[[], None] = lambda: None
+    """Evaluates a step: writes the part's terms, tracking and observation; before the step as a whole is evaluated."""
+    reset: Callable[[], None] = lambda: None
+    """Finishes the reset of the worlds of the mask: their first goals and observations."""
+    validate: Callable[[wp.array, wp.array, wp.array], wp.Launch] | None = None
+    """Records what makes goals of uniform candidates valid: of the rows, half side of the box, and the candidates."""
+    errors: Mapping[str, Tensor] = field(default_factory=dict)
+    """See ``Env.errors``."""
+    points: Callable[[], np.ndarray] | None = None
+    """Gives the places of all goals in the world [m], shape (num_envs, 3)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalPart:
+    """Components of a goal and what comes with them. The velocity goal, whose kernels are the legs', comes first."""
+
+    range: tuple[float, ...]
+    """Half side of the box of goals along every component, in its unit."""
+    units: tuple[str, ...]
+    """Units of the components."""
+    scale: tuple[float, ...]
+    """What the policy sees components multiplied by."""
+    groups: tuple[int, ...]
+    """How many components, one after another, are met or missed together."""
+    fields: tuple[ObsField, ...] = ()
+    """What the observation has of them, between the last action and the heights."""
+    noise: Mapping[str, float] = field(default_factory=dict)
+    """Half width of the noise of those fields, in their units."""
+    columns: tuple[str, ...] = ()
+    """Their terms of the reward."""
+    bind: Callable[[LeggedWorlds], Launches] = lambda worlds: Launches()
+    """Makes the launches for worlds, once."""
+
+
+def velocity_goal(speed: float = 1.0) -> GoalPart:
+    """v_x, v_y and yaw rate in the base's frame, uniform in [-1, 1]^3 times ``speed`` (thesis, 4.1.2)."""
+    return GoalPart(
+        range=(speed,) * 3,
+        units=("m/s", "m/s", "rad/s"),
+        scale=(VELOCITY_SCALE, VELOCITY_SCALE, RATE_SCALE),
+        groups=(2, 1),
+    )
+
+
+def end_effector_goal(robot: Robot, weights: ArmWeights) -> GoalPart:
+    """A place of the end effector, in [-1, 1]^3; see ``deimos.kernels.legged.arm_goals``.
+
+    Raises:
+        ValueError: If the robot has no arm.
+    """
+    if robot.arm is None:
+        raise ValueError("robot must have an arm for goals of its end effector.")
+
+    def bind(worlds: LeggedWorlds) -> Launches:
+        arm = _build_arm(robot, weights, worlds)
+        return Launches(
+            evaluate=lambda: evaluate_arms(worlds, arm),
+            reset=lambda: reset_arms(worlds, arm),
+            validate=lambda row, scale, candidates: redraw_candidates(worlds, arm, row, scale, candidates),
+            errors={"end effector [m]": wp.to_torch(arm.error)},
+            points=lambda: locate_goals(worlds, arm).numpy(),
+        )
+
+    return GoalPart(
+        range=(1.0,) * 3,
+        units=("1",) * 3,
+        scale=(1.0,) * 3,
+        groups=(3,),
+        fields=(ObsField("end_effector", 3, "1", 1.0),),
+        noise={"end_effector": 0.01},  # what that of the joints' angles makes of it
+        columns=ARM_TERMS,
+        bind=bind,
+    )
+
+
+def _build_arm(robot: Robot, weights: ArmWeights, worlds: LeggedWorlds) -> Arm:
+    """The arm's numbers, in the memory of the kernels."""
+    assert robot.arm is not None
+    numbers, n = robot.arm, worlds.worlds.num_envs
+    joints = len(numbers.axes)
+    arm = ARM.allocate(str(worlds.worlds.goal.device), num_envs=n, num_arm_joints=joints, num_links=joints + 1)
+    arm.offset.assign(np.array(numbers.offsets))
+    arm.axis.assign(np.array(numbers.axes))
+    shoulder = np.array(numbers.shoulder)
+    low, high = np.array(numbers.body)
+    arm.origin = wp.vec3(shoulder[0], shoulder[1], shoulder[2] + robot.standing_height)
+    arm.body_low = wp.vec3(*(low - numbers.radius - shoulder))
+    arm.body_high = wp.vec3(*(high + numbers.radius - shoulder))
+    arm.clearance = numbers.radius
+    arm.weight = vecA(*astuple(weights))
+    arm.obs_start = worlds.params.scan_start - 3
+    check_arm(arm, worlds)
+    return arm

@@ -1,0 +1,96 @@
+"""Where the cells of a study are worked on: an interface, and processes of this machine."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Protocol
+
+from deimos.study.cell import STOPPED
+from deimos.study.folder import StudyFolder
+from deimos.study.plan import Cell
+
+
+class Engine(Protocol):
+    """Works on cells; ``run`` is called from one thread for each cell that is worked on at a time."""
+
+    def run(self, cell: Cell) -> str | None:
+        """Work on a cell, from wherever it stands, until it is finished, was stopped or has failed.
+
+        Returns:
+            ``None``, or in one line how the work has failed.
+        """
+
+    def stop(self) -> None:
+        """Let all running cells write their checkpoints and end; from now on ``run`` begins nothing."""
+
+    def kill(self) -> None:
+        """End all that runs at once; from now on ``run`` begins nothing."""
+
+
+class LocalProcesses:
+    """An engine that makes a process of its own for each cell; each ends when this process does."""
+
+    def __init__(self, study: StudyFolder) -> None:
+        self._study = study
+        self._lock = threading.Lock()
+        self._running: dict[subprocess.Popen, int] = {}  # processes, with the pipe that each listens to
+        self._stopping = False
+
+    def run(self, cell: Cell) -> str | None:
+        """See ``Engine.run``."""
+        with self._lock:
+            if self._stopping:
+                return None
+            listening, pipe = os.pipe()
+            process = self._start(cell, listening)
+            os.close(listening)
+            self._running[process] = pipe
+        code = process.wait()
+        with self._lock:
+            os.close(self._running.pop(process))
+        if (code == 0 and self._study.finished([cell])) or (code == STOPPED and self._stopping):
+            return None
+        return last_words(code, self._study.cell_path(cell) / "log.txt")
+
+    def _start(self, cell: Cell, listening: int) -> subprocess.Popen:
+        command = [sys.executable, "-m", "deimos.study.cell", str(self._study.path), cell.name]
+        threads = str(cell.config.threads or 1)
+        with (self._study.cell_path(cell) / "log.txt").open("ab") as log:
+            return subprocess.Popen(
+                command, stdin=listening, stdout=log, stderr=log,
+                env=os.environ | {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads},
+                start_new_session=True,  # Ctrl-C reaches the runner alone, which passes it on once
+            )  # fmt: skip
+
+    def stop(self) -> None:
+        """See ``Engine.stop``."""
+        with self._lock:
+            self._stopping = True
+            for pipe in self._running.values():
+                with contextlib.suppress(BrokenPipeError):  # it has just ended
+                    os.write(pipe, b".")
+
+    def kill(self) -> None:
+        """See ``Engine.kill``."""
+        with self._lock:
+            self._stopping = True
+            for process in self._running:
+                process.kill()
+
+
+def last_words(code: int, log: Path) -> str:
+    """One line that says how a worker died.
+
+    Args:
+        code: Its exit code; negative is the number of a signal.
+        log: What it wrote.
+    """
+    if code < 0:
+        name = signal.Signals(-code).name
+        return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if code not in (0, STOPPED) and lines else f"exit code {code} without results"

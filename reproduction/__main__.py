@@ -1,0 +1,78 @@
+"""``python -m reproduction``: the commands of the thesis's reproduction."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from deimos.checks import check_at_least
+from deimos.run.folder import RunError
+from deimos.study.cli import ReportOptions
+from reproduction import coverage
+from reproduction.report import write
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoverageOptions:
+    """Simulate how often the intervals of the report contain the truth."""
+
+    seeds: int = 10
+    """Size of every simulated population, at least 4."""
+    populations: int = 2000
+    """Simulated populations, at least 100."""
+    resamples: int = 2000
+    """Bootstrap resamples of each, at least 1000."""
+    seed: int = 0
+    """Seed of it all."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("seeds", 4), ("populations", 100), ("resamples", 1000), ("seed", 0)):
+            check_at_least(name, getattr(self, name), least)
+
+
+def report_claims(options: ReportOptions) -> None:
+    """Write the report of a study with the thesis's claims.
+
+    Raises:
+        RunError: If there are no results, or the folder cannot be written.
+    """
+    print(write(options.folder, options.out or options.folder))
+
+
+def print_coverage(options: CoverageOptions) -> None:
+    """Print the table of coverages."""
+    table = Table(title=f"Coverage of 95 % intervals, n = {options.seeds}", title_justify="left")
+    for name in ("statistic", "interval", "normal", "lognormal"):
+        table.add_column(name, justify="left" if name in ("statistic", "interval") else "right")
+    for row in coverage.simulate(options.seeds, options.populations, options.resamples, options.seed):
+        table.add_row(row.statistic, row.interval, f"{100 * row.normal:.1f} %", f"{100 * row.lognormal:.1f} %")
+    Console().print(table)
+
+
+COMMANDS: dict[str, tuple[type, Callable[..., None]]] = {
+    "report": (ReportOptions, report_claims),
+    "coverage": (CoverageOptions, print_coverage),
+}
+"""Options and function of every command."""
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line; returns the exit code."""
+    name = arguments[0] if arguments else "--help"
+    if name not in COMMANDS:
+        print(f"usage: python -m reproduction {{{','.join(COMMANDS)}}} [OPTIONS]")
+        return 0 if name in ("-h", "--help") else 2
+    options, command = COMMANDS[name]
+    try:
+        command(tyro.cli(options, args=arguments[1:], prog=f"python -m reproduction {name}"))
+    except (RunError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

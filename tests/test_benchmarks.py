@@ -1,0 +1,162 @@
+"""The benchmarks, in tiny: every one runs, prints its table, and counts operations as its networks have them."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from deimos.terrain import presets
+from torch import nn
+
+from benchmarks import __main__ as benchmarks
+from benchmarks import director, flops, particle, quad, terrain, timing, training
+from deimos.goals.methods import method
+from deimos.goals.selectors import rnd, vds
+from deimos.learn.ppo import PPOConfig
+from deimos.run.training import TrainConfig, Trainer
+from deimos.sim.envs.particle import Config
+
+CPU = torch.device("cpu")
+TINY = TrainConfig(env=Config(goal_period=12), num_envs=64, ppo=PPOConfig(hidden=(8,)), evaluation=False)
+
+
+def test_ratio_is_the_median_over_rounds(monkeypatch):
+    """What is compared is measured in turn, the first round does not count, and a ratio is the rounds' median."""
+    done = []
+    seconds = timing.in_turn({"a": lambda: done.append("a"), "b": lambda: done.append("b")}, 2, CPU)
+    assert done == ["a", "b"] * 3
+    assert {name: len(values) for name, values in seconds.items()} == {"a": 2, "b": 2}
+    assert timing.ratio([2.0, 9.0, 4.0], [1.0, 1.0, 1.0]) == 4.0
+    assert (timing.short(2.5e9), timing.short(61_234_567.0), timing.short(12.0)) == ("2.5 G", "61.2 M", "12")
+
+
+def test_forward_operations_are_those_of_the_layers():
+    """A network for one row multiplies and adds once for every weight."""
+    net = nn.Sequential(nn.Linear(5, 7), nn.ReLU(), nn.Linear(7, 3), nn.ReLU(), nn.Linear(3, 2))
+    assert flops.forward(5, (7, 3), 2) == sum(2 * p.numel() for p in net.parameters() if p.dim() == 2)
+    # The context's share of the first layer once, all else for every candidate.
+    assert flops.scoring(4, 1, (7, 3), 2, 10) == 2 * 4 * 7 + 10 * 2 * (1 * 7 + 7 * 3 + 3 * 2)
+
+
+def test_operations_of_a_learner_are_counted_by_its_networks():
+    """PPO's bound is three passes of actor and critic over every transition and epoch."""
+    trainer = Trainer(replace(TINY, method="uniform"), CPU)
+    weights = [p for net in (trainer.ppo.actor.mean, trainer.ppo.critic) for p in net.parameters() if p.dim() == 2]
+    rows = trainer.rollout.reward.numel() * TINY.ppo.epochs
+    assert flops.of_learner(TINY.ppo, trainer.env) == 3 * 2 * sum(p.numel() for p in weights) * rows
+
+
+def test_operations_of_selectors():
+    """Fear, surprise and disagreement cost what their networks do; a critic that is not trained is saved."""
+    env, ppo = Config(goal_period=12).build(64, CPU, 0), TINY.ppo
+    decisions = 24 * 64 / 12
+    assert flops.of_selector(method("uniform"), ppo, env) == 0.0
+    fear = 2 * (12 * 64 + 100 * (3 * 64 + 64)) * decisions + 3 * 2 * (15 * 64 + 64) * 128
+    assert flops.of_selector(method("p25"), ppo, env) == pytest.approx(fear)
+    config = rnd.Config(target=4, predictor=6, features=2, candidates=10, epochs=1)
+    score = 2 * (12 * 10 + 10 * (3 * 10 + 10 * 2))
+    fit = 2 * (15 * 4 + 4 * 2) + 3 * 2 * (15 * 6 + 6 * 2)
+    assert flops.of_selector(config, ppo, env) == pytest.approx(decisions * (score + fit))
+    config = vds.Config(hidden=(5,), critics=3, candidates=10, epochs=2, role="auxiliary")
+    critic = 2 * (12 * 5 + 5)
+    both = 24 * 64 * 3 * critic * 7 + decisions * 10 * 3 * critic
+    assert flops.of_selector(config, ppo, env) == pytest.approx(both)
+    saved = 3 * 2 * (12 * 8 + 8) * 24 * 64 * ppo.epochs
+    assert flops.of_selector(replace(config, role="replace"), ppo, env) == pytest.approx(both - saved)
+
+
+def test_particle_is_measured(capsys):
+    """The step of Particle Gym is timed beside torch and NumPy, with what it moves and counts."""
+    row = particle.measure_env(65_536, CPU, 1)
+    assert {"kernel [steps/s]", "env.step [steps/s]", "eager torch [steps/s]", "numpy [steps/s]"} < set(row)
+    assert row["bytes/s"] == 4 * particle.WORDS_PER_STEP * row["kernel [steps/s]"]
+    assert all(value > 0 for value in row.values())
+    particle.print_env([row], 1, "cpu")
+    assert "65,536" in capsys.readouterr().out
+
+
+def test_training_is_measured(capsys):
+    """Every method has its speed beside Uniform's, its shares of an iteration, and its bound."""
+    methods = {name: method(name) for name in ("uniform", "p25", "vds")}
+    result = training.measure_training(TINY, methods, {"uniform": 2, "p25": 1}, CPU, 1, warm_up=1)
+    rows = {row["method"]: row for row in result["rows"]}
+    assert set(rows) == set(methods)
+    assert (rows["uniform"]["ratio to uniform"], rows["uniform"]["limit"]) == (1.0, 1.0)
+    assert 0 < rows["p25"]["limit"] < 1
+    assert (rows["p25"]["thesis"], rows["vds"]["thesis"]) == (0.5, None)
+    assert sum(rows["p25"]["shares"].values()) == pytest.approx(1.0)
+    training.print_training("tiny", result)
+    assert "FLOP bound" in capsys.readouterr().out
+
+
+def test_methods_that_are_timed_exist():
+    """Both tables of methods hold Uniform, which the others are compared with."""
+    assert "uniform" in training.METHODS_TIMED
+    assert "uniform" in quad.METHODS_TIMED
+
+
+def test_quad_is_measured(capsys):
+    """A legged environment is timed beside the bare simulator, on flat and on rough ground."""
+    result = quad.measure_env("quad", CPU, 1, num_envs=2)
+    assert set(result["control steps/s"]) == {"env.step, flat", "bare, flat", "env.step, rough", "bare, rough"}
+    quad.print_env("quad", result)
+    assert "env.step / bare, flat" in capsys.readouterr().out
+
+
+def test_director_is_measured(capsys):
+    """The Director in other people's loops has a time per step for each method."""
+    result = director.measure(CPU, 1, num_envs=50, period=10, methods=("uniform", "p25"))
+    assert set(result["ms per step"]) == {"uniform", "p25"}
+    for name, value in result["ms per step"].items():
+        assert result["world-steps/s"][name] == pytest.approx(50 / value * 1000)
+    director.show(result)
+    assert "world-steps/s" in capsys.readouterr().out
+
+
+def test_terrain_is_measured(capsys):
+    """The making of both presets, here of small grids, is timed by mesh and rays."""
+    grids = [presets.preset(name, levels=2, columns=3, cell=0.2) for name in presets.preset_names()]
+    result = terrain.measure(CPU, 2, grids)
+    assert [row["preset"] for row in result["making"]] == presets.preset_names()
+    for row in result["making"]:
+        assert row["rays [1/s]"] == pytest.approx(row["samples"] / row["rays [s]"])
+        assert 0 < row["mesh [s]"] < 60
+    terrain.show(result)
+    said = capsys.readouterr().out
+    for word in ("legged-gym", "M rays/s", "Peak memory"):
+        assert word in said
+
+
+def test_numbers_are_written(tmp_path, monkeypatch, capsys):
+    """The command measures what is asked for and writes its numbers with versions, threads and device."""
+    monkeypatch.setattr(
+        director, "measure", lambda device, rounds: {"num_envs": 1, "ms per step": {}, "rounds": rounds}
+    )
+    path = tmp_path / "numbers.json"
+    threads = torch.get_num_threads()
+    try:
+        arguments = ["director", "--rounds", "2", "--json", str(path), "--device", "cpu", "--threads", "1"]
+        assert benchmarks.main(arguments) == 0
+    finally:
+        torch.set_num_threads(threads)
+    found = json.loads(path.read_text())
+    assert (found["rounds"], found["threads"], found["device"]) == (2, 1, "cpu")
+    assert "torch" in found["versions"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "Missing from python -m benchmarks"),
+        (["pendulum"], "pendulum"),
+        (["particle", "--rounds", "0"], "rounds must be at least 1, got 0"),
+        (["particle", "--json", "nowhere/x.json"], "json must be in a folder that exists, got nowhere/x.json"),
+    ],
+)
+def test_mistake_is_refused(arguments, message, capsys):
+    """A mistake in the command is said before anything is measured, with exit code 2."""
+    with pytest.raises(SystemExit) as end:
+        benchmarks.main(arguments)
+    assert end.value.code == 2
+    said = capsys.readouterr().err.replace("|", " ").replace("│", " ")
+    assert message in " ".join(said.split())

@@ -1,0 +1,91 @@
+"""Training and evaluation from a program, and runs of earlier versions."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import deimos
+from deimos.app import cli
+from deimos.checks import RunError
+from deimos.learn.ppo import PPOConfig
+from deimos.run.evaluation import EvalConfig
+from deimos.run.folder import RunFolder
+from deimos.sim.envs import particle
+
+OLD = Path(__file__).parent / "data" / "run_0_1_0"  # python train.py of 0.1.0 with 32 worlds, 48 steps, hidden 8
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A small run that a program has made."""
+    config = deimos.TrainConfig(
+        env=particle.Config(goal_period=8), ppo=PPOConfig(hidden=(8,)), num_envs=16, env_steps=48, device="cpu",
+        threads=1, eval=EvalConfig(worlds=16, steps=40, adversary_steps=20, adversary_patience=1),
+    )  # fmt: skip
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        path = deimos.train(config, tmp_path_factory.mktemp("api") / "run")
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    return path
+
+
+def test_a_program_trains_evaluates_and_acts(run):
+    """Three calls lead from a configuration to actions; the evaluation is kept beside the one of the run's end."""
+    assert [row["goals"] for row in RunFolder(run).read_json("evaluation.json")] == ["naive", "adversary"]
+    rows = deimos.evaluate(run, goal_period=10, seed=3)
+    assert [(row["goals"], row["goal_period"], row["seed"]) for row in rows] == [("naive", 10, 3), ("adversary", 10, 3)]
+    assert len(RunFolder(run).read_json("evaluation.json")) == 4
+    policy = deimos.load_policy(run)
+    assert policy(torch.zeros(5, 12)).shape == (5, 3)
+
+
+def test_the_same_evaluation_replaces_its_rows(run):
+    """What was evaluated before with the same seed and sizes is not listed twice."""
+    before = len(RunFolder(run).read_json("evaluation.json"))
+    deimos.evaluate(run, worlds=16)
+    assert len(RunFolder(run).read_json("evaluation.json")) == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 10}, "steps must be at least 2 T = 16, got 10"),
+        ({"worlds": 0}, "worlds must be at least 1, got 0"),
+        ({"words": 3}, "words"),
+    ],
+)
+def test_evaluation_refuses(run, changes, message):
+    """A value that is not allowed, or a name that is none, is said in one line."""
+    with pytest.raises(RunError, match=message):
+        deimos.evaluate(run, **changes)
+
+
+def test_a_run_folder_is_not_overwritten(run):
+    """Training into a folder that exists is refused."""
+    with pytest.raises(RunError, match="exists and is not overwritten"):
+        deimos.train(out=run)
+
+
+def test_policy_of_an_old_run_acts_and_is_evaluated(tmp_path):
+    """A policy of 0.1.0 loads, and its run can be evaluated again."""
+    path = tmp_path / "run"
+    shutil.copytree(OLD, path)
+    assert deimos.load_policy(path)(torch.zeros(2, 12)).shape == (2, 3)
+    rows = deimos.evaluate(path, worlds=8)
+    assert [row["worlds"] for row in rows] == [8, 8]
+    assert len(RunFolder(path).read_json("evaluation.json")) == 4
+
+
+def test_an_old_run_is_resumed_or_refused_in_one_line(tmp_path, capsys):
+    """A checkpoint of 0.1.0 does not go on half understood."""
+    path = tmp_path / "run"
+    shutil.copytree(OLD, path)
+    code = cli.main(["train", "--resume", str(path), "--env-steps", "72"])
+    said = capsys.readouterr().err.strip().splitlines()
+    assert (code, len(said)) == (2, 1)
+    assert "schema" in said[0]

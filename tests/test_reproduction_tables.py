@@ -1,0 +1,85 @@
+"""The commands behind the tables of the documentation, on made-up or tiny runs."""
+
+import json
+
+import numpy as np
+import pytest
+
+from deimos.learn.ppo import PPOConfig
+from deimos.run import training
+from deimos.run.evaluation import EvalConfig
+from deimos.sim.envs.particle import Config
+from reproduction import oracle_table, particle_population, quad_rough
+
+
+def test_table_of_populations_has_medians_and_ranges(tmp_path, capsys):
+    """Every cell of the populations has a row against each kind of goals, with the median of its five seeds."""
+    cells = [(*cell, seed) for cell in particle_population.CELLS for seed in particle_population.SEEDS]
+    for variant, method, seed in cells:
+        naive = {
+            "crashes_per_1000": 0.01 * seed, "crash_rate": 0.001, "score": 0.8, "reward": 0.7, "interactions": 100,
+            "interaction_crashes": 1, "adversary_auroc": None, "weak_adversary": None,
+        }  # fmt: skip
+        attacked = naive | {"crashes_per_1000": 1.0 + seed, "interaction_crashes": 7, "crash_rate": 0.5}
+        attacked |= {"adversary_auroc": 0.9, "weak_adversary": seed == 0}
+        folder = tmp_path / f"{variant}-{method}-s{seed}"
+        folder.mkdir()
+        (folder / "evaluation.json").write_text(json.dumps([naive, attacked]))
+    particle_population.print_tables(tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    assert "| relative | uniform | naive | 0.020 (0.000-0.040) | 0.0010 | 0.800 (0.800-0.800) | 0.7000 |  |" in lines
+    assert sum("| 3.000 (1.000-5.000) | 0.5000 |" in line and "0.900 (1 of 5 weak)" in line for line in lines) == 6
+    assert "non-first interaction: median 5 [5, 5], each 5, 5, 5, 5, 5." in lines[-1]
+    particle_population.write_rows(tmp_path, [[{"seed": 0}]])
+    found = json.loads((tmp_path / "population.json").read_text())
+    assert (len(found["evaluations"]), found["audits"]) == (2 * len(cells), [{"seed": 0}])
+
+
+def test_table_of_rough_ground_has_quarters(tmp_path):
+    """The quarters of a run have their means over worlds, levels and memory, and the figure is drawn."""
+    path = tmp_path / "worlds.npz"
+    reward = np.repeat(np.arange(1.0, 21.0)[:, None], 6, axis=1)
+    np.savez(
+        path, reward=reward, level=np.full((20, 6), 1.5), invalid=np.ones(20), memory=np.full(20, 900.0),
+        seconds=np.arange(60.0, 1260.0, 60.0),
+    )  # fmt: skip
+    lines = quad_rough.table(path).splitlines()
+    assert lines[2] == "| 1 | +3.00000 [+3.00000, +3.00000] | 1.50 | 900 |"
+    assert lines[5] == "| 4 | +18.00000 [+18.00000, +18.00000] | 1.50 | 900 |"
+    assert "Last quarter less first, over 6 worlds: +15.00000 [+15.00000, +15.00000]." in lines
+    assert "20 of 2880 world-steps invalid." in lines
+    assert lines[-1] == "20 iterations, 20.0 minutes."
+    quad_rough.draw(path, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+    assert all((origin / "policy.pt").is_file() for origin in quad_rough.ORIGINS.values())
+
+
+def test_table_of_the_oracle_asks_every_rule(tmp_path, monkeypatch):
+    """A run gives the crashes of every rule's choices by fear and by truth, and those of three Adversaries."""
+    env = Config(goal_period=10, max_speed=200.0, max_force=200.0)
+    config = training.TrainConfig(
+        env=env, method="uniform", num_envs=16, env_steps=48, ppo=PPOConfig(hidden=(8,), epochs=1), evaluation=False,
+        device="cpu", threads=1,
+    )  # fmt: skip
+    trainer, folder = training.start(config, tmp_path / "run", None)
+    training.train(trainer, folder)
+    monkeypatch.setattr(oracle_table, "WORLDS", 8)
+    monkeypatch.setattr(oracle_table, "STEPS", 41)
+    evaluation = EvalConfig(worlds=32, steps=40, adversary_steps=40, adversary_patience=1, adversary_interactions=1)
+    monkeypatch.setattr(oracle_table, "EvalConfig", lambda: evaluation)
+    same, closed = oracle_table.measure(folder.path)
+    assert np.shape(same) == (len(oracle_table.RULES), 2)
+    assert len(closed) == 3
+    assert all(0.0 <= rate <= 1.0 for rate in [*np.ravel(same), *closed])
+    assert same[-1][1] == max(truth for _, truth in same)  # who knows the truth and wants a crash gets most
+    assert oracle_table.spread(np.array([0.1, 0.2, 0.6])) == "0.2000 (0.1000-0.6000)"
+
+
+@pytest.mark.parametrize("module", [oracle_table, particle_population, quad_rough])
+def test_commands_explain_themselves(module, monkeypatch, capsys):
+    """Each is a command that names its way to be called."""
+    monkeypatch.setattr("sys.argv", ["it", "--help"])
+    with pytest.raises(SystemExit) as end:
+        module.main()
+    assert end.value.code == 0
+    assert f"python -m {module.__name__} runs/" in capsys.readouterr().out

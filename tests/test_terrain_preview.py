@@ -1,0 +1,70 @@
+"""Pictures of terrains: colours are heights, lengths are to scale, and what is in front hides what is behind."""
+
+import math
+
+import numpy as np
+import pytest
+from deimos.terrain import preview
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+
+from deimos import terrain
+
+STEP = 0.05  # [m] per pixel; the height grid has a sample for each
+COLOURS = ScalarMappable(Normalize(-1.0, 2.0), colormaps["YlGnBu_r"])
+
+
+def wall(height):
+    """A plain of 10 m along x and 8 m along y with a wall across it, from y = 0 m to 0.5 m."""
+    heights = np.zeros((201, 161), np.float32)
+    heights[:, 80:91] = height
+    return terrain.Terrain(
+        heights, 0.05, (-5.0, -4.0), np.zeros((1, 1, 3), np.float32), ("flat",), 8.0, np.zeros(1, np.float32)
+    )
+
+
+def coloured(picture, height):
+    """Where a picture has the colour of flat ground at a height."""
+    return np.isclose(picture, COLOURS.to_rgba(height)[:3], atol=1e-6).all(axis=-1)
+
+
+def test_from_above_colours_are_heights():
+    """Seen from above, flat ground has the colour that the bar shows for its height, in its place and size."""
+    picture, (left, right, bottom, top) = preview._draw(wall(1.0), COLOURS, STEP, 0.0, math.pi / 2)
+    np.testing.assert_allclose((left, right, bottom, top), (-5, 5, -4, 4), atol=STEP)
+    assert picture.shape == pytest.approx((160, 200, 3), abs=1)
+    rows = np.flatnonzero(coloured(picture, 1.0)[:, 100])  # less the shaded pixels of its risers
+    assert len(rows) == pytest.approx(0.5 / STEP, abs=2)
+    assert rows.mean() == pytest.approx((4 - 0.25) / STEP, abs=1)  # the first row is at the top
+    assert coloured(picture, 0.0)[:68].all()
+    assert coloured(picture, 0.0)[-70:].all()
+
+
+@pytest.mark.parametrize("height", [0.0, 0.5, 1.5])
+def test_oblique_wall_hides_the_ground_behind(height):
+    """Seen from 45 degrees, a wall hides as much ground behind it as it is high, and lengths shrink by sqrt(1/2)."""
+    picture, _ = preview._draw(wall(height), COLOURS, STEP, 0.0, math.pi / 4)
+    column, s = picture[:, 100], math.sqrt(0.5)
+    behind, before = (8 / 2 - 0.5 - height) * s / STEP, 8 / 2 * s / STEP
+    expected = behind + before + (0 if height else 0.5 * s / STEP)
+    assert np.count_nonzero(coloured(column, 0.0)) == pytest.approx(expected, abs=3)
+    if height:
+        assert np.count_nonzero(coloured(column, height)) == pytest.approx(0.5 * s / STEP, abs=2)
+
+
+def test_beside_the_ground_is_white():
+    """A turned view is white around the ground and grey where the ground is cut below its near edges."""
+    picture, (left, right, _, _) = preview._draw(wall(1.0), COLOURS, STEP, math.radians(30.0), math.pi / 4)
+    assert right - left == pytest.approx(10 * math.cos(math.radians(30)) + 8 * 0.5, abs=2 * STEP)
+    for row, column in ((0, 0), (0, -1), (-1, 0)):
+        np.testing.assert_array_equal(picture[row, column], 1.0)
+    cut = np.isclose(picture, preview.WALL).all(axis=-1)
+    np.testing.assert_allclose(cut.sum(axis=0)[5:-5], 0.01 * 10 * math.sqrt(0.5) / STEP, atol=1.5)
+
+
+def test_large_grids_are_thinned():
+    """A grid that is finer than the picture is thinned first, and the picture stays to scale."""
+    picture, span = preview._draw(wall(1.0), COLOURS, 10 * STEP, 0.0, math.pi / 2)
+    assert picture.shape == pytest.approx((16, 20, 3), abs=1)
+    np.testing.assert_allclose(span, (-5, 5, -4, 4), atol=10 * STEP)
