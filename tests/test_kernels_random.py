@@ -7,6 +7,8 @@ import pytest
 import warp as wp
 from deimos.kernels.random import Purpose, draw_uniforms, draw_words, vec4u
 
+from deimos.nn import random
+
 ONES = 0xFFFFFFFF
 # Of the paper's own implementation, Random123: examples/kat_vectors, philox4x32 with 10 rounds.
 KNOWN_ANSWERS = [
@@ -114,6 +116,13 @@ def test_addresses_draw_independently(device):
 def test_purposes_are_distinct():
     """No two purposes share a key, or they would share a stream."""
     assert len({int(purpose) for purpose in Purpose}) == len(Purpose.__members__)
+
+
+def test_purposes_of_torch_are_in_the_table():
+    """What torch draws by address has the numbers that the table of purposes keeps for it."""
+    assert {purpose.name: int(purpose) for purpose in random.Purpose}.items() <= {
+        purpose.name: int(purpose) for purpose in Purpose
+    }.items()
 
 
 def test_uniforms_are_independent_of_the_other_rows(device):
