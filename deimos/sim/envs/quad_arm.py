@@ -30,7 +30,7 @@ class Config(LocomotionConfig):
     def largest_reward(self) -> float:
         """See ``EnvConfig.largest_reward``: perfect tracking, and the end effector at its goal."""
         per_second = max(self.arm_rewards.reach, 0.0) + max(self.arm_rewards.precision, 0.0)
-        return super().largest_reward + per_second * self.physics.timestep * self.physics.substeps
+        return super().largest_reward + per_second * self.physics.control_period
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -82,7 +82,7 @@ class LocomotionConfig(EnvConfig):
     def largest_reward(self) -> float:
         """See ``EnvConfig.largest_reward``: perfect tracking."""
         per_second = max(self.rewards.linear_tracking, 0.0) + max(self.rewards.yaw_tracking, 0.0)
-        return per_second * self.physics.timestep * self.physics.substeps
+        return per_second * self.physics.control_period
 
     def without_randomness(self) -> "LocomotionConfig":
         """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns."""

@@ -90,8 +90,8 @@ class Locomotion(WarpEnv):
         super().__init__(
             config, num_envs, device, seed, env_offset,
             layout=_layout(robot, parts, len(self.points)), goal_range=[half for part in parts for half in part.range],
-            action_dim=len(robot.joints), action_bound=_action_bound(robot), dt=config.physics.control_period,
-            time_limit=config.episode_steps,
+            action_dim=len(robot.joints), dt=config.physics.control_period, time_limit=config.episode_steps,
+            action_bound=max(abs(end) for joint in robot.joints for end in joint.action_range),
         )  # fmt: skip
         ground = config.load_terrain()
         self.terrain = ground or terrain.flat()
@@ -267,11 +267,6 @@ class Locomotion(WarpEnv):
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
         """See ``Env.reference_policy``. Nobody has written down how to walk."""
         return None
-
-
-def _action_bound(robot: Robot) -> float:
-    """The largest action that any joint can do; those of every joint are in the robot's data."""
-    return max(abs(end) for joint in robot.joints for end in joint.action_range)
 
 
 def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:
