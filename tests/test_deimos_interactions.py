@@ -547,20 +547,3 @@ def test_what_is_stored_carries_no_gradient(torch_device):
     resolved = interactions.resolved()
     assert len(resolved) == 2
     assert not any(getattr(resolved, name).requires_grad for name in Resolved.__dataclass_fields__)
-
-
-def test_a_book_of_before_horizons_is_read(torch_device):
-    """A loop's state as version 0.1 wrote it, without horizons, resumes as what it says: T for every interaction."""
-    loops = [build_loop(torch_device), build_loop(torch_device)]
-    run(loops[0], 7, crash=[1])
-    state = loops[0].state_dict()
-    book = state["interactions"]
-    old = {name: book[name] for name in ("now", "active", "pending", "ring", "cursor")}
-    old |= {"issued": book["issued_at"], "marks": book["marks"][:, :, :3]}
-    loops[1].load_state_dict(state | {"interactions": old})
-    for loop in loops:
-        run(loop, 5)
-    first, second = (loop.interactions.resolved() for loop in loops)
-    assert len(first) == 2
-    for name in Resolved.__dataclass_fields__:
-        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=0, equal_nan=True)

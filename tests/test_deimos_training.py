@@ -26,6 +26,7 @@ from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import director, uniform
 from deimos.learn.ppo import PPOConfig
 from deimos.learn.rollout import Rollout
+from deimos.nn.random import Purpose, normals
 from deimos.run import presets, training
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
@@ -243,7 +244,7 @@ def test_seed_reaches_everything():
         lambda trainer: trainer.loop.selector.fear.network[0].weight,
         lambda trainer: trainer.loop.selector.fear.generator.get_state(),
         lambda trainer: trainer.env.tensors["position"],
-        lambda trainer: trainer.env.tensors["target"],
+        lambda trainer: trainer.env.tensors["goal"],
         lambda trainer: trainer.env.sample_goals(torch.arange(2), 3),
         lambda trainer: trainer.env.draw(torch.arange(2)),
     ):
@@ -306,7 +307,7 @@ def test_nan_is_one_line_on_the_command_line(tmp_path, monkeypatch, capfd):
     collect = training.Trainer.collect
 
     def poisoned(trainer):
-        if trainer.iteration == 2:
+        if trainer.iteration == 1:  # before the second
             trainer.env.tensors["position"][5] = torch.nan
         collect(trainer)
 
@@ -497,7 +498,7 @@ CONFIGS = {
         env=particle.Config(
             variant="relative", goal_period=7, max_speed=3.3, max_force=float("inf"), goal_range=0.1,
             reward="reciprocal", reward_length=1e-3, spawn_range=999.0, time_limit=55, stagger_goals=True,
-            obs_scale="raw",
+            obs_scale="raw", crash_penalty=2.5,
         ),
         selector=director.Config(
             percentile=33.3, rule="argmin", candidates=17, probe=0.05, control="shuffled",
@@ -582,7 +583,7 @@ def test_policy_acts_as_the_actor_in_physical_units(tmp_path, variant, obs_scale
     policy = deimos.load_policy(tmp_path / "run")
 
     env, state = trainer.env, trainer.env.tensors
-    goal = state["target"] - state["position"] if variant == "relative" else state["target"]
+    goal = state["goal"] - state["position"] if variant == "relative" else state["goal"]
     physical = torch.cat([state["velocity"], state["position"], state["force"], goal], dim=1)
     mean = trainer.ppo.actor(env.obs).detach()
     expected = mean.clamp(-0.3, 0.3)
@@ -647,3 +648,27 @@ def test_a_preset_is_a_training_configuration():
         assert kind(presets.preset(name).env) == presets.environment(name)
     with pytest.raises(ValueError, match=r"no preset 'nonsense'; there are: .*particle"):
         presets.preset("nonsense")
+
+
+def test_exploration_is_addressed_by_world_and_step():
+    """The first rollout draws the noise of steps 0 to T - 1, the second goes on after it."""
+    trainer = training.Trainer(CONFIG, torch.device("cpu"))
+    steps, worlds = CONFIG.ppo.num_steps, torch.arange(CONFIG.num_envs)
+    for first in (0, steps):
+        trainer.iterate()
+        numbers = torch.arange(first, first + steps).unsqueeze(1)
+        expected = normals(CONFIG.seed, Purpose.EXPLORATION, worlds, numbers, 3)
+        assert torch.equal(trainer.rollout.noise, expected)
+
+
+def test_a_rollout_keeps_no_graph():
+    """What an environment or a caller hands over with gradients is recorded without."""
+    rollout = Rollout(2, 3, 4, 1, torch.device("cpu"))
+    wanting = torch.ones(3, requires_grad=True)
+    no, yes = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)
+    rollout.record(
+        0, obs=wanting.unsqueeze(1).expand(3, 4), reward=2 * wanting, terminated=no, truncated=yes, invalid=no,
+        weight=wanting, cut_off=torch.arange(3),
+    )  # fmt: skip
+    kept = [value for value in vars(rollout).values() if isinstance(value, torch.Tensor)]
+    assert not any(value.requires_grad for value in [*kept, *rollout.cut_off()])

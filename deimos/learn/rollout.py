@@ -49,6 +49,7 @@ class Rollout:
         self.weight = torch.ones(num_steps, n, device=device)
         """Weight of the transition in everything learnt: 0 leaves it out."""
 
+    @torch.no_grad()
     def record(
         self, t: int, *, obs: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, invalid: Tensor,
         weight: Tensor, cut_off: Tensor,

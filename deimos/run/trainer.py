@@ -108,6 +108,7 @@ class Trainer:
         with on_threads(1):
             self._collect()
 
+    @torch.no_grad()
     def _collect(self) -> None:
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
         ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
@@ -134,11 +135,11 @@ class Trainer:
             The row of ``progress.csv``.
 
         Raises:
-            SimulationError: If a number is not finite. This trainer is spoilt then; the last checkpoint is not.
+            SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
         """
-        self.iteration += 1
         try:
             self.collect()
+            self.iteration += 1
             self.env.check()
             if self.env.may_go_on_invalid:
                 self.rollout.exclude_invalid()

@@ -4,7 +4,7 @@ The task is Legged Gym's (Rudin et al. 2021) as Gauthier's thesis uses it (4.1.2
 rise and fall with the reward.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from itertools import accumulate, pairwise
@@ -263,10 +263,6 @@ class Locomotion(WarpEnv):
         """See ``Env.goal_point``."""
         places = [part.points for part in self._launches if part.points]
         return places[0]()[world] if places else None
-
-    def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
-        """See ``Env.reference_policy``. Nobody has written down how to walk."""
-        return None
 
 
 def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:
