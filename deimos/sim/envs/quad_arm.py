@@ -59,5 +59,5 @@ PRESETS = {
         "env_steps": 4800,
         "ppo": _PPO | {"discount": 0.95, "gae_lambda": 0.9},
     },
-    "quad-arm-thesis": quad.PRESETS["quad-thesis"] | {"ppo": _PPO | {"hidden": (512, 256, 128)}},
+    "quad-arm-large": quad.PRESETS["quad-large"] | {"ppo": _PPO | {"hidden": (512, 256, 128)}},
 }  # fmt: skip

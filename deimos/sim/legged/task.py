@@ -190,8 +190,10 @@ class Locomotion(WarpEnv):
             self._sums += self.term.sum(0)
             self._steps_reported += 1
 
-        validate = next((part.validate for part in self._launches if part.validate), None)
-        valid_goals = partial(validate, self._row.array, self._candidate_scale.array) if validate else None
+        validations = [part.validate for part in self._launches if part.validate]
+        if len(validations) > 1:
+            raise ValueError(f"At most one part may restrict which goals are valid, got {len(validations)}.")
+        valid_goals = partial(validations[0], self._row.array, self._candidate_scale.array) if validations else None
         self.begin(step, Captured(self._run_reset, self.device), valid_goals=valid_goals)
         self.physics.buffer_use()  # what the recording needed says nothing about these worlds
 
