@@ -263,7 +263,7 @@ def _backward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int, 
 
 @wp.func
 def _clipped_loss(value: float, before: float, target: float, clip: float):
-    """The clipped value loss and its slope, as ``deimos.learn.ppo.value_gradient`` has them."""
+    """The clipped value loss and its slope, as ``deimos.nn.returns.value_gradient`` has them."""
     error = value - target
     step = value - before
     clipped = before + wp.clamp(step, -clip, clip) - target
@@ -407,7 +407,7 @@ def gradients(
     rows: range,
     record: bool = False,
 ) -> wp.Launch | None:
-    """The clipped value loss of some of the critics and the gradient of their weights, see ``ppo.value_gradient``.
+    """The clipped value loss of some of the critics and the gradient of their weights, see ``returns.value_gradient``.
 
     Args:
         critics: Their memory, whose gradients are written.

@@ -83,7 +83,7 @@ def test_goals_of_the_old_range_say_nothing_of_the_new():
 
 
 def test_a_saved_curriculum_stays_what_it_was():
-    """What happens after a state was taken does not reach into it, and from it the curriculum goes on."""
+    """What happens after a state was taken does not reach into it, and from it the curriculum continues."""
     selector, other, ledger = curriculum(), curriculum(), Ledger()
     ledger.update(selector, [0.9, 0.0])
     state = selector.state_dict()

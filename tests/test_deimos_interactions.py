@@ -132,7 +132,7 @@ def test_crash_within_the_period_is_labelled_at_once(torch_device, steps):
 
 
 def test_crash_on_a_goal_change_is_charged_to_the_old_goal(torch_device):
-    """A crash on the very step that the next goal is due on belongs to the goal that was in force."""
+    """A crash on the very step that the next goal is due on belongs to the goal that was active."""
     loop = build_loop(torch_device)
     run(loop, 5)
     old = loop.env.goal.clone()
@@ -197,7 +197,7 @@ def test_every_ending_by_hand(torch_device):
 
 
 def test_interaction_straddles_rollouts(torch_device):
-    """Rollouts shorter than T cut nothing: an interaction goes on over as many of them as it takes."""
+    """Rollouts shorter than T cut nothing: an interaction continues over as many of them as it takes."""
     loop = build_loop(torch_device, goal_period=10)
     env, rollout = loop.env, Rollout(4, 2, loop.env.obs_dim, 3, torch_device)
     found = []
@@ -394,7 +394,7 @@ def test_equals_a_plain_list(torch_device, goal_period, windows):
 
 
 def test_resume_is_exact(torch_device):
-    """A book that goes on from a state dictionary resolves what one that was never closed resolves."""
+    """A book that continues from a state dictionary resolves what one that was never closed resolves."""
     book, other = (make_interactions(4, torch_device) for _ in range(2))
     advance(book, make_step(4, torch_device))
     issue(book, [0, 1, 2], [0.0, 1.0, 2.0], torch_device)

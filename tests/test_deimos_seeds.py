@@ -36,7 +36,7 @@ def test_streams_are_independent():
 
 
 def test_weights_leave_the_global_stream_alone():
-    """Networks depend on their generator alone, and torch's own stream goes on as if nothing had been."""
+    """Networks depend on their generator alone, and torch's own stream continues as if nothing had been."""
 
     def weights(seed, use):
         return mlp(4, (8,), 1, "relu", generator(seed, use))[0].weight.detach().clone()
@@ -83,7 +83,7 @@ def test_a_run_leaves_all_global_streams_alone():
 
 
 def test_a_stream_goes_on_from_its_state():
-    """A saved stream is gone on with bit for bit."""
+    """A saved stream continues bit for bit."""
     first, second = (generator(seed, "a", torch.device("cpu")) for seed in (0, 1))
     torch.rand(5, generator=first)
     restore(second, first.get_state())

@@ -87,7 +87,7 @@ def go_on(trainer, folder, iterations=None):
 
 
 def resume(path):
-    """Go on with a run to its end, by the command line."""
+    """Resume a run and finish it, by the command line."""
     assert cli.main(["train", "--resume", str(path)]) == 0
 
 
@@ -251,22 +251,22 @@ def test_seed_reaches_everything():
 
 
 def poison_actor(trainer):
-    """Spoil one weight of the actor."""
+    """Make one weight invalid of the actor."""
     trainer.ppo.actor.mean[0].weight.data[3, 2] = torch.nan
 
 
 def poison_critic(trainer):
-    """Spoil one weight of the critic."""
+    """Make one weight invalid of the critic."""
     trainer.ppo.critic[2].bias.data[1] = torch.nan
 
 
 def poison_fear(trainer):
-    """Spoil one weight of the fear network."""
+    """Make one weight invalid of the fear network."""
     trainer.loop.selector.fear.network[0].weight.data[0, 0] = torch.inf
 
 
 def poison_world(name):
-    """Spoil one number of world 17."""
+    """Make one number of world 17 invalid."""
 
     def poison(trainer):
         trainer.env.tensors[name][17, 1] = torch.nan
@@ -378,7 +378,7 @@ def test_failed_write_keeps_the_last_checkpoint(tmp_path, break_disk):
 
 
 def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch):
-    """A run that a full disk stopped at a checkpoint goes on from the last good one, bit for bit."""
+    """A run that a full disk stopped at a checkpoint resumes from the last good one, bit for bit."""
     path = tmp_path / "run"
     trainer, folder = training.start(CONFIG, path, None)
     synced = []
@@ -400,7 +400,7 @@ def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch)
 
 
 def test_full_disk_is_one_line_on_the_command_line(undisturbed, tmp_path):
-    """Where no file can grow any more the run ends with one line and exit code 2, whoever met it, and can go on."""
+    """Where no file can grow any more the run ends in one line with exit code 2, whoever met it, and can be resumed."""
     path = tmp_path / "run"
     process = start_process(path, 1e9, file_size=4096)  # TensorBoard's file is the first to reach it
     _, stderr = process.communicate(timeout=60)

@@ -24,7 +24,7 @@ class FearConfig:
     activation: Activation = "relu"
     """Between the layers."""
     learning_rate: float = 1e-2
-    """Step size of Adam, positive."""
+    """Learning rate of Adam, positive."""
     epochs: int = 1
     """Passes over the window of interactions in every fit, at least 1."""
     minibatches: int = 8

@@ -16,7 +16,7 @@ SCHEMA = 1
 
 
 class Policy(nn.Module):
-    """Physical observations to actions, by the mean of the trained policy.
+    """Physical observations to the deterministic (mean) actions of the trained policy.
 
     Attributes:
         layout: What stands where in the observation, with units.

@@ -41,7 +41,7 @@ class PPOConfig:
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, positive."""
     desired_kl: float = 0.01
-    """KL divergence of one update that the adaptive schedule aims at, at least 0; 0 keeps the step size fixed."""
+    """KL divergence of one update that the adaptive schedule aims at, at least 0; 0 keeps the learning rate fixed."""
     discount: float = 0.99
     """Weight of the next step's reward (gamma), in [0, 1]."""
     gae_lambda: float = 0.95

@@ -1,4 +1,4 @@
-"""From nothing or from a checkpoint to a trained policy: how a run begins, goes on, is saved and ends."""
+"""From nothing or from a checkpoint to a trained policy: how a run begins, resumes, is saved and ends."""
 
 import os
 import platform
@@ -21,7 +21,7 @@ from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 
 SCHEMA = 1  # of config.json
-CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be taken over, but its worlds cannot go on
+CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be loaded, but not its worlds
 CHECKPOINT_SECONDS = 30.0
 LEAST_BYTES = 100  # of any transition, and of any world
 
@@ -166,12 +166,12 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
 
 
 def resume(path: Path, env_steps: int | None = None, device: str | None = None) -> tuple[Trainer, RunFolder]:
-    """Go on with a run from its last checkpoint.
+    """Resume a run from its last checkpoint.
 
     Args:
         path: Its folder.
         env_steps: A larger budget; ``None`` for the one that it had.
-        device: Where to go on; ``None`` for where it was.
+        device: Where to resume; ``None`` for where it was.
 
     Raises:
         RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.

@@ -321,7 +321,7 @@ def _buffer_sizes(model: "mujoco.MjModel", num_envs: int, config: PhysicsConfig,
     """Buffer sizes: contacts in all worlds, and constraint rows in each.
 
     Buffers cost time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 136
-    rows a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown about by
+    rows a policy's robots needed 64 at most, but for worlds that diverged (108), and robots that were thrown about by
     their own legs 93.
     """
     contacts, pairs, rows = _largest_demand(model, plane=plane)
