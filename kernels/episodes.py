@@ -29,7 +29,7 @@ class Worlds:
     num_envs: int
     num_threads: int  # that share the worlds
     goal_period: int  # T: steps that a goal is active
-    time_limit: int  # steps of an episode, 0 for no limit
+    time_limit: int  # steps of an episode, 0 disables the limit
     stagger: wp.bool  # whether the goal clock of a world's first episode starts at a random step
     seed: wp.uint32  # of every draw
     world_offset: int  # global number of world 0

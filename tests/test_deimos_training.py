@@ -287,7 +287,7 @@ def poison_world(name):
     ids=["actor", "critic", "fear", "position", "velocity", "goal"],
 )  # fmt: skip
 def test_nan_stops_the_run_and_keeps_the_checkpoint(tmp_path, poison, message):
-    """NaN in a weight or a world stops the run, says where, and leaves the checkpoint of before, which loads."""
+    """NaN in a weight or a world stops the run, says where, and leaves the previous checkpoint, which loads."""
     trainer, folder = run(CONFIG, tmp_path / "run", iterations=2)
     before = (folder.path / "checkpoint.pt").read_bytes(), (folder.path / "policy.pt").read_bytes()
     poison(trainer)
@@ -360,7 +360,7 @@ def forbid_writing(path, monkeypatch):
 
 @pytest.mark.parametrize("break_disk", [fill_disk_at_sync, fill_disk_in_torch, fill_disk_for_good, forbid_writing])
 def test_failed_write_keeps_the_last_checkpoint(tmp_path, break_disk):
-    """A checkpoint that cannot be written raises RunError, leaves the one of before and nothing half-written."""
+    """A checkpoint that cannot be written raises RunError, leaves the previous one and nothing half-written."""
     trainer, folder = run(CONFIG, tmp_path / "run", iterations=1)
     before = files(folder.path)
     trainer.iterate()

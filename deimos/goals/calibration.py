@@ -43,7 +43,7 @@ class Calibration(Stateful):
         return torch.sigmoid(log_odds / self.temperature)
 
     def set_share(self, share: float) -> None:
-        """Take over the share of crashes, in (0, 1), that the class weights were made from."""
+        """Set the share of crashes, in (0, 1), that the class weights were made from."""
         self.prior = math.log(share / (1.0 - share))
 
     def fit(self, log_odds: Tensor, crashed: Tensor, steps: int = 3) -> None:

@@ -95,7 +95,7 @@ class GoalDirector:
 
         Args:
             state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be
-                that of before or after its reset: nothing is chosen for it.
+                that from before or after its reset: nothing is chosen for it.
             goal: Goals that were active during the step, shape (num_envs, goal_dim).
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).

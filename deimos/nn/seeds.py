@@ -8,7 +8,7 @@ import torch
 
 
 def derive(seed: int, use: str) -> int:
-    """The seed of one use of chance.
+    """The seed of one use of randomness.
 
     Two networks, or a network and its noise, that were seeded alike would be correlated; numbers that
     are derived are not, however alike the seeds and the uses are.
@@ -24,7 +24,7 @@ def derive(seed: int, use: str) -> int:
 
 
 def generator(seed: int, use: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """A generator of its own for one use of chance; the arguments are those of ``derive``.
+    """A generator of its own for one use of randomness; the arguments are those of ``derive``.
 
     Weights are drawn on the CPU, whatever the device of their network.
     """

@@ -122,7 +122,7 @@ def _check_memory(config: TrainConfig) -> None:
 
 
 def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
-    """Take over the networks of another run, whose observations must mean the same."""
+    """Load the networks of another run, whose observations must mean the same."""
     state = load_checkpoint(origin)
     try:
         layout = load_policy(origin.path).layout
@@ -210,7 +210,7 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     """Write the checkpoint and the policy.
 
     Raises:
-        RunError: If they cannot be written; the ones of before are whole.
+        RunError: If they cannot be written; the previous ones are intact.
     """
     save_tensors(folder.path / "checkpoint.pt", {"schema": CHECKPOINT_SCHEMA, **trainer.state_dict()})
     ppo, env = trainer.config.ppo, trainer.env
@@ -236,8 +236,8 @@ def train(
         Whether the budget was used up.
 
     Raises:
-        SimulationError: If a number is not finite; the last checkpoint is that of before.
-        RunError: If a file cannot be written; the last checkpoint is whole.
+        SimulationError: If a number is not finite; the last checkpoint is intact.
+        RunError: If a file cannot be written; the last checkpoint is intact.
     """
     from torch.utils.tensorboard import SummaryWriter
 
