@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -647,3 +648,18 @@ def test_a_preset_is_a_training_configuration():
         assert kind(presets.preset(name).env) == presets.environment(name)
     with pytest.raises(ValueError, match=r"no preset 'nonsense'; there are: .*particle"):
         presets.preset("nonsense")
+
+
+def test_a_run_leaves_all_global_streams_alone():
+    """Building, training and saving under selectors with networks moves neither torch's nor NumPy's global stream."""
+    before = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+    for name in ("p75", "rnd", "vds"):
+        config = TrainConfig(
+            env=particle.Config(goal_period=4), method=name, ppo=PPOConfig(hidden=(8,)), num_envs=16, evaluation=False
+        )
+        trainer = training.Trainer(config, torch.device("cpu"))
+        for _ in range(2):
+            trainer.iterate()
+        trainer.load_state_dict(trainer.state_dict())
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert str(np.random.get_state()) == str(before[1])  # noqa: NPY002
