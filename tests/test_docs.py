@@ -18,7 +18,7 @@ from deimos.sim.envs import particle
 
 HOME = Path(__file__).parent.parent
 DOCS = HOME / "docs"
-PAGES = [HOME / "README.md", HOME / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [HOME / "README.md", HOME / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("lab/*.md"))]
 SUFFIXES = {".py", ".md", ".toml", ".json", ".csv", ".png", ".svg"}
 
 
@@ -77,7 +77,7 @@ def named_paths(page):
             yield link, (page.parent / link,)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(HOME).as_posix())
 def test_every_path_that_a_page_names_exists(page):
     """Files of the repository in backticks and in links are there; NAME stands for any name."""
     missing = [name for name, places in named_paths(page) if not any(place.exists() for place in places)]
@@ -86,7 +86,7 @@ def test_every_path_that_a_page_names_exists(page):
 
 def test_every_link_into_a_page_has_its_heading():
     """A link to a part of a page names one of its headings, as GitHub abbreviates them."""
-    for page in [*PAGES, *sorted(DOCS.glob("lab/*.md"))]:
+    for page in PAGES:
         for link, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", page.read_text(encoding="utf-8")):
             if "://" in link:
                 continue

@@ -221,11 +221,3 @@ def test_uniforms_are_torchs(torch_device, seed):
     world, count = (torch.from_numpy(values).long().to(torch_device) for values in (row, count))
     found = random.uniforms(seed, Purpose.GOAL, world + 12_345, count[world])
     assert torch.equal(found.cpu(), torch.from_numpy(expected.numpy()))
-
-
-def test_no_two_purposes_share_a_key():
-    """A number means the same here and in ``deimos.nn.random``; what only one of them draws has a number of its own."""
-    ours, theirs = ({purpose.value: purpose.name for purpose in purposes} for purposes in (random.Purpose, Purpose))
-    shared = ours.keys() & theirs.keys()
-    assert {ours[number] for number in shared} == {theirs[number] for number in shared} == {"GOAL"}
-    assert all(number >= 16 for number in ours.keys() - shared)
