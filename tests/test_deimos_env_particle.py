@@ -329,7 +329,7 @@ def test_clones_of_another_environment(torch_device):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_resume_is_exact(torch_device, variant):
-    """A run that goes on from its state dictionary in a new environment equals one that was never stopped."""
+    """A run that continues from its state dictionary in a new environment equals one that was never stopped."""
     config = {"variant": variant, "spawn_range": 20.0, "time_limit": 90, "stagger_goals": True}
     env = build(torch_device, **config)
     loop = build_loop(env)

@@ -1,4 +1,4 @@
-"""What becomes of goals between two steps, in Deimos' own loop as in other people's: outcomes first, then choices."""
+"""Goals between two steps, in Deimos' own loop as in other people's: outcomes first, then choices."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A goal selector in other people's loops: one object, and torch is all that it imports."""
+"""A goal selector in other people's loops: one object, which needs only torch and NumPy."""
 
 from dataclasses import dataclass
 
@@ -25,10 +25,10 @@ class Assignment:
 
 
 class GoalDirector:
-    """Chooses the goals of any vectorised environment, and learns from what becomes of them.
+    """Chooses the goals of any vectorised environment, and learns from their outcomes.
 
     It keeps the goal clocks and the interactions, and lets the selector learn. Call ``step`` once after
-    every step of the worlds, and put the goals that it returns into force. It keeps copies, without gradients.
+    every step of the worlds, and make the goals that it returns the active ones. It keeps copies, without gradients.
 
     Selectors that learn from the learner's transitions (``vds``, ``plr``) need Deimos' own loop.
 
@@ -67,7 +67,7 @@ class GoalDirector:
 
     @property
     def interactions(self) -> Interactions:
-        """What became of its goals; see ``selector`` for when it is known."""
+        """The outcomes of its goals; see ``selector`` for when it is known."""
         return self._known.interactions
 
     @property
@@ -95,7 +95,7 @@ class GoalDirector:
 
         Args:
             state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be
-                that of before or after its reset: nothing is chosen for it.
+                that from before or after its reset: nothing is chosen for it.
             goal: Goals that were active during the step, shape (num_envs, goal_dim).
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
@@ -186,7 +186,7 @@ class GoalDirector:
         }
 
     def load_state_dict(self, state: dict, observed: Tensor, goal: Tensor) -> None:
-        """Go on from ``state_dict()``.
+        """Continue from ``state_dict()``.
 
         Args:
             state: What it returned.

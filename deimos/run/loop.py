@@ -45,7 +45,7 @@ class GoalLoop:
         self.renew(step, self.resolve(step))
 
     def resolve(self, step: Step) -> Changes:
-        """The first half of ``advance``: what became of the goals; nothing is reset yet."""
+        """The first half of ``advance``: the outcomes of the goals; nothing is reset yet."""
         return self.core.advance(step.terminated, step.truncated, step.goal_due, step.reward, step.tracking)
 
     def renew(self, step: Step, changes: Changes) -> None:
@@ -68,6 +68,6 @@ class GoalLoop:
         return {"env": self.env.state_dict(), **self.core.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Resume from ``state_dict()``."""
+        """Continue from ``state_dict()``."""
         self.env.load_state_dict(state["env"])
         self.core.load_state_dict(state)

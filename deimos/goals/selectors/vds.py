@@ -49,7 +49,7 @@ class Config(SelectorConfig):
     activation: Activation = "relu"
     """Between the layers."""
     learning_rate: float = 1e-3
-    """Step size of Adam, positive."""
+    """Learning rate of Adam, positive."""
     epochs: int = 5
     """Passes over every critic's data, at least 1."""
     minibatches: int = 4
@@ -200,7 +200,7 @@ class VDS(GoalSelector):
         )  # fmt: skip
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
-        # A thread of torch's that has had work goes on waiting for more, and would take the processor from the updates.
+        # A thread of torch's that has had work keeps waiting for more, and would take the processor from the updates.
         with on_threads(1):
             for _ in range(self.config.epochs):
                 for start in range(0, minibatches * size, size):
