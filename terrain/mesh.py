@@ -109,32 +109,16 @@ def blocks(x: np.ndarray, y: np.ndarray, bottom: float, top: float) -> Mesh:
     return from_quads(np.concatenate(quads))
 
 
-def join(meshes: list[Mesh], offsets: np.ndarray | None = None) -> Mesh:
-    """One mesh of several, each moved by its row of ``offsets`` [m], shape (n, 3)."""
-    moves = np.zeros((len(meshes), 3)) if offsets is None else offsets
-    starts = np.cumsum([0, *[len(mesh.vertices) for mesh in meshes[:-1]]])
-    vertices = np.concatenate([mesh.vertices + move for mesh, move in zip(meshes, moves, strict=True)])
-    return from_triangles(vertices, np.concatenate([m.faces + k for m, k in zip(meshes, starts, strict=True)]))
-
-
-def normals(mesh: Mesh) -> np.ndarray:
-    """Unit normals of the faces, shape (m, 3); NaN where a face has no area."""
-    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[mesh.faces], 1, 0)
-    normal = np.cross(b - a, c - a)
-    with np.errstate(invalid="ignore"):
-        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
 def steepest_slope(mesh: Mesh) -> float:
     """Rise over run of the steepest face that is not a riser."""
-    up = normals(mesh)[:, 2]
+    up = mesh.face_normals[:, 2]
     up = up[up > UPRIGHT]
     return float(np.sqrt(1 / up.min() ** 2 - 1)) if len(up) else 0.0
 
 
 def highest_riser(mesh: Mesh) -> float:
     """Height of the highest vertical face [m]; 0 without any."""
-    upright = np.abs(normals(mesh)[:, 2]) <= UPRIGHT
+    upright = np.abs(mesh.face_normals[:, 2]) <= UPRIGHT
     z = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[upright], 2]
     return float(np.ptp(z, axis=1).max()) if len(z) else 0.0
 
