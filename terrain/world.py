@@ -12,7 +12,7 @@ from deimos.checks import check_at_least, check_positive, check_range
 from . import catalog
 from .grid import Terrain, cells
 from .heightfield import rasterise
-from .mesh import Mesh, from_quads
+from .mesh import Mesh, from_quads, from_triangles
 from .shape import TileShape
 
 Progress = Callable[[str, float], None]
@@ -156,18 +156,20 @@ def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
 
     Every tile has a generator of its own, seeded by (seed, level, column): none depends on another.
     """
-    from trimesh.util import concatenate
+    from trimesh.util import append_faces
 
-    parts = []
+    parts, centres = [], grid.centres
     for level, difficulty in enumerate(grid.difficulty):
         for column, shape in enumerate(grid.column_shapes):
             seed = np.random.SeedSequence(grid.seed, spawn_key=(level, column))
             tile = shape.build(float(difficulty), np.random.default_rng(seed))
-            tile.vertices += grid.centres[level, column]
+            tile.vertices += centres[level, column]
             parts.append(tile)
         if progress is not None:
             progress("tiles", (level + 1) / grid.levels)
-    return concatenate(parts + ([_border(grid)] if grid.border > 0 else []))
+    if grid.border > 0:
+        parts.append(_border(grid))
+    return from_triangles(*append_faces([part.vertices for part in parts], [part.faces for part in parts]))
 
 
 def _require_memory(grid: Grid) -> None:
