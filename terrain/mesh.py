@@ -63,18 +63,20 @@ def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
     h = height[i, j]
     quads = [_quads((x[i], y[j], h), (x[i + 1], y[j], h), (x[i + 1], y[j + 1], h), (x[i], y[j + 1], h))]
 
-    i, j = np.nonzero(height[:-1] != height[1:])  # risers across x: from (i, j) to (i + 1, j), facing the lower one
-    here, there, at = height[i, j], height[i + 1, j], x[i + 1]
-    right, left = np.where(here > there, (y[j], y[j + 1]), (y[j + 1], y[j]))
-    low, high = np.minimum(here, there), np.maximum(here, there)
-    quads.append(_quads((at, right, low), (at, left, low), (at, left, high), (at, right, high)))
-
+    i, j = np.nonzero(height[:-1] != height[1:])
+    corners = _riser(height[i, j], height[i + 1, j], y[j], y[j + 1])
+    quads.append(_quads(*[(x[i + 1], along, z) for along, z in corners]))
     i, j = np.nonzero(height[:, :-1] != height[:, 1:])
-    here, there, at = height[i, j], height[i, j + 1], y[j + 1]
-    right, left = np.where(here > there, (x[i + 1], x[i]), (x[i], x[i + 1]))
-    low, high = np.minimum(here, there), np.maximum(here, there)
-    quads.append(_quads((right, at, low), (left, at, low), (left, at, high), (right, at, high)))
+    corners = _riser(height[i, j], height[i, j + 1], x[i + 1], x[i])
+    quads.append(_quads(*[(along, y[j + 1], z) for along, z in corners]))
     return from_quads(np.concatenate(quads))
+
+
+def _riser(here: np.ndarray, there: np.ndarray, right: np.ndarray, left: np.ndarray) -> list[tuple]:
+    """Corners of risers, along the edge and in height; ``right`` is that of who stands lower, if ``here`` is higher."""
+    right, left = np.where(here > there, (right, left), (left, right))
+    low, high = np.minimum(here, there), np.maximum(here, there)
+    return [(right, low), (left, low), (left, high), (right, high)]
 
 
 def rings(half_sides: np.ndarray, heights: np.ndarray) -> Mesh:
