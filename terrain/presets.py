@@ -101,21 +101,14 @@ def _share(table: Any) -> Share:
     return Share(shape=make(name, parameters), share=convert("share", share, float))
 
 
-def rough(
-    seed: int = 0, levels: int = 10, columns: int = 20, *, cell: float = 0.05, border: float = 5.0, device: str = "cpu"
-) -> Terrain:
+def rough(*, device: str = "cpu", **changes: Any) -> Terrain:
     """Legged Gym's grid of slopes, stairs and rectangles of rising difficulty, with steps that a Go1 can climb.
 
     Args:
-        seed: Seed of all tiles, at least 0.
-        levels: Tiles along x, from the easiest to the hardest, at least 1.
-        columns: Tiles along y, at least 1.
-        cell: Distance of two samples of the height grid [m]; must divide the tile of 8 m and the border.
-        border: Width of the flat border [m], at least 0.
         device: Warp device that rasterises the mesh.
+        changes: Fields of ``Grid`` that are to be otherwise than in the preset ``go1``.
 
     Raises:
-        ValueError: If an argument is out of its range, or the grid would not fit into memory.
+        ValueError: If a value is out of its range, or the grid would not fit into memory.
     """
-    grid = preset("go1", seed=seed, levels=levels, columns=columns, cell=cell, border=border)
-    return build(grid, device=device)
+    return build(preset("go1", **changes), device=device)

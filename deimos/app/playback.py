@@ -82,8 +82,6 @@ def main(arguments: list[str], program: str) -> None:
         env = env_config.build(1, torch.device("cpu"), options.seed, options.world)
     except ValueError as error:
         raise RunError(str(error)) from error
-    if env.scene(0) is None:
-        raise RunError("This environment has nothing to render; play shows robots.")
     loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
     afraid = _fear(folder, config, env)
     every = max(1, round(1.0 / (options.fps * env.dt)))
@@ -138,9 +136,10 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
     """A camera that follows the robot of world 0 and shows its goal, where it is a point, as a red ball."""
     import mujoco
 
-    scene = env.scene(0)
-    assert scene is not None
-    model = scene[0]
+    shown = env.scene(0)
+    if shown is None:
+        raise RunError("This environment has nothing to render; play shows robots.")
+    model = shown[0]
     model.vis.global_.offwidth, model.vis.global_.offheight = options.width, options.height
     with _rendering():
         renderer = mujoco.Renderer(model, options.height, options.width)

@@ -160,9 +160,9 @@ def _make(grid: Grid, outputs: Outputs, title: str) -> None:
         terrain, mesh = build_with_mesh(grid, progress=progress)
         seconds = time.perf_counter() - start
         jobs: dict[Path, Callable[[], None]] = {path: partial(export.save, path, terrain, mesh) for path in outputs.out}
-        if outputs.mjcf is not None:
+        if outputs.mjcf:
             jobs[outputs.mjcf] = partial(export.save_mjcf, outputs.mjcf, terrain)
-        if outputs.preview is not None:
+        if outputs.preview:
             jobs[outputs.preview] = partial(save_preview, outputs.preview, terrain, title)
         for number, (path, job) in enumerate(jobs.items()):
             progress(f"writing {path.name}", number / len(jobs))
@@ -191,15 +191,15 @@ def _check_outputs(outputs: Outputs) -> None:
         if path.suffix.lower() not in export.ENDINGS:
             raise RunError(f"out must end in one of {', '.join(export.ENDINGS)}, got {path}.")
     preview, mjcf = outputs.preview, outputs.mjcf
-    if preview is not None and preview.suffix.lower() != ".png":
+    if preview and preview.suffix.lower() != ".png":
         raise RunError(f"preview must end in .png, got {preview}.")
-    if mjcf is not None and mjcf.exists() and not mjcf.is_dir():
+    if mjcf and mjcf.exists() and not mjcf.is_dir():
         raise RunError(f"mjcf must be a folder, but {mjcf} is a file.")
-    files = [*outputs.out, *([] if preview is None else [preview])]
-    folders = [path.parent for path in [*files, *([] if mjcf is None else [mjcf])]]
-    if missing := [folder for folder in folders if not folder.is_dir()]:
-        raise RunError(f"The folder {missing[0]} does not exist; make it first.")
-    files += [] if mjcf is None else [mjcf / name for name in export.MJCF_FILES]
+    files = [*outputs.out, *filter(None, [preview])]
+    for path in [*files, *filter(None, [mjcf])]:
+        if not path.parent.is_dir():
+            raise RunError(f"The folder {path.parent} does not exist; make it first.")
+    files += [mjcf / name for name in export.MJCF_FILES] if mjcf else []
     for number, path in enumerate(files):
         if path in files[:number]:
             raise RunError(f"{path} is named twice.")

@@ -63,7 +63,7 @@ def main(arguments: list[str], program: str) -> None:
         return
     _check_names(rest)
     options, config = _train_options(), _preset(first.preset, rest)
-    default = options(**{field.name: getattr(config, field.name) for field in fields(config)})
+    default = options(**vars(config))
     _train(console.parse(options, rest, program, default=default))
 
 
