@@ -151,8 +151,7 @@ def _check_start(env: Env, build: Build) -> Claims:
         env.step(action)
     env.restart()
     yield from _are_equal(env.state_dict(), first, "restart must begin the first episodes again, but {name} differs.")
-    other = build(seed=1)
-    yield (env.goal != other.goal).any(), "first goals must depend on the seed."
+    yield (env.goal != build(seed=1).goal).any(), "first goals must depend on the seed."
     env.restart(torch.full((env.goal_dim,), 0.25, device=env.device))
     changed = (env.obs[:, env.goal_slice] != first["obs"][:, env.goal_slice]).any()
     yield changed, "first goals must heed goal_scale: reset must use the range that it is given."
@@ -252,8 +251,7 @@ def _check_set_goals(env: Env, build: Build) -> Claims:
     yield from _are_equal(_at(env.tensors, others), _at(before, others), message)
     shown = torch.isclose(env.goal[rows], goals, rtol=1e-4, atol=1e-5)
     yield shown, "set_goals must show the goals that it was given in the goal's slot of obs."
-    counted = env.tensors["goal_count"][rows] == before["goal_count"][rows] + 1
-    yield counted, "set_goals must count in goal_count."
+    yield env.tensors["goal_count"][rows] == before["goal_count"][rows] + 1, "set_goals must count in goal_count."
     yield env.state(env.obs)[rows] == env.state(before["obs"])[rows], "set_goals must leave the state alone."
 
 
