@@ -7,31 +7,9 @@ A shape builds a triangle mesh, a grid lays tiles of many shapes out, and the wh
     ground = terrain.build(terrain.read_grid("my.toml"))
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from .grid import Terrain as Terrain
-    from .grid import flat as flat
-    from .grid import load as load
-    from .presets import preset as preset
-    from .presets import read_grid as read_grid
-    from .presets import rough as rough
-    from .world import Grid as Grid
-    from .world import Share as Share
-    from .world import build as build
-
-_OFFERED = {
-    "Grid": "world", "Share": "world", "Terrain": "grid", "build": "world", "flat": "grid", "load": "grid",
-    "preset": "presets", "read_grid": "presets", "rough": "presets",
-}  # fmt: skip
-"""What the package offers, and the module that holds it."""
+# By the full name, so that ``python -m terrain`` in a checkout loads no module twice.
+from deimos.terrain.grid import Terrain, flat, load
+from deimos.terrain.presets import preset, read_grid, rough
+from deimos.terrain.world import Grid, Share, build
 
 __all__ = ["Grid", "Share", "Terrain", "build", "flat", "load", "preset", "read_grid", "rough"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import what the package offers when it is first asked for, under one name also in ``python -m terrain``."""
-    if name not in _OFFERED:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"deimos.terrain.{_OFFERED[name]}"), name)

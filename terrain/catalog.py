@@ -3,7 +3,7 @@
 import importlib
 import pkgutil
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import replace
 from typing import Any, get_args, get_type_hints
 
 from . import shapes
@@ -12,16 +12,7 @@ from .shape import TileShape
 
 def names() -> list[str]:
     """Names of all shapes, such as ``flat``, ``stairs-up`` and ``stairs-down``, sorted."""
-    return sorted(_classes())
-
-
-def shape_class(name: str) -> type[TileShape]:
-    """The class behind a name.
-
-    Raises:
-        ValueError: If there is none; the message lists those that there are.
-    """
-    return _find(name)[0]
+    return sorted(_defaults())
 
 
 def make(name: str, parameters: Mapping[str, Any] | None = None) -> TileShape:
@@ -34,14 +25,14 @@ def make(name: str, parameters: Mapping[str, Any] | None = None) -> TileShape:
     Raises:
         ValueError: If there is no such shape or parameter, or a value is out of its range.
     """
-    cls, fixed = _find(name)
-    given = dict(parameters or {})
-    known = [field.name for field in fields(cls) if field.name not in fixed]
-    if unknown := sorted(set(given) - set(known)):
-        raise ValueError(f"{name} has no parameter '{unknown[0]}'; it has: {', '.join(known)}.")
-    hints = get_type_hints(cls)
+    known = _defaults()
+    if name not in known:
+        raise ValueError(f"There is no shape '{name}'; there are: {', '.join(sorted(known))}.")
+    given, hints = dict(parameters or {}), known[name].parameters()
+    if unknown := sorted(set(given) - set(hints)):
+        raise ValueError(f"{name} has no parameter '{unknown[0]}'; it has: {', '.join(hints)}.")
     try:
-        return cls(**fixed, **{key: convert(key, value, hints[key]) for key, value in given.items()})
+        return replace(known[name], **{key: convert(key, value, hints[key]) for key, value in given.items()})
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
@@ -53,23 +44,15 @@ def name_of(shape: TileShape) -> str:
     return stem if direction is None else f"{stem}-{direction}"
 
 
-def _classes() -> dict[str, tuple[type[TileShape], dict[str, Any]]]:
-    found: dict[str, tuple[type[TileShape], dict[str, Any]]] = {}
+def _defaults() -> dict[str, TileShape]:
+    """Every shape with its default parameters, by its name."""
+    found: list[TileShape] = []
     for module in pkgutil.iter_modules(shapes.__path__):
-        if module.name.startswith("_"):
-            continue
-        cls = importlib.import_module(f"{shapes.__name__}.{module.name}").Shape
-        stem = module.name.replace("_", "-")
-        directions = get_args(get_type_hints(cls).get("direction"))
-        found |= {f"{stem}-{way}": (cls, {"direction": way}) for way in directions} or {stem: (cls, {})}
-    return found
-
-
-def _find(name: str) -> tuple[type[TileShape], dict[str, Any]]:
-    classes = _classes()
-    if name not in classes:
-        raise ValueError(f"There is no shape '{name}'; there are: {', '.join(sorted(classes))}.")
-    return classes[name]
+        if not module.name.startswith("_"):
+            cls = importlib.import_module(f"{shapes.__name__}.{module.name}").Shape
+            directions = get_args(get_type_hints(cls).get("direction"))
+            found += [cls(direction=way) for way in directions] or [cls()]
+    return {name_of(shape): shape for shape in found}
 
 
 def convert(name: str, value: Any, hint: Any) -> Any:
@@ -78,8 +61,7 @@ def convert(name: str, value: Any, hint: Any) -> Any:
     Raises:
         ValueError: If it is of another kind.
     """
-    parts = get_args(hint)
-    if parts:
+    if parts := get_args(hint):
         if not isinstance(value, list | tuple) or len(value) != len(parts):
             raise ValueError(f"{name} must be {len(parts)} numbers, got {value!r}.")
         return tuple(convert(name, item, part) for item, part in zip(value, parts, strict=True))

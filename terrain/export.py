@@ -1,6 +1,5 @@
 """What the tool writes: meshes, the height grid, a MuJoCo model."""
 
-import io
 import math
 import struct
 from pathlib import Path
@@ -12,8 +11,7 @@ from deimos.files import write_whole
 from .grid import Terrain
 from .mesh import Mesh
 
-MESH_ENDINGS = (".glb", ".obj", ".ply", ".stl")
-ENDINGS = (*MESH_ENDINGS, ".npz", ".png")
+ENDINGS = (".glb", ".obj", ".ply", ".stl", ".npz", ".png")
 MJCF_FILES = ("terrain.xml", "heights.bin")
 BASE = 1.0  # [m] of solid ground below the lowest sample of a MuJoCo model
 
@@ -39,25 +37,22 @@ _MJCF = """\
 
 
 def save(path: Path, terrain: Terrain, mesh: Mesh) -> None:
-    """Write a terrain to a file whose ending says how, whole or not at all.
+    """Write a terrain to a file whose ending, one of ``ENDINGS``, says how; whole or not at all.
 
     ``.stl``, ``.obj``, ``.ply`` and ``.glb`` hold the mesh [m]; z is up, but in ``.glb``, where y must be.
     ``.npz`` holds the terrain. ``.png`` holds its heights as 16-bit grey values, see ``grey``.
 
     Raises:
-        OSError: If it cannot be written.
-        ValueError: If the ending is another.
+        RunError: If it cannot be written.
     """
     ending = path.suffix.lower()
     if ending == ".npz":
         terrain.save(path)
     elif ending == ".png":
         _save_grey(path, terrain)
-    elif ending in MESH_ENDINGS:
+    else:
         data = _mesh_bytes(mesh, ending)
         write_whole(path, lambda file: file.write(data))
-    else:
-        raise ValueError(f"{path} must end in one of {', '.join(ENDINGS)}.")
 
 
 def grey(terrain: Terrain) -> tuple[np.ndarray, float, float]:
@@ -76,7 +71,8 @@ def save_mjcf(folder: Path, terrain: Terrain) -> None:
     """Write a MuJoCo model of the terrain alone: ``terrain.xml`` and, beside it, its heights.
 
     Raises:
-        OSError: If the folder or a file cannot be written.
+        OSError: If the folder cannot be made.
+        RunError: If a file cannot be written.
     """
     folder.mkdir(exist_ok=True)
     low, extent = float(terrain.heights.min()), float(np.ptp(terrain.heights))
@@ -108,6 +104,5 @@ def _save_grey(path: Path, terrain: Terrain) -> None:
     x, y = terrain.corner
     notes.add_text("Description", f"height [m] = {low!r} + {unit!r} * grey; {terrain.cell!r} m per pixel; "
                                   f"lower left pixel at x = {x!r} m, y = {y!r} m")  # fmt: skip
-    buffer = io.BytesIO()
-    Image.fromarray(numbers).save(buffer, format="PNG", pnginfo=notes)
-    write_whole(path, lambda file: file.write(buffer.getvalue()))
+    image = Image.fromarray(numbers)
+    write_whole(path, lambda file: image.save(file, format="PNG", pnginfo=notes))

@@ -55,7 +55,7 @@ class Terrain:
         """Write everything to one ``.npz`` file, whole or not at all; equal terrains give equal bytes.
 
         Raises:
-            OSError: If it cannot be written.
+            RunError: If it cannot be written.
         """
         data = {field.name: getattr(self, field.name) for field in fields(self)}
         write_whole(Path(path), lambda file: np.savez_compressed(file, schema=SCHEMA, **data))

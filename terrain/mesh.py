@@ -63,18 +63,20 @@ def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
     h = height[i, j]
     quads = [_quads((x[i], y[j], h), (x[i + 1], y[j], h), (x[i + 1], y[j + 1], h), (x[i], y[j + 1], h))]
 
-    i, j = np.nonzero(height[:-1] != height[1:])  # risers across x: from (i, j) to (i + 1, j), facing the lower one
-    here, there, at = height[i, j], height[i + 1, j], x[i + 1]
-    right, left = np.where(here > there, (y[j], y[j + 1]), (y[j + 1], y[j]))
-    low, high = np.minimum(here, there), np.maximum(here, there)
-    quads.append(_quads((at, right, low), (at, left, low), (at, left, high), (at, right, high)))
-
+    i, j = np.nonzero(height[:-1] != height[1:])
+    corners = _riser(height[i, j], height[i + 1, j], y[j], y[j + 1])
+    quads.append(_quads(*[(x[i + 1], along, z) for along, z in corners]))
     i, j = np.nonzero(height[:, :-1] != height[:, 1:])
-    here, there, at = height[i, j], height[i, j + 1], y[j + 1]
-    right, left = np.where(here > there, (x[i + 1], x[i]), (x[i], x[i + 1]))
-    low, high = np.minimum(here, there), np.maximum(here, there)
-    quads.append(_quads((right, at, low), (left, at, low), (left, at, high), (right, at, high)))
+    corners = _riser(height[i, j], height[i, j + 1], x[i + 1], x[i])
+    quads.append(_quads(*[(along, y[j + 1], z) for along, z in corners]))
     return from_quads(np.concatenate(quads))
+
+
+def _riser(here: np.ndarray, there: np.ndarray, right: np.ndarray, left: np.ndarray) -> list[tuple]:
+    """Corners of risers, along the edge and in height; ``right`` is that of who stands lower, if ``here`` is higher."""
+    right, left = np.where(here > there, (right, left), (left, right))
+    low, high = np.minimum(here, there), np.maximum(here, there)
+    return [(right, low), (left, low), (left, high), (right, high)]
 
 
 def rings(half_sides: np.ndarray, heights: np.ndarray) -> Mesh:
@@ -109,32 +111,16 @@ def blocks(x: np.ndarray, y: np.ndarray, bottom: float, top: float) -> Mesh:
     return from_quads(np.concatenate(quads))
 
 
-def join(meshes: list[Mesh], offsets: np.ndarray | None = None) -> Mesh:
-    """One mesh of several, each moved by its row of ``offsets`` [m], shape (n, 3)."""
-    moves = np.zeros((len(meshes), 3)) if offsets is None else offsets
-    starts = np.cumsum([0, *[len(mesh.vertices) for mesh in meshes[:-1]]])
-    vertices = np.concatenate([mesh.vertices + move for mesh, move in zip(meshes, moves, strict=True)])
-    return from_triangles(vertices, np.concatenate([m.faces + k for m, k in zip(meshes, starts, strict=True)]))
-
-
-def normals(mesh: Mesh) -> np.ndarray:
-    """Unit normals of the faces, shape (m, 3); NaN where a face has no area."""
-    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[mesh.faces], 1, 0)
-    normal = np.cross(b - a, c - a)
-    with np.errstate(invalid="ignore"):
-        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
 def steepest_slope(mesh: Mesh) -> float:
     """Rise over run of the steepest face that is not a riser."""
-    up = normals(mesh)[:, 2]
+    up = mesh.face_normals[:, 2]
     up = up[up > UPRIGHT]
     return float(np.sqrt(1 / up.min() ** 2 - 1)) if len(up) else 0.0
 
 
 def highest_riser(mesh: Mesh) -> float:
     """Height of the highest vertical face [m]; 0 without any."""
-    upright = np.abs(normals(mesh)[:, 2]) <= UPRIGHT
+    upright = np.abs(mesh.face_normals[:, 2]) <= UPRIGHT
     z = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[upright], 2]
     return float(np.ptp(z, axis=1).max()) if len(z) else 0.0
 

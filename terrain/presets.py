@@ -1,7 +1,6 @@
 """Ready-made grids, and grids from TOML files."""
 
 import tomllib
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -9,32 +8,28 @@ from .catalog import convert, make
 from .grid import Terrain
 from .world import Grid, Share, build
 
-Recipe = tuple[tuple[str, float, dict[str, Any]], ...]
-"""Name, share and parameters of each shape."""
-
 # Proportions of Legged Gym: smooth slopes (half of them up), rough slopes, stairs up, stairs down, discrete.
-_LEGGED_GYM: Recipe = (
-    ("slope-up", 0.05, {}),
-    ("slope-down", 0.05, {}),
-    ("rough-slope-down", 0.1, {}),
-    ("stairs-up", 0.35, {}),
-    ("stairs-down", 0.25, {}),
-    ("discrete", 0.2, {}),
-)
+_LEGGED_GYM: list[dict[str, Any]] = [
+    {"name": "slope-up", "share": 0.05},
+    {"name": "slope-down", "share": 0.05},
+    {"name": "rough-slope-down", "share": 0.1},
+    {"name": "stairs-up", "share": 0.35},
+    {"name": "stairs-down", "share": 0.25},
+    {"name": "discrete", "share": 0.2},
+]
 # The Go1's legs are 0.43 m long, so its steps end at 0.18 m. A sunk rectangle beside a raised one makes 2 h.
-_GO1: Recipe = (
-    ("slope-up", 0.05, {}),
-    ("slope-down", 0.05, {}),
-    ("rough-slope-down", 0.1, {"amplitude": (0.01, 0.05)}),
-    ("stairs-up", 0.35, {"height": (0.05, 0.18)}),
-    ("stairs-down", 0.25, {"height": (0.05, 0.18)}),
-    ("discrete", 0.2, {"height": (0.03, 0.09)}),
-)
-_PRESETS: dict[str, tuple[Recipe, dict[str, Any]]] = {
-    "legged-gym": (_LEGGED_GYM, {}),
-    "go1": (_GO1, {"border": 5.0, "max_step": 0.18}),
+_LOWER = {
+    "rough-slope-down": {"amplitude": (0.01, 0.05)},
+    "stairs-up": {"height": (0.05, 0.18)},
+    "stairs-down": {"height": (0.05, 0.18)},
+    "discrete": {"height": (0.03, 0.09)},
 }
-_GRID_KEYS = tuple(field.name for field in fields(Grid) if field.name != "shapes")
+_GO1 = [table | _LOWER.get(table["name"], {}) for table in _LEGGED_GYM]
+_PRESETS: dict[str, dict[str, Any]] = {
+    "legged-gym": {"shape": _LEGGED_GYM},
+    "go1": {"shape": _GO1, "border": 5.0, "max_step": 0.18},
+}
+"""What a file would say; see ``read_grid``."""
 
 
 def preset_names() -> list[str]:
@@ -52,8 +47,7 @@ def preset(name: str, **changes: Any) -> Grid:
     Raises:
         ValueError: If there is no such preset, or a value is out of its range.
     """
-    recipe, values = _look_up(name)
-    return _grid(recipe, values | changes)
+    return _grid(_look_up(name), changes)
 
 
 def read_grid(path: str | Path, **changes: Any) -> Grid:
@@ -72,59 +66,49 @@ def read_grid(path: str | Path, **changes: Any) -> Grid:
     """
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        base, entries = table.pop("preset", None), table.pop("shape", [])
-        if base is None and not entries:
+        if "preset" in table:
+            table = _look_up(table.pop("preset")) | table
+        if not table.get("shape"):
             raise ValueError(f"it needs a [[shape]], or preset = one of {', '.join(preset_names())}")
-        if unknown := sorted(set(table) - set(_GRID_KEYS)):
-            raise ValueError(f"it has '{unknown[0]}', but may have only preset, shape, {', '.join(_GRID_KEYS)}")
-        recipe, values = ((), {}) if base is None else _look_up(base)
-        shapes = tuple(_entry(entry) for entry in entries) or recipe
-        return _grid(shapes, values | _numbers(table) | changes)
+        return _grid(table, changes)
     except ValueError as error:  # of TOML too
         raise ValueError(f"{path}: {str(error).rstrip('.')}.") from error
 
 
-def _look_up(name: str) -> tuple[Recipe, dict[str, Any]]:
+def _look_up(name: str) -> dict[str, Any]:
     if name not in _PRESETS:
         raise ValueError(f"There is no preset '{name}'; there are: {', '.join(preset_names())}.")
     return _PRESETS[name]
 
 
-def _entry(table: Any) -> tuple[str, float, dict[str, Any]]:
-    """One ``[[shape]]`` of a file."""
+def _grid(table: dict[str, Any], changes: dict[str, Any]) -> Grid:
+    """The grid that a table describes as a file does."""
+    hints = {name: hint for name, hint in get_type_hints(Grid).items() if name != "shapes"}
+    values = {name: value for name, value in table.items() if name != "shape"}
+    if unknown := sorted(set(values) - set(hints)):
+        raise ValueError(f"it has '{unknown[0]}', but may have only preset, shape, {', '.join(hints)}")
+    numbers = {name: convert(name, value, hints[name]) for name, value in values.items()}
+    return Grid(shapes=tuple(map(_share, table["shape"])), **(numbers | changes))
+
+
+def _share(table: Any) -> Share:
     if not isinstance(table, dict) or not isinstance(table.get("name"), str):
         raise ValueError("every [[shape]] needs a name")
     parameters = dict(table)
     name, share = parameters.pop("name"), parameters.pop("share", 1.0)
     if "tile" in parameters:
         raise ValueError(f"the tile of '{name}' is that of the grid; write it above the first [[shape]]")
-    return name, convert("share", share, float), parameters
+    return Share(shape=make(name, parameters), share=convert("share", share, float))
 
 
-def _numbers(table: dict[str, Any]) -> dict[str, Any]:
-    hints = get_type_hints(Grid)
-    return {name: convert(name, value, hints[name]) for name, value in table.items()}
-
-
-def _grid(recipe: Recipe, values: dict[str, Any]) -> Grid:
-    return Grid(shapes=tuple(Share(shape=make(name, p), share=share) for name, share, p in recipe), **values)
-
-
-def rough(
-    seed: int = 0, levels: int = 10, columns: int = 20, *, cell: float = 0.05, border: float = 5.0, device: str = "cpu"
-) -> Terrain:
+def rough(*, device: str = "cpu", **changes: Any) -> Terrain:
     """Legged Gym's grid of slopes, stairs and rectangles of rising difficulty, with steps that a Go1 can climb.
 
     Args:
-        seed: Seed of all tiles, at least 0.
-        levels: Tiles along x, from the easiest to the hardest, at least 1.
-        columns: Tiles along y, at least 1.
-        cell: Distance of two samples of the height grid [m]; must divide the tile of 8 m and the border.
-        border: Width of the flat border [m], at least 0.
         device: Warp device that rasterises the mesh.
+        changes: Fields of ``Grid`` that are to be otherwise than in the preset ``go1``.
 
     Raises:
-        ValueError: If an argument is out of its range, or the grid would not fit into memory.
+        ValueError: If a value is out of its range, or the grid would not fit into memory.
     """
-    grid = preset("go1", seed=seed, levels=levels, columns=columns, cell=cell, border=border)
-    return build(grid, device=device)
+    return build(preset("go1", **changes), device=device)

@@ -31,8 +31,6 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     Raises:
         RunError: If the file cannot be written.
     """
-    from matplotlib import colormaps
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
@@ -40,7 +38,7 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
 
     low, high = float(terrain.heights.min()), float(terrain.heights.max())
     margin = max(0.05, 0.15 * (high - low))  # flat ground has neither the darkest nor the lightest colour
-    colours = ScalarMappable(Normalize(low - margin, high + margin), colormaps["YlGnBu_r"])
+    colours = ScalarMappable(Normalize(low - margin, high + margin), "YlGnBu_r")
     stacked = max(terrain.size) > 1.5 * min(terrain.size)
     pixel = max(terrain.size) / (LENGTH if stacked else 0.55 * LENGTH)  # [m]
     views = [_draw(terrain, colours, pixel / SAMPLES, *angles) for angles in ((0.0, math.pi / 2), (TURN, TILT))]
@@ -48,7 +46,6 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     width, height = (max(widths), sum(heights)) if stacked else (sum(widths), max(heights))
     inches = (width / SAMPLES + WORDS) / DPI, (height / SAMPLES + WORDS) / DPI
     figure = Figure(inches, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)  # draws without a display
     axes = figure.subplots(2, 1, height_ratios=heights) if stacked else figure.subplots(1, 2, width_ratios=widths)
     figure.suptitle(title, fontsize=13)
     for axis, (picture, span) in zip(axes, views, strict=True):

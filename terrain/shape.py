@@ -3,6 +3,7 @@
 import abc
 import math
 from dataclasses import dataclass, fields
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -37,6 +38,11 @@ class TileShape(abc.ABC):
                 check_ramp(field.name, getattr(self, field.name))
         if self.platform >= self.tile:
             raise ValueError(f"platform must be smaller than tile = {self.tile:g} m, got {self.platform:g} m.")
+
+    @classmethod
+    def parameters(cls) -> dict[str, Any]:
+        """Names and types of the fields that a caller may set: all but ``direction``, which is in the shape's name."""
+        return {name: hint for name, hint in get_type_hints(cls).items() if name != "direction"}
 
     @abc.abstractmethod
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:

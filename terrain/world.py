@@ -12,7 +12,7 @@ from deimos.checks import check_at_least, check_positive, check_range
 from . import catalog
 from .grid import Terrain, cells
 from .heightfield import rasterise
-from .mesh import Mesh, from_quads, join
+from .mesh import Mesh, from_quads, from_triangles
 from .shape import TileShape
 
 Progress = Callable[[str, float], None]
@@ -137,9 +137,9 @@ def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | Non
     Raises:
         ValueError: If it would not fit into memory.
     """
-    require_memory(grid)
-    mesh = build_mesh(grid, progress)
+    _require_memory(grid)
     report = progress or (lambda stage, share: None)
+    mesh = build_mesh(grid, report)
     heights = rasterise(
         mesh, grid.corner, grid.cell, grid.num_samples, device=device, progress=lambda share: report("rays", share)
     )
@@ -156,21 +156,23 @@ def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
 
     Every tile has a generator of its own, seeded by (seed, level, column): none depends on another.
     """
-    tiles = []
+    from trimesh.util import append_faces
+
+    parts, centres = [], grid.centres
     for level, difficulty in enumerate(grid.difficulty):
         for column, shape in enumerate(grid.column_shapes):
             seed = np.random.SeedSequence(grid.seed, spawn_key=(level, column))
-            tiles.append(shape.build(float(difficulty), np.random.default_rng(seed)))
+            tile = shape.build(float(difficulty), np.random.default_rng(seed))
+            tile.vertices += centres[level, column]
+            parts.append(tile)
         if progress is not None:
             progress("tiles", (level + 1) / grid.levels)
-    offsets = grid.centres.reshape(-1, 3)
     if grid.border > 0:
-        tiles.append(_border(grid))
-        offsets = np.concatenate([offsets, np.zeros((1, 3))])
-    return join(tiles, offsets)
+        parts.append(_border(grid))
+    return from_triangles(*append_faces([part.vertices for part in parts], [part.faces for part in parts]))
 
 
-def require_memory(grid: Grid) -> None:
+def _require_memory(grid: Grid) -> None:
     """Raise ``ValueError`` if a grid has too many samples, or its making would not fit into memory."""
     most = max(grid.num_samples) - 1
     if most > LARGEST:

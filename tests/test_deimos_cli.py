@@ -108,8 +108,8 @@ OTHER_ERRORS = {
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
     "evaluate there": "there is not a run folder: it holds no config.json",
     "bench": "There is no command 'bench'",
-    "study walk": "There is no command 'study walk'; there are: run, show, merge, report, ",
-    "terrain walk": "There is no command 'terrain walk'; there are: list, shape, grid",
+    "study walk": "There is no command 'study walk'; there are: run, show, merge, export, report",
+    "terrain walk": "There is no command 'terrain walk'; there are: shape, grid",
 }
 
 
@@ -258,7 +258,7 @@ def write_tensors(path):
 
 def write_next_schema(path):
     """A checkpoint of a later version."""
-    torch.save(torch.load(path) | {"schema": 2}, path)
+    torch.save(torch.load(path) | {"schema": 99}, path)
 
 
 BREAKERS = [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from deimos.terrain import catalog, heightfield
 from deimos.terrain.heightfield import rasterise
-from deimos.terrain.mesh import UPRIGHT, from_triangles, normals, rings, sheet, steepest_slope
+from deimos.terrain.mesh import UPRIGHT, from_triangles, rings, sheet, steepest_slope
 
 NAMES = catalog.names()
 CELL = 0.05  # [m]
@@ -42,7 +42,7 @@ def bilinear(heights, corner, cell, points):
 
 def beside_risers(mesh, points, distance):
     """Which points are at least ``distance`` away from every riser, along x or along y."""
-    risers = mesh.vertices[mesh.faces[np.abs(normals(mesh)[:, 2]) < UPRIGHT], :2]
+    risers = mesh.vertices[mesh.faces[np.abs(mesh.face_normals[:, 2]) < UPRIGHT], :2]
     boxes = np.unique(np.concatenate([risers.min(axis=1), risers.max(axis=1)], axis=1).round(6), axis=0)
     free = np.ones(len(points), bool)
     for left, front, right, back in boxes:

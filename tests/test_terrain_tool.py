@@ -1,5 +1,6 @@
 """The generator: what it writes, what it says, and what it refuses."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,6 @@ from PIL import Image
 
 from deimos import terrain
 from deimos.app import cli
-from deimos.app.terrain import field_docs
 
 ENDINGS = (".stl", ".obj", ".ply", ".glb", ".npz", ".png")
 SMALL = ["--levels", "2", "--columns", "3", "--cell", "0.2", "--border", "1"]
@@ -39,18 +39,30 @@ def run(*arguments):
     return cli.main(["terrain", *map(str, arguments)])
 
 
-def test_list_names_everything(capsys):
-    """Every shape, every parameter with its meaning, and every preset is listed."""
-    assert run("list") == 0
-    said = " ".join(capsys.readouterr().out.split())
+def test_every_shape_and_preset_is_named(capsys):
+    """``shape`` lists every shape with a line about it, and the help of ``grid`` names every preset."""
+    assert run("shape") == 0
+    said = capsys.readouterr().out
     for name in catalog.names():
-        assert name in said
-        for field, text in field_docs(catalog.shape_class(name)).items():
-            if field != "direction":
-                assert f"--{field}" in said
-                assert text.split()[0] in said
+        assert f"  {name} " in said
+        assert (type(catalog.make(name)).__doc__ or "").splitlines()[0] in said
+    assert run("grid", "--help") == 0
+    said = capsys.readouterr().out
     for name in presets.preset_names():
-        assert f"preset {name}" in said
+        assert name in said
+
+
+@pytest.mark.parametrize("name", catalog.names())
+def test_every_parameter_is_explained(capsys, name):
+    """The help of a shape shows its parameters with their defaults; its direction is in its name."""
+    assert run("shape", name, "--help") == 0
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    shape = catalog.make(name)
+    for field in shape.parameters():
+        value = getattr(shape, field)
+        shown = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        assert re.search(rf" --{field} .*?\(default: {re.escape(shown)}\)", said), field
+    assert "--direction" not in said
 
 
 def test_everything_is_written_at_once(folder, small, capsys):
@@ -162,8 +174,7 @@ def test_force_overwrites_and_nothing_else_does(folder, capsys):
         ("shape flat --difficulty 1.5", "difficulty must be in [0, 1], got 1.5"),
         ("shape flat --difficulty nan", "difficulty must be in [0, 1], got nan"),
         ("grid --difficulty 0 2", "hardest must be in [0, 1], got 2.0"),
-        ("shape stairs", "There is no shape 'stairs'; there are: discrete, flat, gap"),
-        ("shape", "shape needs a name first, one of: discrete, flat"),
+        ("shape stairs", "There is no command 'terrain shape stairs'; there are: discrete, flat, gap"),
         ("grid --shapes flat stair", "There is no shape 'stair'; there are: discrete, flat, gap"),
         ("grid --preset go2", "There is no preset 'go2'; there are: go1, legged-gym"),
         ("shape pit --tile 3", "platform must be smaller than tile = 3 m, got 4 m"),
@@ -189,7 +200,7 @@ def test_force_overwrites_and_nothing_else_does(folder, capsys):
         ("grid --file here.npz", "here.npz: "),
         ("grid --file a.toml --preset go1", "file excludes preset and shapes"),
         ("grid --shapes flat --preset go1", "shapes excludes preset"),
-        ("shapes", "There is no command 'terrain shapes'; there are: list, shape, grid"),
+        ("shapes", "There is no command 'terrain shapes'; there are: shape, grid"),
     ],
 )
 def test_mistakes_give_one_line(folder, capsys, arguments, message):
@@ -240,8 +251,9 @@ def test_interrupt_ends_quietly(folder, capsys, monkeypatch):
     assert not list(folder.iterdir())
 
 
-@pytest.mark.parametrize("arguments", [[], ["--help"], ["shape", "--help"], ["shape", "pit", "--help"],
-                                       ["grid", "--help"], ["list", "--help"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments", [[], ["--help"], ["shape", "--help"], ["shape", "pit", "--help"], ["grid", "--help"]]
+)
 def test_help_is_there(capsys, arguments):
     """Every command explains itself and ends with exit code 0."""
     assert run(*arguments) == 0

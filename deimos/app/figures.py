@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deimos.checks import RunError
+from deimos.files import write_whole
 from deimos.goals.calibration import reliability
 from deimos.run.folder import RunFolder
 
@@ -84,10 +84,7 @@ def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor
 
 
 def _save(figure: "Figure", path: Path) -> Path:
-    try:
-        figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise RunError(f"{path} could not be written ({error.strerror}).") from error
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=120))
     return path
 
 

@@ -1,12 +1,12 @@
 """``deimos play``: watch a trained policy, as a video or as single pictures."""
 
+import itertools
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -68,7 +68,10 @@ def main(arguments: list[str], program: str) -> None:
     """Run ``deimos play``."""
     options: PlayOptions = console.parse(PlayOptions, arguments, program)
     console.quiet_warp()
-    _import_mujoco()
+    if sys.platform.startswith("linux"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    with _rendering():
+        import mujoco  # noqa: F401 (it decides now how it will render)
     folder = RunFolder.open(options.run)
     config = read_config(folder)
     policy = load_policy(folder.path)
@@ -79,8 +82,6 @@ def main(arguments: list[str], program: str) -> None:
         env = env_config.build(1, torch.device("cpu"), options.seed, options.world)
     except ValueError as error:
         raise RunError(str(error)) from error
-    if env.scene(0) is None:
-        raise RunError("This environment has nothing to render; play shows robots.")
     loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
     afraid = _fear(folder, config, env)
     every = max(1, round(1.0 / (options.fps * env.dt)))
@@ -93,27 +94,18 @@ def main(arguments: list[str], program: str) -> None:
     print(options.video or options.frames)
 
 
-def _import_mujoco() -> None:
-    """Import MuJoCo, which decides then how it will render.
-
-    Raises:
-        RunError: If it cannot render in the way that MUJOCO_GL asks for.
-    """
-    if sys.platform.startswith("linux"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
+@contextmanager
+def _rendering() -> Iterator[None]:
+    """Turn whatever goes wrong into a ``RunError`` that says how to render, but for a missing MuJoCo."""
     try:
-        import mujoco  # noqa: F401
-    except Exception as error:  # ImportError, AttributeError (PyOpenGL without a library), RuntimeError, OSError
+        yield
+    except Exception as error:  # of MuJoCo, PyOpenGL and what they load: ImportError, AttributeError, GLError, ...
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
             raise
-        raise _unrenderable(error) from error
-
-
-def _unrenderable(error: Exception) -> RunError:
-    return RunError(
-        f"Nothing can be rendered with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({error}); "
-        "install libegl1 or libosmesa6 and set MUJOCO_GL=egl or osmesa."
-    )
+        raise RunError(
+            f"Nothing can be rendered with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({error}); "
+            "install libegl1 or libosmesa6 and set MUJOCO_GL=egl or osmesa."
+        ) from error
 
 
 def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | None:
@@ -144,14 +136,13 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
     """A camera that follows the robot of world 0 and shows its goal, where it is a point, as a red ball."""
     import mujoco
 
-    scene = env.scene(0)
-    assert scene is not None
-    model = scene[0]
+    shown = env.scene(0)
+    if shown is None:
+        raise RunError("This environment has nothing to render; play shows robots.")
+    model = shown[0]
     model.vis.global_.offwidth, model.vis.global_.offheight = options.width, options.height
-    try:
+    with _rendering():
         renderer = mujoco.Renderer(model, options.height, options.width)
-    except Exception as error:  # likewise, and MuJoCo's FatalError and PyOpenGL's GLError, which share no base
-        raise _unrenderable(error) from error
     camera = mujoco.MjvCamera()
     camera.distance, camera.azimuth, camera.elevation = 1.8, 130.0, -18.0
 
@@ -183,7 +174,7 @@ def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
 
 
 @contextmanager
-def _writer(options: PlayOptions, fps: float) -> Iterator[Callable[[np.ndarray], Any]]:
+def _writer(options: PlayOptions, fps: float) -> Iterator[Callable[[np.ndarray], object]]:
     """Writes pictures one after another; a video that is cut off does not stay."""
     if options.frames is not None:
         from PIL import Image
@@ -193,8 +184,8 @@ def _writer(options: PlayOptions, fps: float) -> Iterator[Callable[[np.ndarray],
             folder.mkdir(parents=True)
         except FileExistsError as error:
             raise RunError(f"{folder} exists already; name another folder.") from error
-        numbers = iter(range(10**6))
-        yield lambda picture: Image.fromarray(picture).save(folder / f"{next(numbers):06d}.png")
+        number = itertools.count()
+        yield lambda picture: Image.fromarray(picture).save(folder / f"{next(number):06d}.png")
         return
     import imageio_ffmpeg
 

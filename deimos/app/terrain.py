@@ -1,27 +1,23 @@
 """``deimos terrain``: generate terrain as meshes, height grids, MuJoCo models and pictures."""
 
-import ast
 import dataclasses
-import inspect
-import itertools
-import textwrap
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 from deimos.app import console
 from deimos.checks import RunError, check_range
 from deimos.terrain import catalog, export, presets
 from deimos.terrain.mesh import highest_riser, steepest_slope
 from deimos.terrain.preview import save_preview
-from deimos.terrain.world import Grid, Share, build_with_mesh, require_memory
+from deimos.terrain.shape import TileShape
+from deimos.terrain.world import Grid, Share, build_with_mesh
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,7 +101,6 @@ class GridOptions(Outputs):
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos terrain``."""
     commands = {
-        "list": ("the shapes and their parameters, and the presets", show_list),
         "shape": ("build one tile: deimos terrain shape stairs-up --out stairs.stl --preview stairs.png", build_shape),
         "grid": ("build a grid of tiles, from a preset, a TOML file or a list of shapes", build_grid),
     }
@@ -118,57 +113,20 @@ def main(arguments: list[str], program: str) -> None:
         raise RunError("There is not enough memory; enlarge cell, or ask for fewer levels or columns.") from error
 
 
-def show_list(arguments: list[str], program: str) -> None:
-    """Print every shape with its parameters, their defaults and their meaning, and the presets."""
-
-    @dataclasses.dataclass(frozen=True)
-    class ListOptions:
-        """Show the shapes with their parameters, and the presets."""
-
-    console.parse(ListOptions, arguments, program)
-    screen = Console(highlight=False, markup=False)
-    by_class: dict[type, list[str]] = {}
-    for name in catalog.names():
-        by_class.setdefault(catalog.shape_class(name), []).append(name)
-    for cls, names in by_class.items():
-        screen.print(", ".join(names), style="bold")
-        screen.print(" ".join((cls.__doc__ or "").split("\n\n")[0].split()))
-        table = Table(box=None, show_header=False, padding=(0, 2, 0, 2))
-        docs = field_docs(cls)
-        for field in dataclasses.fields(cls):
-            if field.name != "direction":
-                values = field.default if isinstance(field.default, tuple) else (field.default,)
-                table.add_row(f"--{field.name}", " ".join(f"{value:g}" for value in values), Text(docs[field.name]))
-        screen.print(table, "")
-    for name in presets.preset_names():
-        grid = presets.preset(name)
-        parts = ", ".join(f"{part.share:g} {catalog.name_of(part.shape)}" for part in grid.shapes)
-        screen.print(f"preset {name}: {grid.levels} x {grid.columns} tiles; {parts}")
-
-
-def field_docs(cls: type) -> dict[str, str]:
-    """The docstring below each field of a dataclass and of those that it inherits from, on one line."""
-    docs: dict[str, str] = {}
-    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
-        body: list[Any] = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
-        for field, after in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                docs[ast.unparse(field.target)] = " ".join(ast.literal_eval(after.value).split())
-    return docs
-
-
 def build_shape(arguments: list[str], program: str) -> None:
-    """Build one tile."""
-    known = f"one of: {', '.join(catalog.names())}"
-    if not arguments or arguments[0].startswith("-"):
-        if not {"-h", "--help"} & set(arguments):
-            raise RunError(f"shape needs a name first, {known}.")
-        print(f"usage: {program} NAME [OPTIONS]\n\nNAME is {known}.\n{program} NAME --help explains its parameters.")
-        return
-    name, rest = arguments[0], arguments[1:]
-    options = console.parse(_shape_options(name), rest, f"{program} {name}")
+    """Build one tile, of the shape that the first argument names."""
+    commands = {name: (_about(catalog.make(name)), partial(_build_tile, name)) for name in catalog.names()}
+    console.dispatch(commands, "Builds one tile of a shape.", arguments, program)
+
+
+def _about(shape: TileShape) -> str:
+    return (shape.__doc__ or "").splitlines()[0]
+
+
+def _build_tile(name: str, arguments: list[str], program: str) -> None:
+    options = console.parse(_tile_options(catalog.make(name)), arguments, program)
     check_range("difficulty", options.difficulty, 0, 1)
-    parameters = {field.name for field in dataclasses.fields(catalog.shape_class(name))} - {"direction"}
+    parameters = catalog.make(name).parameters()
     grid = Grid(
         shapes=(Share(shape=catalog.make(name, {key: getattr(options, key) for key in parameters})),),
         levels=1, columns=1, tile=options.tile, border=options.border, cell=options.cell, easiest=options.difficulty,
@@ -177,15 +135,12 @@ def build_shape(arguments: list[str], program: str) -> None:
     _make(grid, options, f"{name}, difficulty {options.difficulty:g}, seed {options.seed}")
 
 
-def _shape_options(name: str) -> type:
+def _tile_options(shape: TileShape) -> type:
     """``TileOptions`` with the parameters of a shape, whose direction is in its name."""
-    cls = catalog.shape_class(name)
-    direction = getattr(catalog.make(name), "direction", None)
-    fixed = [("direction", Annotated[Literal["up", "down"], tyro.conf.Suppress], dataclasses.field(default=direction))]
-    about = f"{name}: " + (cls.__doc__ or "").partition("\n\n")[0]
+    direction = [("direction", tyro.conf.Suppress[str], shape.direction)] if hasattr(shape, "direction") else []
     return dataclasses.make_dataclass(
-        "ShapeOptions", fixed if direction else [], bases=(TileOptions, cls), frozen=True, kw_only=True,
-        namespace={"__doc__": about},
+        "ShapeOptions", direction, bases=(TileOptions, type(shape)), frozen=True, kw_only=True,
+        namespace={"__doc__": f"{catalog.name_of(shape)}: {_about(shape)}"},
     )  # fmt: skip
 
 
@@ -199,16 +154,15 @@ def build_grid(arguments: list[str], program: str) -> None:
 def _make(grid: Grid, outputs: Outputs, title: str) -> None:
     """Check, build, write and report; nothing is built where something could not be written."""
     _check_outputs(outputs)
-    require_memory(grid)
     console.quiet_warp()
     start = time.perf_counter()
     with console.stage_bar() as progress:
         terrain, mesh = build_with_mesh(grid, progress=progress)
         seconds = time.perf_counter() - start
         jobs: dict[Path, Callable[[], None]] = {path: partial(export.save, path, terrain, mesh) for path in outputs.out}
-        if outputs.mjcf is not None:
+        if outputs.mjcf:
             jobs[outputs.mjcf] = partial(export.save_mjcf, outputs.mjcf, terrain)
-        if outputs.preview is not None:
+        if outputs.preview:
             jobs[outputs.preview] = partial(save_preview, outputs.preview, terrain, title)
         for number, (path, job) in enumerate(jobs.items()):
             progress(f"writing {path.name}", number / len(jobs))
@@ -237,15 +191,15 @@ def _check_outputs(outputs: Outputs) -> None:
         if path.suffix.lower() not in export.ENDINGS:
             raise RunError(f"out must end in one of {', '.join(export.ENDINGS)}, got {path}.")
     preview, mjcf = outputs.preview, outputs.mjcf
-    if preview is not None and preview.suffix.lower() != ".png":
+    if preview and preview.suffix.lower() != ".png":
         raise RunError(f"preview must end in .png, got {preview}.")
-    if mjcf is not None and mjcf.exists() and not mjcf.is_dir():
+    if mjcf and mjcf.exists() and not mjcf.is_dir():
         raise RunError(f"mjcf must be a folder, but {mjcf} is a file.")
-    files = [*outputs.out, *([] if preview is None else [preview])]
-    folders = [path.parent for path in [*files, *([] if mjcf is None else [mjcf])]]
-    if missing := [folder for folder in folders if not folder.is_dir()]:
-        raise RunError(f"The folder {missing[0]} does not exist; make it first.")
-    files += [] if mjcf is None else [mjcf / name for name in export.MJCF_FILES]
+    files = [*outputs.out, *filter(None, [preview])]
+    for path in [*files, *filter(None, [mjcf])]:
+        if not path.parent.is_dir():
+            raise RunError(f"The folder {path.parent} does not exist; make it first.")
+    files += [mjcf / name for name in export.MJCF_FILES] if mjcf else []
     for number, path in enumerate(files):
         if path in files[:number]:
             raise RunError(f"{path} is named twice.")

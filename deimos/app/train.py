@@ -3,7 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -63,7 +63,7 @@ def main(arguments: list[str], program: str) -> None:
         return
     _check_names(rest)
     options, config = _train_options(), _preset(first.preset, rest)
-    default = options(**{field.name: getattr(config, field.name) for field in fields(config)})
+    default = options(**vars(config))
     _train(console.parse(options, rest, program, default=default))
 
 
@@ -123,13 +123,9 @@ def _train_options() -> type:
         "Train a policy under a goal selector, then evaluate it against Naive and Adversary. "
         f"--preset NAME starts from a ready configuration: {', '.join(presets.names())}."
     )
-    default = next(field.default_factory for field in fields(TrainConfig) if field.name == "env")
+    selector = _subcommands(selectors, Annotated[None, tyro.conf.subcommand("none")])
     return make_dataclass(
-        "TrainOptions",
-        [
-            ("env", _subcommands(envs), field(default_factory=default)),
-            ("selector", _subcommands(selectors, Annotated[None, tyro.conf.subcommand("none")]), field(default=None)),
-        ],
+        "TrainOptions", [("env", _subcommands(envs)), ("selector", selector)],
         bases=(FolderOptions,), frozen=True, kw_only=True, namespace={"__doc__": about},
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from deimos.goals.calibration import evaluate
 from deimos.goals.fear import auroc
-from deimos.goals.fear_selector import fear_selector
+from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
@@ -51,9 +51,7 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
     Raises:
         RunError: If there is no fear network, or no context with both outcomes.
     """
-    afraid = fear_selector(trainer.loop.selector)
-    if afraid is None or not afraid.fear.fitted:
-        raise RunError("This run's selector has no fear network that has learnt anything.")
+    afraid = _learnt_fear(trainer)
     generator = seeds.generator(trainer.config.seed, "audit", trainer.env.device)
     config = trainer.config
     clones = Clones(
@@ -107,9 +105,7 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
     Raises:
         RunError: If there is no fear network.
     """
-    afraid = fear_selector(trainer.loop.selector)
-    if afraid is None or not afraid.fear.fitted:
-        raise RunError("This run's selector has no fear network that has learnt anything.")
+    afraid = _learnt_fear(trainer)
     generator = seeds.generator(trainer.config.seed, "calibration", trainer.env.device)
     choosers = {"selected": trainer.loop.selector, "uniform": uniform.Config().build(spaces(trainer.env), 0)}
     results = {}
@@ -121,6 +117,13 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
         quality = counts | {"auroc": auroc(score, done.crashed)} | evaluate(probability, done.crashed)
         results[name] = probability, done.crashed, quality
     return results
+
+
+def _learnt_fear(trainer: "Trainer") -> FearSelector:
+    afraid = fear_selector(trainer.loop.selector)
+    if afraid is None or not afraid.fear.fitted:
+        raise RunError("This run's selector has no fear network that has learnt anything.")
+    return afraid
 
 
 @torch.no_grad()

@@ -12,18 +12,17 @@ from deimos.files import first_line, write_whole
 
 
 class RunFolder:
-    """The files of one run: ``config.json``, ``progress.csv``, ``timing.csv``, ``checkpoint.pt`` and the rest."""
+    """The files of one run: ``config.json``, ``progress.csv``, ``timing.csv``, ``checkpoint.pt`` and the rest.
+
+    What cannot be made, read or written raises ``RunError``.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @classmethod
     def create(cls, path: Path) -> "RunFolder":
-        """Make the folder.
-
-        Raises:
-            RunError: If it exists or cannot be made.
-        """
+        """Make the folder, which must not exist."""
         try:
             path.mkdir(parents=True)
         except FileExistsError as error:
@@ -35,30 +34,18 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """Open the folder of an earlier run.
-
-        Raises:
-            RunError: If it is not one.
-        """
+        """Open the folder of an earlier run; it must hold a ``config.json``."""
         if not (path / "config.json").is_file():
             raise RunError(f"{path} is not a run folder: it holds no config.json.")
         return cls(path)
 
     def write_json(self, name: str, data: Any) -> None:
-        """Write a JSON file whole or not at all; NaN becomes null.
-
-        Raises:
-            RunError: If it cannot be written.
-        """
+        """Write a JSON file whole or not at all; NaN becomes null."""
         text = json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n"
         write_whole(self.path / name, lambda file: file.write(text.encode()))
 
     def read_json(self, name: str) -> Any:
-        """Read a JSON file.
-
-        Raises:
-            RunError: If it is missing or is not JSON.
-        """
+        """Read a JSON file, which must be there and be JSON."""
         try:
             return json.loads((self.path / name).read_text())
         except (OSError, ValueError) as error:
@@ -73,11 +60,7 @@ class RunFolder:
             return [row for row in csv.DictReader(file) if None not in row.values()]
 
     def cut_csv(self, name: str, iteration: int) -> None:
-        """Drop the rows after an iteration: a resumed run writes them again.
-
-        Raises:
-            RunError: If it cannot be written.
-        """
+        """Drop the rows after an iteration: a resumed run writes them again."""
         rows = [row for row in self.read_csv(name) if int(row["iteration"]) <= iteration]
         if not rows:
             (self.path / name).unlink(missing_ok=True)
@@ -89,11 +72,7 @@ class RunFolder:
         write_whole(self.path / name, lambda file: file.write(text.getvalue().encode()))
 
     def append_csv(self, name: str, row: dict[str, float]) -> None:
-        """Add a row, and a header where there is none yet; NaN becomes an empty cell.
-
-        Raises:
-            RunError: If it cannot be written.
-        """
+        """Add a row, and a header where there is none yet; NaN becomes an empty cell."""
         path = self.path / name
         try:
             is_new = not path.exists() or path.stat().st_size == 0

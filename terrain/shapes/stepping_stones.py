@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..mesh import Mesh, blocks, join, rings
+from ..mesh import Mesh, blocks, rings
 from ..shape import Ramp, TileShape, at, check_ramp
 
 
@@ -48,4 +48,4 @@ class Shape(TileShape):
             y.append(np.broadcast_to([front, front + pitch - gap], ends.shape))
         middle = np.array([[-self.platform / 2, self.platform / 2]])
         stones = blocks(np.concatenate([*x, middle]), np.concatenate([*y, middle]), -self.depth, 0.0)
-        return join([rings(np.array([self.tile / 2, bed]), np.array([0.0, -self.depth])), stones])
+        return rings(np.array([self.tile / 2, bed]), np.array([0.0, -self.depth])) + stones
