@@ -1,6 +1,5 @@
 """The results of a study as samples: one value per policy, by environment, goals, T and method."""
 
-import copy
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -10,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos.run.folder import RunError
 from deimos.study.results import Results, Row
 from deimos.study.stats import Array
 
@@ -94,7 +92,7 @@ class Data:
 
     def __init__(self, results: Results, style: Style | None = None) -> None:
         results.check()
-        self.rows = results.rows
+        self._results, self.rows = results, results.rows
         self.weak = [row for row in self.rows if row["weak_adversary"]]
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = {}
@@ -115,19 +113,12 @@ class Data:
         Raises:
             RunError: If there are none, a file is broken or of another schema, or they are no one study.
         """
-        results = Results.read(folder)
-        if not results.rows:
-            raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
-        return cls(results, style)
+        return cls(Results.read(folder, may_be_empty=False), style)
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
-        found = copy.copy(self)
-        found.rows = [row for row in self.rows if row["method"] in methods]
-        found.weak = [row for row in self.weak if row["method"] in methods]
-        found._samples = {key: seeds for key, seeds in self._samples.items() if key[1] in methods}
-        found._curves = {key: seeds for key, seeds in self._curves.items() if key[1] in methods}
-        return found
+        rows, curves = ([row for row in rows if row["method"] in methods] for rows in (self.rows, self._results.curves))
+        return Data(Results(rows, curves), self.style)
 
     @property
     def environments(self) -> list[str]:

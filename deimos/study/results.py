@@ -8,7 +8,7 @@ import csv
 import io
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,6 +16,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from deimos.files import write_whole
 from deimos.run.folder import RunError, RunFolder
 from deimos.study.plan import Cell
 
@@ -59,21 +60,22 @@ class Results:
     """One per training, with ``CURVE_COLUMNS``."""
 
     @classmethod
-    def read(cls, folder: Path) -> "Results":
-        """The results of a study's folder, or of one that holds tables only; none where there is nothing.
+    def read(cls, folder: Path, *, may_be_empty: bool = True) -> "Results":
+        """The results of a study's folder, or of one that holds tables only.
 
         Raises:
-            RunError: If a file is broken or of another schema.
+            RunError: If a file is broken or of another schema, or if there must be results and are none.
         """
         found = cls()
         for path in sorted(folder.glob("cells/*/result.json")):
             data = RunFolder(path.parent).read_json(path.name)
             if not isinstance(data, dict) or data.get("schema") != SCHEMA:
                 raise RunError(f"{path} is not the result of a cell of schema {SCHEMA}.")
-            for row in data["rows"]:
-                found.rows.append({name: _value(kind, row.get(name)) for name, kind in RESULT_COLUMNS.items()})
-            found.curves.append({name: _value(kind, data["curve"][name]) for name, kind in CURVE_COLUMNS.items()})
+            found.rows += [_row(RESULT_COLUMNS, row) for row in data["rows"]]
+            found.curves.append(_row(CURVE_COLUMNS, data["curve"]))
         found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())))
+        if not found.rows and not may_be_empty:
+            raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
         return found
 
     def add(self, other: "Results") -> int:
@@ -92,8 +94,8 @@ class Results:
                 count for nothing.
         """
         check_comparable([*self.rows, *self.curves])
-        for rows, more in ((self.rows, ("goals", "goal_period")), (self.curves, ())):
-            names = ("environment", "method", "seed", *more)
+        policy = ("environment", "method", "seed")
+        for rows, names in ((self.rows, (*policy, "goals", "goal_period")), (self.curves, policy)):
             for key, count in Counter(tuple(row[name] for name in names) for row in rows).items():
                 if count > 1:
                     what = ", ".join(f"{name} {value}" for name, value in zip(names, key, strict=True))
@@ -171,39 +173,21 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
     """
     merged = Results.read(target)
     added = present = differing = 0
+    numbers = ("weights", "crashes", "reward")
     for source in sources:
-        found = Results.read(source)
-        if not found.rows:
-            raise RunError(f"{source} holds no results; it is empty, or no study folder.")
-        known = {(row["hash"], row["goals"], row["goal_period"]): row for row in merged.rows}
-        for row in found.rows:
-            old = known.get((row["hash"], row["goals"], row["goal_period"]))
-            present += old is not None
-            differing += old is not None and any(
-                _text(old[name]) != _text(row[name]) for name in ("weights", "crashes", "reward")
-            )
+        found = Results.read(source, may_be_empty=False)
+        ours, theirs = (
+            {(row["hash"], row["goals"], row["goal_period"]): [_text(row[name]) for name in numbers] for row in rows}
+            for rows in (merged.rows, found.rows)
+        )
+        both = ours.keys() & theirs.keys()
+        present += len(both)
+        differing += sum(ours[key] != theirs[key] for key in both)
         added += merged.add(found)
     merged.check()
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"The folder {target} cannot be made ({error.strerror}).") from error
+    target.mkdir(parents=True, exist_ok=True)
     merged.write(target)
     return added, present, differing
-
-
-_SHARED = {  # what the rows that share the other columns must share too, with what to say if they do not
-    "setting": (
-        ("environment",),
-        "The cells of environment '{environment}' were run with {count} different settings ({found}) and cannot be "
-        "compared; keep one setting in a folder.",
-    ),
-    "selector": (
-        ("environment", "method"),
-        "Method '{method}' stands for {count} different selectors in environment '{environment}' ({found}), which are "
-        "no one population; keep one of them in a folder.",
-    ),
-}
 
 
 def check_comparable(rows: Iterable[Row]) -> None:
@@ -215,15 +199,22 @@ def check_comparable(rows: Iterable[Row]) -> None:
     Raises:
         RunError: If there are more.
     """
-    rows = list(rows)
-    for column, (names, message) in _SHARED.items():
-        values: dict[tuple, set[str]] = {}
-        for row in rows:
-            values.setdefault(tuple(row[name] for name in names), set()).add(row[column])
-        for key, found in values.items():
-            if len(found) > 1:
-                known = dict(zip(names, key, strict=True)) | {"count": len(found), "found": ", ".join(sorted(found))}
-                raise RunError(message.format(**known))
+    settings, selectors = defaultdict(set), defaultdict(set)
+    for row in rows:
+        settings[row["environment"]].add(row["setting"])
+        selectors[row["environment"], row["method"]].add(row["selector"])
+    for environment, found in settings.items():
+        if len(found) > 1:
+            raise RunError(
+                f"The cells of environment '{environment}' were run with {len(found)} different settings "
+                f"({', '.join(sorted(found))}) and cannot be compared; keep one setting in a folder."
+            )
+    for (environment, method), found in selectors.items():
+        if len(found) > 1:
+            raise RunError(
+                f"Method '{method}' stands for {len(found)} different selectors in environment '{environment}' "
+                f"({', '.join(sorted(found))}), which are no one population; keep one of them in a folder."
+            )
 
 
 def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
@@ -236,21 +227,18 @@ def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
         text = path.read_text()
     except FileNotFoundError:
         return []
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise RunError(f"{path} cannot be read ({error}).") from error
     lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())  # version 0.1.0 may have left half a line
     names = [FORMER_NAMES.get(name, name) for name in next(lines, columns)]
-    if set(names) != set(columns):
-        both = (
-            ("missing", [n for n in columns if n not in names]),
-            ("unknown", [n for n in names if n not in columns]),
-        )
-        parts = [f"{what}: {', '.join(found)}" for what, found in both if found]
-        raise RunError(f"{path} is a table of another schema; {'; '.join(parts)}.")
+    missing, unknown = ([n for n in a if n not in b] for a, b in ((columns, names), (names, columns)))
+    if missing or unknown:
+        lists = f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}"
+        raise RunError(f"{path} is a table of another schema; {lists}.")
     rows = []
     for number, values in enumerate(lines, start=2):
         try:
-            rows.append({name: _value(columns[name], text) for name, text in zip(names, values, strict=True)})
+            rows.append(_row(columns, dict(zip(names, values, strict=True))))
         except ValueError as error:
             raise RunError(f"{path}, line {number}, does not fit its columns ({error}).") from error
     return rows
@@ -266,12 +254,12 @@ def write_table(path: Path, columns: dict[str, type], rows: Iterable[Row]) -> No
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows([_text(row.get(name)) for name in columns] for row in rows)
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        temporary.write_text(out.getvalue())
-        temporary.replace(path)
-    except OSError as error:
-        raise RunError(f"{path} could not be written ({error.strerror}).") from error
+    write_whole(path, lambda file: file.write(out.getvalue().encode()))
+
+
+def _row(columns: dict[str, type], given: Row) -> Row:
+    """A row with the values of all columns; see ``_value``."""
+    return {name: _value(kind, given.get(name)) for name, kind in columns.items()}
 
 
 def _value(kind: type, given: Any) -> Any:
