@@ -93,7 +93,6 @@ class Data:
     def __init__(self, results: Results, style: Style | None = None) -> None:
         results.check()
         self._results, self.rows = results, results.rows
-        self.weak = [row for row in self.rows if row["weak_adversary"]]
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = {}
         for row in self.rows:

@@ -22,7 +22,7 @@ POWER = 0.8
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its interval."""
+    """An estimate with its interval, which has NaN as its ends where there is none; formats as its numbers do."""
 
     estimate: float
     """Of the samples themselves."""
@@ -30,6 +30,11 @@ class Interval:
     """Lower end."""
     high: float
     """Upper end."""
+
+    def __format__(self, form: str) -> str:
+        if math.isnan(self.low):
+            return format(self.estimate, form)
+        return f"{self.estimate:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
 def iqm(x: Array) -> Array:
