@@ -46,19 +46,19 @@ class Cell:
     def digest(self) -> str:
         """First 12 hexadecimal digits of the SHA-256 of everything that the numbers depend on."""
         selector, periods = _spelled_out(self.config.goals), list(self.goal_periods)
-        return _digest({"config": to_dict(self.config), "selector": selector, "goal_periods": periods})
+        return _digest(config=to_dict(self.config), selector=selector, goal_periods=periods)
 
     @cached_property
     def setting(self) -> str:
         """The same of what the cells of one environment must share to be compared: all but selector and seed."""
         config = to_dict(self.config)
         shared = {name: value for name, value in config.items() if name not in ("method", "selector", "seed")}
-        return _digest({"config": shared, "goal_periods": list(self.goal_periods)})
+        return _digest(config=shared, goal_periods=list(self.goal_periods))
 
     @cached_property
     def selector(self) -> str:
         """The same of what the cells of one method must share: what the method's name stands for."""
-        return _digest({"selector": _spelled_out(self.config.goals)})
+        return _digest(selector=_spelled_out(self.config.goals))
 
     @cached_property
     def name(self) -> str:
@@ -66,11 +66,8 @@ class Cell:
         return f"{self.environment}-{self.config.label}-s{self.config.seed}-{self.digest[:8]}"
 
     def to_dict(self) -> dict:
-        """As JSON types."""
-        return {
-            "schema": SCHEMA, "environment": self.environment, "config": to_dict(self.config),
-            "goal_periods": list(self.goal_periods),
-        }  # fmt: skip
+        """As JSON types; see ``read_cell``."""
+        return {"schema": SCHEMA} | to_dict(self)
 
 
 def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
@@ -83,7 +80,7 @@ def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
     return fields | ({"methods": named} if named else {})
 
 
-def _digest(data: dict) -> str:
+def _digest(**data: Any) -> str:
     text = json.dumps({"schema": SCHEMA} | data, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -96,11 +93,10 @@ def read_cell(path: Path) -> Cell:
     """
     try:
         data = json.loads(path.read_text())
-        if data["schema"] != SCHEMA:
-            raise ValueError(f"its schema is {data['schema']}, not {SCHEMA}")
-        config = from_dict(TrainConfig, data["config"])
-        return Cell(environment=data["environment"], config=config, goal_periods=tuple(data["goal_periods"]))
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        if (found := data.pop("schema")) != SCHEMA:
+            raise ValueError(f"its schema is {found}, not {SCHEMA}")
+        return from_dict(Cell, data)
+    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
 
 

@@ -11,7 +11,6 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -23,10 +22,12 @@ from deimos.study.plan import Cell
 SCHEMA = 1  # of result.json
 Row = dict[str, Any]
 
-RESULT_COLUMNS: dict[str, type] = {
+_CELL: dict[str, type] = {
+    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
+}  # fmt: skip
+RESULT_COLUMNS = _CELL | {
     # What was run.
-    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str,
-    "num_envs": int, "env_steps": int, "trained_period": int,
+    "env_steps": int, "trained_period": int,
     # How it was evaluated.
     "goals": str, "goal_period": int, "eval_seed": int, "worlds": int, "steps": int,
     # What came out.
@@ -38,14 +39,12 @@ RESULT_COLUMNS: dict[str, type] = {
     # By what.
     "fps": float, "weights": str, "device": str, "versions": str,
 }  # fmt: skip
+MEANS = ("reward", "crashes_per_1000", "selected_fraction")
+"""Columns of ``progress.csv`` that a training curve has means of."""
+CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS), tuple)
+TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 TIMED = ("fps",)
 """Columns that two runs of the same cell may differ in."""
-
-CURVE_COLUMNS: dict[str, type] = {
-    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
-    "env_steps": tuple, "reward": tuple, "crashes_per_1000": tuple, "selected_fraction": tuple,
-}  # fmt: skip
-TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 FORMER_NAMES = {"selected_share": "selected_fraction"}
 """Columns of version 0.1.0 that have another name today."""
 
@@ -111,42 +110,36 @@ class Results:
             write_table(folder / name, columns, rows)
 
 
-def result(cell: Cell, run: RunFolder, evaluated: Iterable[Row], points: int = 100) -> Row:
+def result(cell: Cell, run: RunFolder, evaluated: Iterable[Row]) -> Row:
     """What a finished cell writes to its ``result.json``.
 
     Args:
         cell: The cell.
         run: Its run.
         evaluated: The rows of its evaluations.
-        points: Stretches of the training, at most, that its curve has means over.
     """
     stored = run.read_json("config.json")
-    versions = stored["versions"]
     names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
     shared = identity(cell) | {
         "env_steps": stored["config"]["env_steps"],
         "trained_period": cell.config.env.goal_period,
         "fps": median(float(row["fps"]) for row in run.read_csv("timing.csv")),
         "device": stored["config"]["device"],
-        "versions": " ".join(f"{name}={versions[name]}" for name in names),
+        "versions": " ".join(f"{name}={stored['versions'][name]}" for name in names),
     }
     rows = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in evaluated]
     # Where a goal has one group of components, its tracking is the reward.
     rows = [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in rows]
-    return {"schema": SCHEMA, "rows": rows, "curve": identity(cell) | _curve(run.read_csv("progress.csv"), points)}
+    return {"schema": SCHEMA, "rows": rows, "curve": identity(cell) | _curve(run.read_csv("progress.csv"))}
 
 
-def _curve(rows: list[dict[str, str]], points: int) -> Row:
+def _curve(rows: list[dict[str, str]], points: int = 100) -> Row:
     """Means of the columns of ``progress.csv`` over as many stretches as ``points``, or fewer."""
     rows = [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
     count = min(points, len(rows))
-    bounds = [len(rows) * i // count for i in range(count + 1)]
-    stretches = [rows[low:high] for low, high in pairwise(bounds)]
-    means = {
-        name: [sum(float(row[name]) for row in stretch) / len(stretch) for stretch in stretches]
-        for name in ("reward", "crashes_per_1000", "selected_fraction")
-    }
-    return {"env_steps": [float(stretch[-1]["env_steps"]) for stretch in stretches]} | means
+    stretches = [rows[len(rows) * i // count : len(rows) * (i + 1) // count] for i in range(count)]
+    means = {name: [sum(float(row[name]) for row in part) / len(part) for part in stretches] for name in MEANS}
+    return {"env_steps": [float(part[-1]["env_steps"]) for part in stretches]} | means
 
 
 def identity(cell: Cell) -> Row:
@@ -284,4 +277,4 @@ def _text(value: Any) -> str:
         return " ".join(f"{part:.5g}" for part in value)
     if isinstance(value, dict):
         return json.dumps(value) if value else ""
-    return repr(value) if isinstance(value, float) else str(value)
+    return str(value)
