@@ -1,6 +1,5 @@
 """What the thesis's methods look like, and the figure of claim C25: crashes over the achieved percentile of fear."""
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,7 +33,7 @@ def figures(data: Data, environment: str) -> Figures:
         found[f"dose-{environment}-T{period}"] = (
             f"{environment}, T = {period}: crashes over the percentile of fear that a method's goals have on average; "
             "medians with quartiles, and the parabola of claim C25.",
-            partial(dose_response, data, environment, period),
+            dose_response(data, environment, period),
         )
     return found
 

@@ -235,7 +235,7 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
         return ["# Mine", *pictures]
 
     def draw(data, environment):
-        return {f"own-{environment}": ("A caption.", lambda: figures.boxes(data, environment, 100))}
+        return {f"own-{environment}": ("A caption.", figures.boxes(data, environment, 100))}
 
     report.write(folder, tmp_path, page=page, draw=draw)
     assert (tmp_path / "report.md").read_text().startswith("# Mine\n\n![A caption.](figures/own-directional.png)")

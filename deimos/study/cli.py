@@ -106,11 +106,7 @@ class RunOptions(_FolderOptions):
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Seeds of ``10`` (the first ten), ``10-19`` or ``0,3,5``.
-
-    Raises:
-        RunError: If it is none of these.
-    """
+    """Seeds of ``10`` (the first ten), ``10-19`` or ``0,3,5``; raises ``RunError`` for anything else."""
     if re.fullmatch(r"[1-9]\d*", text):
         return list(range(int(text)))
     seeds: list[int] = []
@@ -129,11 +125,7 @@ class ShowOptions(_FolderOptions):
     """Print where a study stands."""
 
     def run(self) -> None:
-        """Print the medians of a study and what has failed or is open.
-
-        Raises:
-            RunError: If there is no study.
-        """
+        """Print the medians of a study and what has failed or is open; ``RunError`` if there is no study."""
         study = StudyFolder(self.folder)
         cells, rows = study.cells(), study.results().rows
         if not cells and not rows:

@@ -5,7 +5,7 @@ A text is a heading (``## ...``), a list (lines of ``* ...``) or a paragraph, as
 
 import base64
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; 
 """
 
 
-Table = Sequence[Mapping[str, str]]
+Table = list[dict[str, str]]
 """Its rows: plain texts by the titles of the columns, which are those of the first row; at least one."""
 
 
@@ -67,12 +67,7 @@ def _html(block: Block, folder: Path) -> str:
 
 
 def to_markdown(blocks: Sequence[Block], pictures: str) -> str:
-    """The page as Markdown, with links to the figures.
-
-    Args:
-        blocks: The page.
-        pictures: Folder of the figures, as seen from the page.
-    """
+    """The page as Markdown, with links to the figures in a folder, as seen from the page."""
     return "\n\n".join(_markdown(block, pictures) for block in blocks) + "\n"
 
 

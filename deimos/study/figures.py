@@ -3,15 +3,14 @@
 Every method has one colour and one marker throughout: those of the data's ``Style``.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from deimos.study import stats
-from deimos.study.data import Curve, Data, Style, Where
+from deimos.study.data import Data, Style, Where
 from deimos.study.stats import Array
 
 if TYPE_CHECKING:
@@ -23,8 +22,8 @@ DPI = 130
 WINDOW = 0.05  # of the training, for the rolling mean
 GOALS = ("naive", "adversary")
 
-Figures = dict[str, tuple[str, Callable[[], "Figure | None"]]]
-"""Of every figure by its name: the caption, and what makes it or finds that there are no data for it."""
+Figures = dict[str, tuple[str, "Figure | None"]]
+"""Captions and figures by their names; ``None`` for a figure that there are no data for."""
 
 
 def of_environment(data: Data, environment: str) -> Figures:
@@ -33,29 +32,29 @@ def of_environment(data: Data, environment: str) -> Figures:
     if any(data.curves(environment, name) for name in data.methods(environment)):
         figures[f"training-{environment}"] = (
             f"Training in {environment}: rolling means, mean over seeds with standard error. {CAVEAT}",
-            partial(training, data, environment),
+            training(data, environment),
         )
     for period in data.periods(environment):
         place, ending = f"{environment}, T = {period}", f"{environment}-T{period}"
         figures[f"evaluation-{ending}"] = (
             f"{place}: every point is a policy; boxes are quartiles, whiskers 1.5 times their range. Weak adversaries "
             "are left out.",
-            partial(boxes, data, environment, period),
+            boxes(data, environment, period),
         )
         figures[f"profile-{ending}"] = (
             f"{place}: share of the policies that crash more often than x, with pointwise 95 % bands.",
-            partial(profiles, data, environment, period),
+            profiles(data, environment, period),
         )
     return figures
 
 
 def draw(figures: Figures, folder: Path) -> dict[str, str]:
-    """Draw figures, each as PNG and SVG; returns captions of those that there are data for, by their names."""
+    """Write figures, each as PNG and SVG; returns captions of those that there are data for, by their names."""
     import matplotlib
 
     captions = {}
-    for name, (caption, make) in figures.items():
-        if (figure := make()) is not None:
+    for name, (caption, figure) in figures.items():
+        if figure is not None:
             figure.savefig(folder / f"{name}.png", dpi=DPI)
             with matplotlib.rc_context({"svg.hashsalt": name}):  # the same file from the same data
                 figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
@@ -64,13 +63,9 @@ def draw(figures: Figures, folder: Path) -> dict[str, str]:
 
 
 def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) -> "tuple[Figure, Any]":
-    """A figure that belongs to nobody else, unlike pyplot's, and its axes, shape (rows, columns).
+    """A figure that belongs to nobody else, unlike pyplot's, of width and height ``size`` [inch], and its axes.
 
-    Args:
-        rows: Of axes.
-        columns: Of axes.
-        size: Width and height [inch].
-        more: See ``Figure.subplots``.
+    The axes have shape (rows, columns); ``more`` is for ``Figure.subplots``.
     """
     from matplotlib.figure import Figure
 
@@ -133,9 +128,8 @@ def training(data: Data, environment: str) -> "Figure":
         names = [name for name in found if name == data.style.everywhere and name not in own] + own
         axes[0, column].set_title(title)
         for name in names:
-            curves = data.curves(environment, name)
-            _curve(axes[0, column], data.style, name, curves, lambda curve: curve.crashes)
-            _curve(axes[1, column], data.style, name, curves, lambda curve: curve.reward)
+            _curve(axes[0, column], data, environment, name, "crashes_per_1000")
+            _curve(axes[1, column], data, environment, name, "reward")
         axes[1, column].set_xlabel("parallel steps")
         if names:
             axes[0, column].legend(frameon=False, ncols=2, fontsize=9)
@@ -180,16 +174,17 @@ def _panels(style: Style, sharey: str) -> "tuple[Figure, Any]":
     return subplots(2, count, (1.5 + 4.75 * count, 6.6), sharex=True, sharey=sharey)
 
 
-def _curve(axes: "Axes", style: Style, name: str, curves: Sequence[Curve], number: Callable[[Curve], Array]) -> None:
+def _curve(axes: "Axes", data: Data, environment: str, name: str, column: str) -> None:
     """Mean over seeds with its standard error, smoothed by a rolling mean."""
-    length = min(len(curve.env_steps) for curve in curves)
+    curves, steps = data.curves(environment, name, column), data.curves(environment, name, "env_steps")
+    length = min(map(len, curves))
     window = max(1, round(WINDOW * length))
-    smooth = np.stack([_rolling(number(curve)[:length], window) for curve in curves])
+    smooth = np.stack([_rolling(curve[:length], window) for curve in curves])
     mean, band = smooth.mean(axis=0), None
     if len(curves) > 1:
         error = smooth.std(axis=0, ddof=1) / np.sqrt(len(curves))
         band = mean - error, mean + error
-    _line(axes, style, name, curves[0].env_steps[:length], mean, band, every=max(1, length // 8), alpha=0.18)
+    _line(axes, data.style, name, steps[0][:length], mean, band, every=max(1, length // 8), alpha=0.18)
 
 
 def _line(

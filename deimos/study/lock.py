@@ -31,8 +31,7 @@ else:
 def hold(path: Path, what: str, *, patience: float = 0.0, one_machine: bool = False) -> Iterator[None]:
     """Hold a lock for as long as the context lasts.
 
-    The file names its holder's machine and process. It is emptied when the context ends; after a kill it still names
-    them, but is not locked any more.
+    The file names its holder's machine and process until the context ends; after a kill it still does, unlocked.
 
     Args:
         path: The file; made if it is not there.

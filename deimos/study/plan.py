@@ -86,11 +86,7 @@ def _digest(**data: Any) -> str:
 
 
 def read_cell(path: Path) -> Cell:
-    """Read a ``cell.json``.
-
-    Raises:
-        RunError: If it is broken or of another version.
-    """
+    """Read a ``cell.json``; raises ``RunError`` if it is broken or of another version."""
     try:
         data = json.loads(path.read_text())
         if (found := data.pop("schema")) != SCHEMA:
@@ -109,8 +105,7 @@ def read(path: Path) -> dict:
     ``preset`` is one of ``deimos.run.presets``, where its environment and settings come from that are not said.
     ``base`` names another such file, as seen from this one, where everything comes from that is not said.
 
-    Raises:
-        RunError: If it or its base cannot be read or is not TOML.
+    Raises ``RunError`` if it or its base cannot be read or is not TOML.
     """
     try:
         data = tomllib.loads(path.read_text())

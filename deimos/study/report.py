@@ -4,7 +4,6 @@
 these sections and others.
 """
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import sem
 
 from deimos.study import figures, stats
 from deimos.study.data import Data, Where
@@ -51,13 +51,9 @@ def write(
         out: Where to write; made if it is not there.
         style: How methods are ordered and drawn.
         page: Makes the page.
-        draw: Names the figures of an environment.
+        draw: Draws the figures of an environment.
 
-    Returns:
-        Path of the HTML page.
-
-    Raises:
-        RunError: If there are no results, or they cannot be read.
+    Returns the path of the HTML page; raises ``RunError`` if there are no results, or they cannot be read.
     """
     data = Data.read(folder, style)
     (out / FIGURES).mkdir(parents=True, exist_ok=True)
@@ -95,8 +91,8 @@ def _values(rows: Sequence[dict], column: str) -> str:
 
 def _weak_adversaries(data: Data) -> str:
     made = sum(row["goals"] == "adversary" for row in data.rows)
-    weak = Counter((row["environment"], row["method"]) for row in data.rows if row["weak_adversary"])
-    text = f"{weak.total()} of {made} evaluations by the Adversary are marked weak and left out"
+    weak = Counter((row["environment"], row["method"]) for row in data.weak)
+    text = f"{len(data.weak)} of {made} evaluations by the Adversary are marked weak and left out"
     if not weak:
         return f"{text}."
     found = {place: [f"{name} {weak[place, name]}" for name in data.methods(place) if weak[place, name]]
@@ -162,46 +158,36 @@ def over_all(data: Data) -> list[Block]:
     blocks: list[Block] = []
     for goals in ("naive", "adversary"):
         places = [place for environment in data.environments for place in data.places(environment, goals)]
-        shared = [name for name in data.methods(data.environments[0])
-                  if all(len(data.sample(place, name, "crashes")) >= 2 for place in places)]  # fmt: skip
+        found = {name: [data.sample(place, name, "log_crashes") for place in places]
+                 for name in data.methods(data.environments[0])}  # fmt: skip
+        shared = {name: samples for name, samples in found.items() if min(map(len, samples)) >= 2}
         if len(places) < 2 or len(shared) < 2:
             continue
-        worst = [max(data.sample(place, name, "log_crashes").max() for name in shared) for place in places]
+        worst = [max(1e-9, *(x.max() for x in samples)) for samples in zip(*shared.values(), strict=True)]
         rows = []
-        for name in shared:
-            safety = [1 - data.sample(place, name, "log_crashes") / max(most, 1e-9)
-                      for place, most in zip(places, worst, strict=True)]  # fmt: skip
-            found = stats.bootstrap(safety, lambda *x: stats.iqm(np.concatenate(x, axis=-1)))
-            rows.append({"method": name, "safety: IQM [95 %]": f"{found:.3f}"})
+        for name, samples in shared.items():
+            safety = [1 - x / most for x, most in zip(samples, worst, strict=True)]
+            mean = stats.bootstrap(safety, lambda *x: stats.iqm(np.concatenate(x, axis=-1)))
+            rows.append({"method": name, "safety: IQM [95 %]": f"{mean:.3f}"})
         blocks += [f"### Against the {goals.capitalize()}, {len(places)} evaluations together", rows]
     text = "Safety is 1 - log(1 + crashes) / log(1 + most crashes of any policy of that evaluation)."
     return ["## Over all environments", text, *blocks] if blocks else []
 
 
-def speed(data: Data, published: Mapping[str, Mapping[str, float]] | None = None) -> list[Block]:
-    """Frames per second.
-
-    Args:
-        data: The results.
-        published: Ratios to the reference method that somebody else measured, by environment and method.
-    """
+def speed(data: Data) -> list[Block]:
+    """Frames per second; the rows of its table, the last of its blocks, can be added to."""
     rows = []
     for environment in data.environments:
         place = data.places(environment, "naive")[0]
         fps = {name: data.sample(place, name, "fps") for name in data.methods(environment)}
         base = fps.get(data.style.reference, ())
         for name, values in fps.items():
-            if len(values) < 2:
-                continue
-            error = values.std(ddof=1) / math.sqrt(len(values))
-            row = {
-                "environment": environment, "method": name, "FPS": f"{values.mean():.0f} ± {error:.0f}",
-                f"ratio to {data.style.reference}": f"{values.mean() / base.mean():.2f}" if len(base) else "-",
-            }  # fmt: skip
-            if published is not None:
-                theirs = published.get(environment, {}).get(name)
-                row["published ratio"] = "-" if theirs is None else f"{theirs:.2f}"
-            rows.append(row)
+            if len(values) >= 2:
+                rows.append({
+                    "environment": environment, "method": name,
+                    "FPS": f"{values.mean():.0f} ± {sem(values):.0f}",
+                    f"ratio to {data.style.reference}": f"{values.mean() / base.mean():.2f}" if len(base) else "-",
+                })  # fmt: skip
     text = (
         "Frames per second over all worlds during training, learning included: mean over seeds ± standard error. Only "
         "ratios are comparable, and only among runs of one kind of machine."
@@ -211,11 +197,9 @@ def speed(data: Data, published: Mapping[str, Mapping[str, float]] | None = None
 
 def limits(data: Data) -> list[str]:
     """What a reader must bear in mind, one text each."""
+    places = [place for environment in data.environments for place in data.places(environment, "naive")]
     smallest = min(
-        len(data.sample(place, name, "crashes"))
-        for environment in data.environments
-        for place in data.places(environment, "naive")
-        for name in data.methods(environment)
+        len(data.sample(place, name, "crashes")) for place in places for name in data.methods(place.environment)
     )
     p10, p30 = (stats.detectable_probability(n, n) for n in (10, 30))
     return [

@@ -62,8 +62,7 @@ class Results:
     def read(cls, folder: Path, *, may_be_empty: bool = True) -> "Results":
         """The results of a study's folder, or of one that holds tables only.
 
-        Raises:
-            RunError: If a file is broken or of another schema, or if there must be results and are none.
+        Raises ``RunError`` if a file is broken or of another schema, or if there must be results and are none.
         """
         found = cls()
         for path in sorted(folder.glob("cells/*/result.json")):
@@ -86,11 +85,9 @@ class Results:
         return len(fresh)
 
     def check(self) -> None:
-        """Refuse what is no one study.
+        """Raise ``RunError`` if what cannot be compared is mixed, or if a policy is there twice.
 
-        Raises:
-            RunError: If what cannot be compared is mixed, or a policy is there twice: one of the two would silently
-                count for nothing.
+        One of the two would silently count for nothing.
         """
         check_comparable([*self.rows, *self.curves])
         policy = ("environment", "method", "seed")
@@ -101,23 +98,13 @@ class Results:
                     raise RunError(f"There are two rows of {what}; keep one of them in the folder.")
 
     def write(self, folder: Path) -> None:
-        """Write the tables, each whole or not at all; numbers of a curve have five digits.
-
-        Raises:
-            RunError: If they cannot be written.
-        """
+        """Write the tables, each as ``write_table`` does; numbers of a curve have five digits."""
         for rows, (name, columns) in zip((self.rows, self.curves), TABLES.items(), strict=True):
             write_table(folder / name, columns, rows)
 
 
 def result(cell: Cell, run: RunFolder, evaluated: Iterable[Row]) -> Row:
-    """What a finished cell writes to its ``result.json``.
-
-    Args:
-        cell: The cell.
-        run: Its run.
-        evaluated: The rows of its evaluations.
-    """
+    """What a finished cell writes to its ``result.json``, from its run and the rows of its evaluations."""
     stored = run.read_json("config.json")
     names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
     shared = identity(cell) | {
@@ -158,8 +145,8 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
         sources: Study folders; all are checked before anything is written.
 
     Returns:
-        How many rows of evaluations were added, how many were there already, and how many of those
-        have other numbers in the source: of those the first stay.
+        How many rows of evaluations were added, how many were there already, and how many of those have other
+        numbers in the source: of those the first stay.
 
     Raises:
         RunError: If a folder has no results or those of another schema, or they do not make one study.
@@ -184,13 +171,9 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
 
 
 def check_comparable(rows: Iterable[Row]) -> None:
-    """Refuse to mix what cannot be compared: an environment has one setting, and a method in it one selector.
+    """Raise ``RunError`` unless an environment has one setting, and a method in it one selector.
 
-    Args:
-        rows: Rows of either kind, or cells' identities.
-
-    Raises:
-        RunError: If there are more.
+    ``rows`` are of either kind, or the identities of cells.
     """
     settings, selectors = defaultdict(set), defaultdict(set)
     for row in rows:
@@ -213,8 +196,7 @@ def check_comparable(rows: Iterable[Row]) -> None:
 def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     """All whole rows of a table, in which empty cells are NaN in columns of numbers, else None; none if it is missing.
 
-    Raises:
-        RunError: If it has other columns, or holds what is no value of its column.
+    Raises ``RunError`` if it has other columns, or holds what is no value of its column.
     """
     try:
         text = path.read_text()
@@ -238,11 +220,7 @@ def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
 
 
 def write_table(path: Path, columns: dict[str, type], rows: Iterable[Row]) -> None:
-    """Write a table, whole or not at all.
-
-    Raises:
-        RunError: If it cannot be written.
-    """
+    """Write a table, whole or not at all; raises ``RunError`` if it cannot be written."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
