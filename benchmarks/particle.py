@@ -57,7 +57,7 @@ def _torch_step(
     config: particle.Config, num_envs: int, device: torch.device, action: Tensor
 ) -> Callable[[], tuple[Tensor, ...]]:
     """The directional step as one would write it in torch, with the same outputs."""
-    params = config.params(0, 0)
+    params = config.params()
     position, velocity, target = (torch.zeros(num_envs, 3, device=device) for _ in range(3))
     clock = torch.zeros(num_envs, dtype=torch.int32, device=device)
     episode = torch.zeros(num_envs, dtype=torch.int32, device=device)
@@ -70,7 +70,7 @@ def _torch_step(
         terminated = (position.abs() > HALF_SIDE).any(dim=1)
         reward = 1.0 - (velocity - target).norm(dim=1) / (1.01 * params.largest_distance)
         clock, episode = clock + 1, episode + 1
-        goal_due = clock >= params.goal_period
+        goal_due = clock >= config.goal_period
         truncated = torch.zeros_like(terminated)
         invalid = ~(action.isfinite().all(dim=1) & position.isfinite().all(dim=1))
         obs = torch.cat([
@@ -84,7 +84,7 @@ def _torch_step(
 
 def _numpy_step(config: particle.Config, num_envs: int) -> Callable[[], tuple]:
     """The directional step as one would write it in NumPy, with the same outputs."""
-    params = config.params(0, 0)
+    params = config.params()
     action, position, velocity, target = (np.zeros((num_envs, 3), np.float32) for _ in range(4))
     clock, episode = (np.zeros(num_envs, np.int32) for _ in range(2))
 
@@ -96,7 +96,7 @@ def _numpy_step(config: particle.Config, num_envs: int) -> Callable[[], tuple]:
         terminated = (np.abs(position) > HALF_SIDE).any(axis=1)
         reward = 1.0 - np.linalg.norm(velocity - target, axis=1) / (1.01 * params.largest_distance)
         clock, episode = clock + 1, episode + 1
-        goal_due = clock >= params.goal_period
+        goal_due = clock >= config.goal_period
         truncated = np.zeros_like(terminated)
         invalid = ~(np.isfinite(action).all(axis=1) & np.isfinite(position).all(axis=1))
         obs = np.concatenate([
