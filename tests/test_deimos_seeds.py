@@ -81,7 +81,7 @@ def test_a_stream_continues_from_its_state():
 
 
 def test_a_stream_of_another_kind_of_device_continues_as_one_of_its_own():
-    """After the 16 bytes of a GPU a CPU continues as they and the seed determine, and says that it is another stream."""
+    """After the 16 bytes of a GPU a CPU continues as they and the seed determine, and warns that it is another."""
     states = [torch.tensor([0] * 8 + [offset] + [0] * 7, dtype=torch.uint8) for offset in (4, 4, 8)]
     numbers = []
     for state in states:
