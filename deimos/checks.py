@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 
 class RunError(Exception):
-    """A run cannot go on for a reason outside the program: a folder, a file, a disk, a device."""
+    """A run cannot continue for a reason outside the program: a folder, a file, a disk, a device."""
 
 
 class SimulationError(RuntimeError):

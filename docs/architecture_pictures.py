@@ -57,7 +57,7 @@ def canvas(width: float, height: float) -> Axes:
 
 
 def draw_packages() -> None:
-    """Which package may import which; arrows point at what is imported, and go on downwards."""
+    """Which package may import which; arrows point at what is imported, and continue downwards."""
     ax = canvas(10, 7.4)
     box(ax, 3.6, 6.8, 3.4, "app", "command line, figures, videos", PERSON)
     box(ax, 8.2, 6.8, 3.2, "adapters", "rsl_rl, gymnasium", PERSON)

@@ -1,4 +1,4 @@
-"""What becomes of a claim: findings, Holm's correction, verdicts."""
+"""The outcome of a claim: findings, Holm's correction, verdicts."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -77,7 +77,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a claim."""
+    """The outcome of a claim."""
 
     claim: Claim
     """The claim."""

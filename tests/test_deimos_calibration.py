@@ -100,7 +100,7 @@ def test_the_temperature_follows_from_update_to_update():
         assert calibration.temperature == end
 
 
-def test_it_goes_on_from_its_state():
+def test_it_continues_from_its_state():
     """Prior and temperature come back as they were."""
     first, second = Calibration(), Calibration()
     first.set_share(0.1)

@@ -174,7 +174,7 @@ def test_the_adversarys_uniform_goals_are_marked():
     assert abs(proposal.probe.sum().item() - 200) < 4 * 10
 
 
-def test_collecting_goes_on_until_there_is_enough():
+def test_collecting_continues_until_there_is_enough():
     """The collection ends at its steps where they suffice, and at its patience where a policy never crashes."""
     env = particle.Config(goal_period=50).build(64, CPU, 0)
     fear, facts = train_adversary(lambda obs: torch.zeros(64, 3), env, SMALL)

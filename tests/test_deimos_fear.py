@@ -137,7 +137,7 @@ def test_no_interactions_teach_nothing():
     assert math.isnan(make().fit(interactions(torch.zeros(0, dtype=torch.bool))))
 
 
-def test_it_goes_on_from_its_state_bit_for_bit():
+def test_it_continues_from_its_state_bit_for_bit():
     """Saved, loaded into a fresh one and fitted again, it equals the one that never stopped."""
     data = interactions(torch.arange(400) < 150)
     first, second = make(), Fear(FearConfig(), STATE_DIM, GOAL_DIM, torch.device("cpu"), seed=5)

@@ -57,7 +57,7 @@ def test_scaled_first_goals_do_not_fall_due_together(torch_device):
         loop.advance(step)
 
 
-def test_starting_again_goes_on_to_new_episodes(torch_device):
+def test_starting_again_continues_with_new_episodes(torch_device):
     """``start`` begins the next episode of every world, where ``restart`` begins the first one again."""
     env = TASKS["particle"].build(16, torch_device, 2)
     loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))

@@ -289,7 +289,7 @@ def test_weights_depend_on_the_seed_alone():
     assert not torch.equal(first.actor.mean[0].weight, third.actor.mean[0].weight)
 
 
-def test_a_learner_goes_on_from_its_state_bit_for_bit():
+def test_a_learner_continues_from_its_state_bit_for_bit():
     """Saved, loaded into a fresh learner and updated, it has the weights of the one that never stopped."""
     ppo = small_learner()
     rollout = filled(ppo)

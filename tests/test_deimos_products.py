@@ -10,7 +10,11 @@ from deimos.nn import matmul as products
 from deimos.nn.matmul import add_product_, fast_linear, onednn
 
 CPU = torch.device("cpu")
-MATMUL = torch.backends.mkldnn.matmul
+
+
+def precision():
+    """The switch that ``onednn`` turns; ``None`` where an older PyTorch has none."""
+    return getattr(getattr(torch.backends.mkldnn, "matmul", None), "fp32_precision", None)
 
 
 @pytest.mark.parametrize("activation", [None, nn.ReLU(), nn.ELU(), nn.Tanh()])
@@ -40,33 +44,33 @@ def test_gradients_of_weights_are_float32(rows, inputs, outputs):
 
 def test_onednn_leaves_the_switch_as_it_was():
     """Afterwards, also after an error and within itself, products are made as before."""
-    before = MATMUL.fp32_precision
+    before = precision()
     inside = "bf16" if products._exact_through_onednn() else before
     with onednn(CPU):
-        assert MATMUL.fp32_precision == inside
+        assert precision() == inside
         with onednn(CPU):
-            assert MATMUL.fp32_precision == inside
-        assert MATMUL.fp32_precision == inside
-    assert MATMUL.fp32_precision == before
+            assert precision() == inside
+        assert precision() == inside
+    assert precision() == before
     with pytest.raises(KeyError), onednn(CPU):
         raise KeyError
-    assert MATMUL.fp32_precision == before
+    assert precision() == before
 
 
 def test_onednn_is_nothing_to_a_gpu(monkeypatch):
     """Products of another device than a CPU neither touch the switch nor try the library."""
     monkeypatch.setattr(products, "_exact_through_onednn", None)
-    before = MATMUL.fp32_precision
+    before = precision()
     with onednn(torch.device("cuda")):
-        assert MATMUL.fp32_precision == before
+        assert precision() == before
 
 
 def test_inexact_library_is_not_used(monkeypatch):
     """Where oneDNN would multiply in bfloat16, the switch stays where it is."""
     monkeypatch.setattr(products, "_exact_through_onednn", lambda: False)
-    before = MATMUL.fp32_precision
+    before = precision()
     with onednn(CPU):
-        assert MATMUL.fp32_precision == before
+        assert precision() == before
 
 
 @pytest.mark.parametrize("missing", ["none", "operator", "switch"])

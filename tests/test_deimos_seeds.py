@@ -72,7 +72,7 @@ def test_a_director_leaves_all_global_streams_alone():
     assert str(np.random.get_state()) == str(before[1])  # noqa: NPY002
 
 
-def test_a_stream_goes_on_from_its_state():
+def test_a_stream_continues_from_its_state():
     """A saved stream continues bit for bit."""
     first, second = (generator(seed, "a", torch.device("cpu")) for seed in (0, 1))
     torch.rand(5, generator=first)
@@ -80,8 +80,8 @@ def test_a_stream_goes_on_from_its_state():
     assert torch.equal(torch.rand(5, generator=first), torch.rand(5, generator=second))
 
 
-def test_a_stream_of_another_kind_of_device_goes_on_as_one_of_its_own():
-    """After the 16 bytes of a GPU a CPU goes on as they and the seed determine, and says that it is no continuation."""
+def test_a_stream_of_another_kind_of_device_continues_as_one_of_its_own():
+    """After the 16 bytes of a GPU a CPU continues as they and the seed determine, and warns that it is another."""
     states = [torch.tensor([0] * 8 + [offset] + [0] * 7, dtype=torch.uint8) for offset in (4, 4, 8)]
     numbers = []
     for state in states:

@@ -379,7 +379,7 @@ def test_failed_write_keeps_the_last_checkpoint(tmp_path, break_disk):
     assert training.load(folder, CONFIG).iteration == 2
 
 
-def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch):
+def test_run_resumes_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch):
     """A run that a full disk stopped at a checkpoint resumes from the last good one, bit for bit."""
     path = tmp_path / "run"
     trainer, folder = training.start(CONFIG, path, None)

@@ -48,10 +48,10 @@ def advantages(
         if array.shape != reward.shape:
             raise ValueError(f"{name} must have the shape of reward, {tuple(reward.shape)}, got {tuple(array.shape)}.")
     has_future = (~terminated).float()
-    goes_on = (~(terminated | truncated)).float().mul_(discount * gae_lambda)
+    continues = (~(terminated | truncated)).float().mul_(discount * gae_lambda)
     advantage = torch.addcmul(reward, has_future, next_value, value=discount).sub_(value)
     for t in reversed(range(len(reward) - 1)):
-        advantage[t].addcmul_(goes_on[t], advantage[t + 1])
+        advantage[t].addcmul_(continues[t], advantage[t + 1])
     return advantage
 
 

@@ -17,7 +17,7 @@ UNWATCHED = -2  # part of a geom whose contacts do not matter
 
 @wp.struct
 class Contacts:
-    """The simulator's contacts of one substep, over all worlds, in mujoco-warp's layout, and what becomes of them."""
+    """The simulator's contacts of one substep, over all worlds, in mujoco-warp's layout, and the forces that result."""
 
     count: wp.array[int]  # contacts found, which may be more than the buffer holds
     world: wp.array[int]
