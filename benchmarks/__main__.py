@@ -10,7 +10,7 @@ import torch
 import tyro
 import warp as wp
 
-from benchmarks import director, particle, quad, terrain, training
+from benchmarks import commits, director, particle, quad, terrain, training
 from benchmarks.timing import wide_console
 from deimos.checks import check_at_least
 from deimos.run.folder import RunError
@@ -24,8 +24,10 @@ from reproduction.thesis import TABLE_4_1
 class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
-    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain", "director"]]
+    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain", "director", "commits"]]
     """What to measure."""
+    against: str = "HEAD"
+    """The other commit of ``commits``: this checkout's training beside it, in processes of their own."""
     json: Path | None = None
     """Write all numbers to this file too."""
     rounds: int = 7
@@ -54,13 +56,21 @@ def run(options: BenchOptions) -> dict[str, Any]:
         "versions": provenance(), "threads": torch.get_num_threads(), "device": str(device),
     }  # fmt: skip
     measure = {"particle": measure_particle, "terrain": measure_terrain, "director": measure_director}
+    if options.what == "commits":
+        results["commits"] = commits.measure(options.against, options.rounds, options.threads or cores())
+        commits.show(results["commits"], options.against)
+        return _write(results, options.json)
     with one_stream(device):
         if options.what in measure:
             results |= measure[options.what](options.rounds, device)
         else:
             results |= measure_legged(options.what.replace("-", "_"), options.rounds, device)
-    if options.json is not None:
-        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    return _write(results, options.json)
+
+
+def _write(results: dict[str, Any], path: Path | None) -> dict[str, Any]:
+    if path is not None:
+        path.write_text(json.dumps(results, indent=2) + "\n")
     return results
 
 

@@ -1,6 +1,7 @@
 """Checks of values, and the errors that stop a run; each message names the field, what it must be and what it was."""
 
 import math
+import numbers
 from collections.abc import Iterable
 
 
@@ -14,7 +15,7 @@ class SimulationError(RuntimeError):
 
 def check_at_least(name: str, value: int, least: int) -> None:
     """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
-    if not isinstance(value, int):
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):  # NumPy's whole numbers too
         raise ValueError(f"{name} must be a whole number, got {value}.")
     if not value >= least:
         raise ValueError(f"{name} must be at least {least}, got {value}.")

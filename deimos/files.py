@@ -1,4 +1,4 @@
-"""Files that survive a kill at any moment: the old or the new one is whole, never half of one."""
+"""Files that survive a kill at any moment: each is written atomically."""
 
 import contextlib
 import os
@@ -20,10 +20,10 @@ _UNREADABLE = (  # what reading damaged and foreign archives was seen to raise
 
 
 def save_tensors(path: Path, data: dict) -> None:
-    """Write a file of tensors so that at every moment either the old or the new one is whole.
+    """Write a file of tensors so that at every moment either the old or the new one is complete.
 
     Raises:
-        RunError: If it cannot be written; the file of before is untouched.
+        RunError: If it cannot be written; the previous file is untouched.
     """
     import torch
 
@@ -34,7 +34,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     """Write a file under a temporary name, to the disk, and only then rename it.
 
     Raises:
-        RunError: If it cannot be written; the file of before is untouched.
+        RunError: If it cannot be written; the previous file is untouched.
     """
     temporary = path.with_name(path.name + ".partial")
     try:

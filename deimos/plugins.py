@@ -1,6 +1,7 @@
-"""The file name is the registration: a module in ``deimos.sim.envs`` or ``deimos.goals.selectors`` *is* the plugin.
+"""The file name is the registration: a module in the package of environments, selectors or robots *is* the plugin.
 
-Packages outside this tree register a module through an entry-point group (``deimos.envs`` or ``deimos.selectors``).
+Packages outside this tree register a module through an entry-point group: ``deimos.envs``, ``deimos.selectors`` or
+``deimos.robots``.
 """
 
 import importlib

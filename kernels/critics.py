@@ -1,14 +1,14 @@
 """Values of several critics and the gradient of their loss, in the vector registers of a CPU.
 
 A critic is a multilayer perceptron of ReLU with one output. Products of a library write every layer of every critic to
-memory and read it back for ReLU, its slope and the next product; here blocks of rows pass forwards and backwards
+memory and read it back for ReLU, its derivative and the next product; here blocks of rows pass forwards and backwards
 through all layers within a core's caches (10 critics of 11, 64, 64 and 1 units, one core of Zen 5: 195 GFLOP/s in
 all; batched products by oneDNN 93). A GPU's libraries want large products: there ``nn.ensemble`` leaves it to them.
 
 Weights lie in a table of rows of ``WIDE`` or more lanes, one table per critic; units beyond a layer's lie idle, as 0.
 For each hidden layer: a row for every input, with its weights to all units, and a row of biases. For the output: a row
 of weights, and a row whose first number is the bias. Then the weights of the second and later hidden layers once
-more, turned: a row for every unit, with its weights from all inputs. Gradients have a table like it.
+more, transposed: a row for every unit, with its weights from all inputs. Gradients have a table like it.
 """
 
 from dataclasses import dataclass
@@ -39,8 +39,8 @@ class Layout:
         return tuple(sum(self.units[:i]) + i for i in range(len(self.units)))
 
     @property
-    def turned(self) -> tuple[int, ...]:
-        """First row of every hidden layer's turned weights; those of the first are not kept."""
+    def transposed(self) -> tuple[int, ...]:
+        """First row of every hidden layer's transposed weights; those of the first are not kept."""
         rows = [self.start[-1] + 2]
         for units in self.units[2:]:
             rows.append(rows[-1] + units)
@@ -68,7 +68,7 @@ class _Critics:
 
     units: wp.array[int]
     start: wp.array[int]
-    turned: wp.array[int]
+    transposed: wp.array[int]
     table: wp.array3d[_Floats]
     table_number: wp.array3d[float]
     scratch: wp.array3d[_Floats]
@@ -89,7 +89,7 @@ def _relu(h: _Floats):
 
 @wp.func
 def _where_active(h: _Floats, delta: _Floats):
-    """``delta`` times the slope of ReLU, by its output."""
+    """``delta`` times the derivative of ReLU, which its output determines."""
     for lane in range(WIDE):
         delta[lane] = wp.where(h[lane] > 0.0, delta[lane], 0.0)
     return delta
@@ -158,7 +158,7 @@ def _forward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int):
     for layer in range(1, hidden):
         _forward_layer(c, k, layer, c.scratch_number, (layer - 1) * _ROWS, layer * _ROWS - 1)
     top = (hidden - 1) * _ROWS
-    free = hidden * _ROWS  # until the way back
+    free = hidden * _ROWS  # until the backward pass
     out = c.start[hidden]
     for r in range(_ROWS):
         products = _Floats()
@@ -240,7 +240,7 @@ def _backward_layer(c: _Critics, k: int, layer: int, delta: int, to: int):
         row = (layer - 1) * _ROWS + 4 * quad
         for g in range(_groups(c.units[layer])):
             y0, y1, y2, y3 = _products(
-                c.scratch_number, k, delta + 4 * quad, delta + _ROWS - 1, n, c.table, c.turned[layer], g, _Floats()
+                c.scratch_number, k, delta + 4 * quad, delta + _ROWS - 1, n, c.table, c.transposed[layer], g, _Floats()
             )
             c.scratch[k, to + 4 * quad, g] = _where_active(c.scratch[k, row, g], y0)
             c.scratch[k, to + 4 * quad + 1, g] = _where_active(c.scratch[k, row + 1, g], y1)
@@ -263,7 +263,7 @@ def _backward(c: _Critics, k: int, x: wp.array3d[float], first: int, last: int, 
 
 @wp.func
 def _clipped_loss(value: float, before: float, target: float, clip: float):
-    """The clipped value loss and its slope, as ``deimos.learn.ppo.value_gradient`` has them."""
+    """The clipped value loss and its derivative, as ``deimos.nn.returns.value_gradient`` has them."""
     error = value - target
     step = value - before
     clipped = before + wp.clamp(step, -clip, clip) - target
@@ -335,7 +335,8 @@ class CriticTables:
     Args:
         layout: Where weights lie.
         table: Weights, float32, shape (K, rows, width) of the layout; idle numbers are 0. It may change, not move.
-        gradient: Gradients of the weights, of the same shape. Written whole; idle numbers and turned rows mean nothing.
+        gradient: Gradients of the weights, of the same shape. All of it is written; idle numbers and transposed rows
+            mean nothing.
 
     Raises:
         ValueError: If an array has another shape or dtype, is not contiguous, or does not lie on a CPU.
@@ -352,7 +353,7 @@ class CriticTables:
         whole = [wp.array(numbers, dtype=int, device=table.device) for numbers in (layout.units, layout.start)]
         self.struct = _Critics()
         self.struct.units, self.struct.start = whole
-        self.struct.turned = wp.array(layout.turned, dtype=int, device=table.device)
+        self.struct.transposed = wp.array(layout.transposed, dtype=int, device=table.device)
         self.struct.table, self.struct.table_number = _as_vectors(table), table
         self.struct.scratch, self.struct.scratch_number = _as_vectors(scratch), scratch
         self.struct.eights = _as_vectors(scratch, _Eight)
@@ -407,7 +408,7 @@ def gradients(
     rows: range,
     record: bool = False,
 ) -> wp.Launch | None:
-    """The clipped value loss of some of the critics and the gradient of their weights, see ``ppo.value_gradient``.
+    """The clipped value loss of some of the critics and the gradient of their weights, see ``returns.value_gradient``.
 
     Args:
         critics: Their memory, whose gradients are written.

@@ -28,8 +28,8 @@ class Worlds:
 
     num_envs: int
     num_threads: int  # that share the worlds
-    goal_period: int  # T: steps that a goal is in force
-    time_limit: int  # steps of an episode, 0 for no limit
+    goal_period: int  # T: steps that a goal is active
+    time_limit: int  # steps of an episode, 0 disables the limit
     stagger: wp.bool  # whether the goal clock of a world's first episode starts at a random step
     seed: wp.uint32  # of every draw
     world_offset: int  # global number of world 0
@@ -42,18 +42,18 @@ class Worlds:
     first_range: wp.array[float]  # (goal_dim,): half side of the box that first goals come from
     # All that a bit-exact resume needs of them.
     goal: wp.array2d[float]  # (num_envs, goal_dim), in physical units
-    goal_clock: wp.array[int]  # steps that the goal has been in force
+    goal_clock: wp.array[int]  # steps that the goal has been active
     episode_step: wp.array[int]  # steps since the reset
     episode_count: wp.array[int]  # resets so far
     goal_count: wp.array[int]  # goals received so far, first goals apart
     obs: wp.array2d[float]  # (num_envs, obs_dim)
     origin: wp.array2d[float]  # (num_envs, goal_dim), what goals are seen relative to; no rows where they are not
     # What a step gives back.
-    reward: wp.array[float]  # against the goal that was in force, at least 0 but for the penalty of a crash
+    reward: wp.array[float]  # against the goal that was active, at least 0 but for the penalty of a crash
     tracking: wp.array2d[float]  # (num_envs, num_groups): how well each group of the goal is met, in [0, 1]
     terminated: wp.array[wp.bool]  # crashed
     truncated: wp.array[wp.bool]  # cut off without a crash
-    goal_due: wp.array[wp.bool]  # the goal has been in force for its whole period, and the state is valid
+    goal_due: wp.array[wp.bool]  # the goal has been active for its whole period, and the state is valid
     invalid: wp.array[wp.bool]  # the action, the goal or the state is not physical
     fault: wp.array[int]  # (3,): invalid world-steps so far, lowest such world, lowest world with a broken action
     cause: wp.array[int]  # bits of what was wrong with a world when it last was invalid

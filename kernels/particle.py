@@ -53,12 +53,6 @@ PARTICLES = StructTable(ParticleState)
 
 
 @wp.func
-def load3(array: wp.array2d[float], env: int) -> wp.vec3:
-    """The three components of a row."""
-    return wp.vec3(array[env, 0], array[env, 1], array[env, 2])
-
-
-@wp.func
 def clamp3(v: wp.vec3, bound: float) -> wp.vec3:
     """Every component clipped to [-bound, bound]."""
     return wp.vec3(wp.clamp(v[0], -bound, bound), wp.clamp(v[1], -bound, bound), wp.clamp(v[2], -bound, bound))
@@ -110,11 +104,13 @@ def _step_particles(
     state: ParticleState,
     # In
     params: ParticleParams,
+    actions: wp.array[wp.vec3],  # those of ``worlds``, and its goals: a vector takes one address, not three
+    goals: wp.array[wp.vec3],
 ):
     for env in range(wp.tid(), worlds.num_envs, worlds.num_threads):
         # Tested before anything is clipped: a clipped NaN may come out as a bound.
-        action = load3(worlds.action, env)
-        goal = load3(worlds.goal, env)
+        action = actions[env]
+        goal = goals[env]
         broken = find_broken(action, state.velocity[env], state.position[env], goal)
 
         force = clamp3(action, params.max_force)
@@ -146,7 +142,7 @@ def step_particles(worlds: Worlds, state: ParticleState, params: ParticleParams)
         ValueError: If an array has another shape, dtype or device.
     """
     _require(worlds, state)
-    return record(_step_particles, worlds, state, params)
+    return record(_step_particles, worlds, state, params, _vectors(worlds.action), _vectors(worlds.goal))
 
 
 @wp.kernel
@@ -177,6 +173,11 @@ def reset_particles(worlds: Worlds, state: ParticleState, params: ParticleParams
     """
     _require(worlds, state)
     return record(_reset_particles, worlds, state, params)
+
+
+def _vectors(array: wp.array) -> wp.array:
+    """The rows of an array as vectors, in the same memory."""
+    return wp.array(ptr=array.ptr, dtype=wp.vec3, shape=array.shape[0], device=array.device)
 
 
 def _require(worlds: Worlds, state: ParticleState) -> None:

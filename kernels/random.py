@@ -3,7 +3,7 @@
 A sequential generator hands out numbers in the order of the calls, so what one world draws depends on
 what the others did before. Here a draw is addressed by *who* draws *what* for *which time*: the key is
 (seed, purpose), the counter (world, count, index, block). Two policies that crash at different times
-meet the same i-th goal in every world, two halves of a batch equal the whole, and a resumed run goes on
+meet the same i-th goal in every world, two halves of a batch equal the whole, and a resumed run continues
 with the very numbers that it would have had.
 
 The generator is Philox4x32-10 of Salmon et al., *Parallel Random Numbers: As Easy as 1, 2, 3*, SC 2011.

@@ -68,7 +68,7 @@ def main(arguments: list[str]) -> int:
     options, command = COMMANDS[name]
     try:
         command(tyro.cli(options, args=arguments[1:], prog=f"python -m reproduction {name}"))
-    except (RunError, ValueError) as error:
+    except (RunError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0

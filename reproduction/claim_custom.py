@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats as scipy_stats
 
 from deimos.study import stats
-from deimos.study.data import Curve, Data, Where
+from deimos.study.data import Data, Where
 from deimos.study.stats import Array, Interval
 from reproduction import claim_tests as tests
 from reproduction import significance
@@ -357,8 +357,8 @@ def _not_inferior(what: str, where: Where, x: Array, y: Array, margin: float) ->
 def halfway(data: Data, environment: str) -> list[Finding]:
     """VDS's crashes halfway are below a tenth of those at the start of training."""
 
-    def fall(curve: Curve) -> float:
-        log = np.log1p(1000 * curve.crashes)
+    def fall(crashes: Array) -> float:
+        log = np.log1p(1000 * crashes)
         tenth = max(1, len(log) // 10)
         return float(log[:tenth].mean() - log[4 * tenth : max(6 * tenth, 4 * tenth + 1)].mean())
 
@@ -410,7 +410,7 @@ def share_falls(directors: Sequence[str]) -> Findings:
 
     def findings(data: Data, environment: str) -> list[Finding]:
         found = {
-            float(name[1:]): tests.of_curves(data, environment, name, lambda c: float(c.selected_fraction.mean()))
+            float(name[1:]): tests.of_curves(data, environment, name, np.mean, "selected_fraction")
             for name in directors
         }
         found = {p: x for p, x in found.items() if len(x) >= tests.LEAST}

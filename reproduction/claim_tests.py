@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats as scipy_stats
 
 from deimos.study import stats
-from deimos.study.data import Curve, Data, Where
+from deimos.study.data import Data, Where
 from deimos.study.stats import Array, Interval
 from reproduction import significance
 from reproduction.claims import Finding
@@ -175,26 +175,28 @@ def by_ranks(samples: Sequence[Array]) -> Callable[[float], float]:
     return lambda alpha: stats.detectable_probability(n, m, alpha)
 
 
-def late_crashes(curve: Curve, share: float = 0.1) -> float:
-    """log(1 + crashes per 10^6 transitions) over the last part of a training."""
-    return math.log1p(1000 * _tail(curve.crashes, share).mean())
+def late_crashes(crashes: Array, share: float = 0.1) -> float:
+    """log(1 + crashes per 10^6 transitions) over the last part of a training, from those per 1000."""
+    return math.log1p(1000 * _tail(crashes, share).mean())
 
 
-def change(curve: Curve, share: float = 0.2) -> float:
+def change(crashes: Array, share: float = 0.2) -> float:
     """Change of log(1 + crashes per 10^6 transitions) from the first part of a training to the last."""
-    count = len(_tail(curve.crashes, share))
-    return math.log1p(1000 * curve.crashes[-count:].mean()) - math.log1p(1000 * curve.crashes[:count].mean())
+    count = len(_tail(crashes, share))
+    return math.log1p(1000 * crashes[-count:].mean()) - math.log1p(1000 * crashes[:count].mean())
 
 
-def final_slope(curve: Curve, share: float = 0.2) -> float:
+def final_slope(crashes: Array, share: float = 0.2) -> float:
     """Change of log(1 + crashes per 10^6 transitions) over the last part of a training, by a straight line."""
-    y = np.log1p(1000 * _tail(curve.crashes, share))
+    y = np.log1p(1000 * _tail(crashes, share))
     return float(np.polyfit(np.linspace(0.0, 1.0, len(y)), y, 1)[0]) if len(y) > 1 else math.nan
 
 
-def of_curves(data: Data, environment: str, method: str, number: Callable[[Curve], float]) -> Array:
+def of_curves(
+    data: Data, environment: str, method: str, number: Callable[[Array], float], column: str = "crashes_per_1000"
+) -> Array:
     """A number of every training curve of a method."""
-    values = np.array([number(curve) for curve in data.curves(environment, method)], float)
+    values = np.array([number(curve) for curve in data.curves(environment, method, column)], float)
     return values[~np.isnan(values)]
 
 

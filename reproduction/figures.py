@@ -1,12 +1,11 @@
 """What the thesis's methods look like, and the figure of claim C25: crashes over the achieved percentile of fear."""
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deimos.study.data import Data, Style, Where
-from deimos.study.figures import GOALS, Figures, logarithmic, of_environment
+from deimos.study.figures import GOALS, Figures, logarithmic, of_environment, subplots
 from deimos.study.stats import Array
 from reproduction.thesis import ACHIEVED, DIRECTOR_METHODS, ENVIRONMENTS
 
@@ -34,20 +33,18 @@ def figures(data: Data, environment: str) -> Figures:
         found[f"dose-{environment}-T{period}"] = (
             f"{environment}, T = {period}: crashes over the percentile of fear that a method's goals have on average; "
             "medians with quartiles, and the parabola of claim C25.",
-            partial(dose_response, data, environment, period),
+            dose_response(data, environment, period),
         )
     return found
 
 
 def dose_response(data: Data, environment: str, period: int) -> "Figure | None":
     """Crashes over the achieved percentile of fear, Naive and Adversary side by side."""
-    import matplotlib.pyplot as plt
-
     names = [name for name in data.methods(environment) if name in ACHIEVED]
     if len([name for name in names if name in DIRECTOR_METHODS]) < 3:
         return None
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained", sharey=True)
-    for panel, goals in zip(axes, GOALS, strict=True):
+    figure, axes = subplots(1, 2, (11, 4.2), sharey=True)
+    for panel, goals in zip(axes[0], GOALS, strict=True):
         where = Where(environment, goals, period)
         samples = {name: data.sample(where, name, "crashes") for name in names}
         for name, values in samples.items():
@@ -65,8 +62,8 @@ def dose_response(data: Data, environment: str, period: int) -> "Figure | None":
         shown = [name for name, values in samples.items() if len(values)]
         names_above = panel.secondary_xaxis("top")  # beside the markers they would cover each other
         names_above.set_xticks([ACHIEVED[name] for name in shown], shown, rotation=60, ha="left", fontsize=8)
-    logarithmic(axes[0])
-    axes[0].set_ylabel("crashes")
+    logarithmic(axes[0, 0])
+    axes[0, 0].set_ylabel("crashes")
     return figure
 
 

@@ -141,6 +141,17 @@ def write_rows(root: Path, audits: list[list[dict]]) -> None:
     (root / "population.json").write_text(json.dumps(rows, indent=1) + "\n")
 
 
+def print_audits(rows: list[dict]) -> None:
+    """The table of the audits of fear; nothing where there are none."""
+    if not rows:
+        return
+    print("\n| seed | parallel steps | contexts | crash rate | AUROC within contexts | 95 % interval |")
+    print("|---|---|---|---|---|---|")
+    for row in rows:
+        print(f"| {row['seed']} | {row['steps']} | {row['contexts']} of {row['tried']} | {row['crash_rate']:.3f} "
+              f"| {row['auroc']:.3f} | [{row['low']:.3f}, {row['high']:.3f}] |")  # fmt: skip
+
+
 def main() -> None:
     """See the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -162,12 +173,7 @@ def main() -> None:
         audits = list(pool.map(lambda seed: audit(options.root, seed), SEEDS)) if options.audit else []
     print_tables(options.root)
     write_rows(options.root, audits)
-    if audits:
-        print("\n| seed | parallel steps | contexts | crash share | AUROC within contexts | 95 % interval |")
-        print("|---|---|---|---|---|---|")
-    for row in (row for rows in audits for row in rows):
-        print(f"| {row['seed']} | {row['steps']} | {row['contexts']} of {row['tried']} | {row['crash_share']:.3f} "
-              f"| {row['auroc']:.3f} | [{row['low']:.3f}, {row['high']:.3f}] |")  # fmt: skip
+    print_audits([row for rows in audits for row in rows])
 
 
 if __name__ == "__main__":

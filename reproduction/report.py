@@ -7,8 +7,7 @@ from pathlib import Path
 
 from deimos.study import report
 from deimos.study.data import Data
-from deimos.study.document import Block, Table
-from deimos.study.report import interval
+from deimos.study.document import Block
 from reproduction import claims
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import FACTOR, LEAST, PROBABILITY, REWARD_SHARE, SPREAD
@@ -25,11 +24,12 @@ def write(folder: Path, out: Path) -> Path:
 
 def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
     """The sections of every study, the claims after what was run, and their tests at the end."""
-    outcomes = [claims.test(claim, data.only(LEGGED_METHODS)) for claim in CLAIMS]
+    tested = data.only(LEGGED_METHODS)
+    outcomes = [claims.test(claim, tested) for claim in CLAIMS]
     return [
         "# A study of goal selection", *report.what_was_run(data), *_verdicts(outcomes),
         *report.environments(data, captions), *report.over_all(data),
-        *report.speed(data, RATIOS_4_1), *[block for outcome in outcomes for block in _details(outcome)],
+        *_speed(data), *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
 
@@ -38,15 +38,26 @@ def _verdicts(outcomes: Sequence[Outcome]) -> list[Block]:
     counts: Counter[str] = Counter(outcome.verdict for outcome in outcomes)
     summary = ", ".join(f"{counts[verdict]} {verdict}" for verdict in claims.VERDICTS)
     rows = [
-        [o.claim.id, o.claim.text, _verdict(o), f"{o.made} of {o.claim.planned}", _tally(o), ", ".join(o.missing)]
-        for o in outcomes
-    ]
+        {"claim": each.claim.id, "what the thesis says": each.claim.text, "verdict": _verdict(each),
+         "tests made": f"{each.made} of {each.claim.planned}", "what they say": _tally(each),
+         "without data": ", ".join(each.missing)}
+        for each in outcomes
+    ]  # fmt: skip
     return [
         "## Claims",
         f"Of the thesis's {len(outcomes)} claims: {summary}. They are tested on the thesis's own methods; the "
         "tests of each, with effects, are below.",
-        Table(["claim", "what the thesis says", "verdict", "tests made", "what they say", "without data"], rows),
+        rows,
     ]
+
+
+def _speed(data: Data) -> list[Block]:
+    """That of every study, beside the thesis's Table 4.1."""
+    blocks = report.speed(data)
+    for row in blocks[-1] if blocks else []:
+        theirs = RATIOS_4_1.get(row["environment"], {}).get(row["method"])
+        row["published ratio"] = "-" if theirs is None else f"{theirs:.2f}"
+    return blocks
 
 
 def _verdict(outcome: Outcome) -> str:
@@ -63,17 +74,16 @@ def _details(outcome: Outcome) -> list[Block]:
     blocks: list[Block] = [f"### {claim.id}: {_verdict(outcome)}", claim.text]
     blocks.append(f"Test: {claim.test}." + (f" {claim.note}" if claim.note else ""))
     rows = [
-        [
-            str(each.finding.where), each.finding.what, " + ".join(map(str, each.finding.n)), each.finding.effect,
-            interval(each.finding.interval), f"{each.p:.2g}",
-            f"{'none' if math.isinf(each.detectable) else format(each.detectable, '.2g')} "
+        {
+            "where": str(each.finding.where), "what": each.finding.what, "n": " + ".join(map(str, each.finding.n)),
+            "effect": each.finding.effect, "size [95 %]": f"{each.finding.interval:.3g}", "p": f"{each.p:.2g}",
+            "minimum detectable effect": f"{'none' if math.isinf(each.detectable) else format(each.detectable, '.2g')} "
             f"(wanted {each.finding.wanted:.2g})",
-            each.verdict + ("" if each.finding.required else " (can only contradict)"),
-        ]
+            "verdict": each.verdict + ("" if each.finding.required else " (can only contradict)"),
+        }
         for each in outcome.assessed
     ]  # fmt: skip
-    header = ["where", "what", "n", "effect", "size [95 %]", "p", "minimum detectable effect", "verdict"]
-    return [*blocks, Table(header, rows)] if rows else [*blocks, "There are no data for it here."]
+    return [*blocks, rows or "There are no data for it here."]
 
 
 def _limits(data: Data) -> list[str]:

@@ -3,7 +3,9 @@
 Every program runs in a process of its own in which nothing else can be imported, whatever is installed here.
 """
 
+import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +13,7 @@ from pathlib import Path
 import pytest
 
 HOME = Path(__file__).resolve().parent.parent
+NIGHTLY = HOME / ".ci" / "nightly"
 
 BLOCK = """
 import sys
@@ -99,3 +102,17 @@ def test_command_line_names_its_extra(arguments):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1
     assert "pip install 'deimos-rl[sim]'" in done.stderr
+
+
+def test_what_nightly_runs_needs_the_base_install():
+    """The tests that .ci/nightly runs import torch, NumPy, pytest and what Deimos builds on these alone."""
+    files = re.findall(r"\btest_\w+\.py\b", re.search(r"tests=\((.*?)\n\)", NIGHTLY.read_text(), re.DOTALL)[1])
+    assert {"test_base_install.py", "test_deimos_goal_director.py", "test_deimos_fear.py"} <= set(files)
+    for file in set(files):
+        for node in ast.walk(ast.parse((HOME / "tests" / file).read_text())):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module]
+                for name in names:
+                    top, _, rest = name.partition(".")
+                    assert top in {"deimos", "torch", "numpy", "pytest"} | sys.stdlib_module_names, f"{file}: {name}"
+                    assert rest.split(".")[0] in {"", "checks", "goals", "learn", "nn"} or top != "deimos", file

@@ -9,7 +9,8 @@ from deimos.terrain import presets
 from torch import nn
 
 from benchmarks import __main__ as benchmarks
-from benchmarks import director, flops, particle, quad, terrain, timing, training
+from benchmarks import commits, director, flops, particle, quad, terrain, timing, training
+from deimos.checks import RunError
 from deimos.goals.methods import method
 from deimos.goals.selectors import rnd, vds
 from deimos.learn.ppo import PPOConfig
@@ -160,3 +161,26 @@ def test_mistake_is_refused(arguments, message, capsys):
     assert end.value.code == 2
     said = capsys.readouterr().err.replace("|", " ").replace("│", " ")
     assert message in " ".join(said.split())
+
+
+def test_two_checkouts_are_compared(capsys):
+    """Both are run in turn, and the ratios are those of what they wrote down."""
+    options = ["--num-envs", "16", "--env-steps", "120", "--ppo.hidden", "8"]
+    results = commits.compare(commits.HOME, 1, 1, {"tiny": options})
+    tiny = results["tiny"]
+    for key in ("FPS", "env [ms/iteration]", "CPU [s]"):
+        assert tiny["ratio"][key] == pytest.approx(tiny["this"][key] / tiny["other"][key])
+    commits.show(results, "HEAD")
+    assert "this / other" in capsys.readouterr().out
+
+
+def test_a_commit_that_is_none_is_one_line():
+    """A name that git does not know is said."""
+    with pytest.raises(RunError, match="git worktree add failed"):
+        commits.measure("no-such-commit", 1, 1)
+
+
+def test_a_run_that_fails_is_said():
+    """An option that a version does not know ends the comparison with what it said."""
+    with pytest.raises(RunError, match=r"train\.py .* failed: .*nonsense"):
+        commits.compare(commits.HOME, 1, 1, {"bad": ["--nonsense", "1"]})

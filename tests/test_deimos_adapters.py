@@ -67,6 +67,13 @@ def rsl_rl_runner(env, num_steps=8):
     return runner, losses
 
 
+def test_an_adapter_keeps_no_gradient():
+    """Actions that carry a gradient, as those of a learner outside of inference mode do, leave none in the worlds."""
+    env = RslRlVecEnv(CONFIG.build(4, CPU, 0))
+    obs, rewards, _, _ = env.step(torch.ones(4, 3, requires_grad=True) * 2.0)
+    assert not any(tensor.requires_grad for tensor in (obs["policy"], rewards, *env.env.tensors.values()))
+
+
 def test_adapters_are_optional():
     """Importing the package of adapters, or what they wrap, needs neither rsl_rl nor gymnasium."""
     code = (

@@ -82,7 +82,7 @@ def test_policy_of_an_old_run_acts_and_is_evaluated(tmp_path):
 
 
 def test_an_old_run_is_resumed_or_refused_in_one_line(tmp_path, capsys):
-    """A checkpoint of 0.1.0 does not go on half understood."""
+    """A checkpoint of 0.1.0 is not resumed half understood."""
     path = tmp_path / "run"
     shutil.copytree(OLD, path)
     code = cli.main(["train", "--resume", str(path), "--env-steps", "72"])

@@ -1,4 +1,4 @@
-"""From logits of a class-balanced network to probabilities, and how probabilities are judged."""
+"""From logits of a class-balanced network to probabilities, and how probabilities are evaluated."""
 
 import math
 
@@ -85,8 +85,8 @@ def test_the_temperature_is_found(temperature):
     )
 
 
-def test_the_temperature_follows_from_lesson_to_lesson():
-    """A few steps of Newton's method per lesson end where many do, and none leaves the range of temperatures."""
+def test_the_temperature_follows_from_update_to_update():
+    """A few steps of Newton's method per update end where many do, and none leaves the range of temperatures."""
     truth = torch.randn(5000, generator=torch.Generator().manual_seed(0))
     crashed = outcomes(torch.sigmoid(truth))
     tracked, settled = Calibration(), Calibration()
@@ -157,7 +157,7 @@ def test_a_small_case_by_hand():
 
 
 def test_the_ends_of_the_skill():
-    """The base rate has no skill and a perfect oracle all of it; one class or nothing to judge gives NaN."""
+    """The base rate has no skill and a perfect oracle all of it; one class or nothing to evaluate gives NaN."""
     crashed = torch.arange(100) < 20
     assert evaluate(torch.full((100,), 0.2), crashed)["log_loss_skill"] == pytest.approx(0.0, abs=1e-7)
     assert evaluate(crashed.float(), crashed)["log_loss_skill"] == 1.0

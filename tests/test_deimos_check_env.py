@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,26 @@ def test_the_unit_of_the_penalty_is_matching_the_goal():
     assert units.pop("quad") == pytest.approx(0.02 * (1.0 + 0.5))
     assert units.pop("quad-arm") == pytest.approx(0.02 * (1.0 + 0.5 + 0.5 + 0.5))
     assert set(units.values()) == {1.0}
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_crash_costs_the_penalty_everywhere(torch_device, name):
+    """In every environment the step of a crash, and no other, is worth less by the penalty; evaluation has none."""
+    configs = [replace(OURS[name].with_goal_period(5), crash_penalty=cost) for cost in (0.0, 2.0)]
+    plain, punished = (config.build(6, torch_device, 0) for config in configs)
+    assert punished.crash_penalty == pytest.approx(2.0 * OURS[name].largest_reward)
+    assert configs[1].for_evaluation() == configs[0].for_evaluation()
+    generator, crashes = torch.Generator().manual_seed(0), 0
+    place = "position" if "position" in plain.tensors else None
+    for t in range(40):
+        action = (3.0 * torch.randn(6, plain.action_dim, generator=generator)).to(torch_device)
+        if place and t == 20:  # robots fall by themselves
+            for env in (plain, punished):
+                env.tensors[place][2:4] = 1e4
+        expected, step = plain.step(action), punished.step(action)
+        crashes += int(expected.terminated.sum())
+        assert torch.equal(step.reward, expected.reward - punished.crash_penalty * expected.terminated)
+    assert crashes > 0
 
 
 @pytest.fixture

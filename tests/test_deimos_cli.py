@@ -40,7 +40,7 @@ TRAIN_ERRORS = {
     "--method q33": f"There is no method 'q33'; there are: {re.escape(', '.join(METHODS))}",
     "--method=": f"There is no method ''; there are: {re.escape(', '.join(METHODS))}",
     "selector:nope": "There is no 'selector:nope'; there are: .*selector:director, .*selector:uniform",
-    "--method p25 selector:uniform": "method 'p25' and a selector exclude each other",
+    "--method p25 selector:uniform": "method 'p25' and a selector cannot be combined",
     "selector:director --selector.percentile 100.5": r"percentile must be in \[0, 100\], got 100.5",
     "selector:director --selector.percentile -1": r"percentile must be in \[0, 100\], got -1.0",
     "selector:director --selector.percentile nan": r"percentile must be in \[0, 100\], got nan",

@@ -6,9 +6,6 @@ import torch
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import cl, grid
-from deimos.run.loop import GoalLoop, spaces
-from deimos.sim.env import Env
-from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
 GROUPS = (slice(0, 2), slice(2, 3))
@@ -83,7 +80,7 @@ def test_goals_of_the_old_range_say_nothing_of_the_new():
 
 
 def test_a_saved_curriculum_stays_what_it_was():
-    """What happens after a state was taken does not reach into it, and from it the curriculum goes on."""
+    """What happens after a state was taken does not reach into it, and from it the curriculum continues."""
     selector, other, ledger = curriculum(), curriculum(), Ledger()
     ledger.update(selector, [0.9, 0.0])
     state = selector.state_dict()
@@ -91,20 +88,6 @@ def test_a_saved_curriculum_stays_what_it_was():
     other.load_state_dict(state)
     assert other.share == [0.5, 0.25]
     assert other.goal_range().tolist() == [0.5, 0.5, 0.25]
-
-
-def test_goals_stay_in_the_range_first_goals_included():
-    """In Particle Gym all goals, first ones included, come from the share of the range, and reach its edge."""
-    env = particle.Config(goal_period=4).build(500, CPU, 0)
-    loop = GoalLoop(env, cl.Config(start=0.2, min_interactions=10**6).build(spaces(env), 0))
-    largest = 0.0
-    for _ in range(13):
-        largest = max(largest, env.goal.abs().max().item())
-        loop.advance(env.step(torch.zeros(500, 3)))
-    assert 0.19 < largest <= 0.2 * (1 + 1e-6)
-    env.tensors["position"][:] = 5000.0
-    loop.advance(env.step(torch.zeros(500, 3)))  # everybody crashes and gets a first goal
-    assert 0.19 < env.goal.abs().max().item() <= 0.2 * (1 + 1e-6)
 
 
 def adaptive(bins=8, **changes):
@@ -182,15 +165,3 @@ def test_a_grid_that_does_not_fit_is_refused():
     spaces_of_six = Spaces(num_envs=1, state_dim=1, goal_dim=6, goal_period=1, device=CPU)
     with pytest.raises(ValueError, match=r"bins must give at most 2\^20 cells per group, got 16 bins: 16777216 cells"):
         grid.Config(bins=16).build(spaces_of_six, 0)
-
-
-def test_environments_tell_their_groups():
-    """By default all components are one group, and its tracking is the mean reward."""
-    assert Env.goal_groups == (slice(None),)
-    env = particle.Config(goal_period=4).build(8, CPU, 0)
-    loop = GoalLoop(env, cl.Config().build(spaces(env), 0))
-    for _ in range(8):
-        loop.advance(env.step(torch.zeros(8, 3)))
-    resolved = loop.interactions.resolved()
-    assert resolved.tracking.shape == (8, 1)
-    torch.testing.assert_close(resolved.tracking[:, 0], resolved.reward / 4)

@@ -329,7 +329,7 @@ def test_clones_of_another_environment(torch_device):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_resume_is_exact(torch_device, variant):
-    """A run that goes on from its state dictionary in a new environment equals one that was never stopped."""
+    """A run that continues from its state dictionary in a new environment equals one that was never stopped."""
     config = {"variant": variant, "spawn_range": 20.0, "time_limit": 90, "stagger_goals": True}
     env = build(torch_device, **config)
     loop = build_loop(env)
@@ -676,3 +676,17 @@ def test_checkpoints_of_before_the_penalty_load(torch_device):
     state["made_for"]["env"]["max_speed"] = 3.0
     with pytest.raises(RunError, match="another environment"):
         trainer.load_state_dict(state)
+
+
+def test_training_refuses_a_field_that_one_network_sees(torch_device, monkeypatch):
+    """A field for the critic alone stops training with its name: both networks would see it."""
+    build_env = Config.build
+
+    def build_private(self, *arguments):
+        env = build_env(self, *arguments)
+        env.layout = (replace(env.layout[0], seen_by="critic"), *env.layout[1:])
+        return env
+
+    monkeypatch.setattr(Config, "build", build_private)
+    with pytest.raises(ValueError, match=r"PPO shows all .* velocity must be seen by both"):
+        Trainer(train_config(), torch_device)

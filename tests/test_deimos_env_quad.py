@@ -232,7 +232,7 @@ def test_reset_of_one_world_leaves_the_others(task, torch_device, hills):
 
 @both
 def test_copied_worlds_are_exact_clones(task, torch_device):
-    """Clones, also into another environment, go on exactly as their originals, warm starts and payloads included."""
+    """Clones, also into another environment, continue exactly as their originals, warm starts and payloads included."""
     config = {"noise": False, "push_interval": 0.0, "episode_steps": 300, "goal_period": 100}
     origin, env = build(torch_device, task=task, **config), build(torch_device, task=task, seed=3, **config)
     action = actions(6, torch_device, task=task)
@@ -251,7 +251,7 @@ def test_copied_worlds_are_exact_clones(task, torch_device):
 
 @both
 def test_resume_is_exact(task, torch_device, hills):
-    """A new environment with the saved state goes on bit for bit, over goals, pushes, crashes, resets and levels."""
+    """A new environment with the saved state continues bit for bit, over goals, pushes, crashes, resets and levels."""
     config = {"terrain": hills, "push_interval": 0.2}
     env = build(torch_device, task=task, **config)
     loop = build_loop(env)
@@ -655,6 +655,7 @@ def test_actions_are_what_the_joints_can_do(torch_device):
     ends = np.array([joint.action_range for joint in env.robot.joints])
     np.testing.assert_allclose(POSE + 0.25 * ends.T, [low, high], atol=1e-12)
     assert env.action_bound == pytest.approx(np.abs(ends).max())
+    np.testing.assert_allclose(torch.stack(env.action_range), ends.T, rtol=1e-6)
     step = env.step(torch.tensor([[1e6], [-1e6]], device=torch_device).expand(2, 12))
     np.testing.assert_allclose(env.physics.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
     np.testing.assert_allclose(step.obs[:, 36:48].cpu(), ends.T[::-1], rtol=1e-6)

@@ -232,7 +232,7 @@ def test_evaluation_is_quads(torch_device):
 
 def test_presets():
     """The command line's names, however spelled, lead to the environment; all presets but one ask it to walk too."""
-    for name in ("quad-arm", "quad_arm", "quad-arm-stand", "quad-arm-thesis"):
+    for name in ("quad-arm", "quad_arm", "quad-arm-stand", "quad-arm-large"):
         assert plugins.load(envs, presets.environment(name)) is quad_arm
         assert presets.preset(name).env.speed == (0.0 if name == "quad-arm-stand" else 1.0)
         assert not presets.preset(name).env.hold_trunk
@@ -240,7 +240,7 @@ def test_presets():
     stand = presets.preset("quad-arm-stand")
     assert (stand.env.noise, stand.ppo.discount, stand.ppo.hidden) == (False, 0.95, (256, 128, 64))
     assert (stand.eval.worlds, stand.eval.adversary_enough) == (256, "any")
-    assert presets.preset("quad-arm-thesis").env.terrain == "rough"
+    assert presets.preset("quad-arm-large").env.terrain == "rough"
 
 
 def test_the_environments_share_their_code_not_their_lines():

@@ -1,4 +1,4 @@
-"""The judgement of policies: what is counted, the score, and the Adversary."""
+"""The evaluation of policies: what is counted, the score, and the Adversary."""
 
 import math
 from types import SimpleNamespace
@@ -94,7 +94,7 @@ def test_play_counts_what_a_plain_loop_counts():
 
 
 def test_errors_are_read_at_the_end_of_goals():
-    """What an environment calls an error is read where a goal has been in force for T steps, and not elsewhere."""
+    """What an environment calls an error is read where a goal has been active for T steps, and not elsewhere."""
     env = particle.Config(goal_period=7).for_evaluation().build(5, torch.device("cpu"), 0)
     env.errors = {"clock [steps]": env.tensors["goal_clock"]}
     row = play(env, lambda obs: torch.zeros(5, 3), uniform.Config().build(spaces(env), 0), 30)

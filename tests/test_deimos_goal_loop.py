@@ -7,6 +7,7 @@ import torch
 
 from deimos.goals.selectors import cl, mix, schedule, uniform
 from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import Env
 from deimos.sim.envs import particle, quad
 
 TASKS = {
@@ -84,3 +85,29 @@ def test_an_environment_that_miscounts_touches_no_other_world(torch_device):
     assert (env.tensors["goal_count"] - before["goal_count"]).nonzero().flatten().tolist() == [3]
     assert (env.tensors["episode_count"] - before["episode_count"]).nonzero().flatten().tolist() == [5, 7]
     assert loop.interactions.active.nonzero().flatten().tolist() == [3]
+
+
+def test_goals_stay_in_the_range_first_goals_included():
+    """In Particle Gym all goals, first ones included, come from the share of the range, and reach its edge."""
+    env = particle.Config(goal_period=4).build(500, torch.device("cpu"), 0)
+    loop = GoalLoop(env, cl.Config(start=0.2, min_interactions=10**6).build(spaces(env), 0))
+    largest = 0.0
+    for _ in range(13):
+        largest = max(largest, env.goal.abs().max().item())
+        loop.advance(env.step(torch.zeros(500, 3)))
+    assert 0.19 < largest <= 0.2 * (1 + 1e-6)
+    env.tensors["position"][:] = 5000.0
+    loop.advance(env.step(torch.zeros(500, 3)))  # everybody crashes and gets a first goal
+    assert 0.19 < env.goal.abs().max().item() <= 0.2 * (1 + 1e-6)
+
+
+def test_environments_tell_their_groups():
+    """By default all components are one group, and its tracking is the mean reward."""
+    assert Env.goal_groups == (slice(None),)
+    env = particle.Config(goal_period=4).build(8, torch.device("cpu"), 0)
+    loop = GoalLoop(env, cl.Config().build(spaces(env), 0))
+    for _ in range(8):
+        loop.advance(env.step(torch.zeros(8, 3)))
+    resolved = loop.interactions.resolved()
+    assert resolved.tracking.shape == (8, 1)
+    torch.testing.assert_close(resolved.tracking[:, 0], resolved.reward / 4)

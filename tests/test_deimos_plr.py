@@ -58,7 +58,7 @@ class Loop:
         self.clock[(due | crashed).numpy()] = 0
         self.advantages.append(self.random(NUM_ENVS) - 0.5)
 
-    def lesson(self):
+    def update(self):
         """One rollout and what is learnt from it; returns what resolved in it, with the loss of each, by loops."""
         known = len(self.closed)
         for _ in range(STEPS):
@@ -83,14 +83,14 @@ def test_positive_value_loss_is_a_sum_over_transitions(monkeypatch):
 
     monkeypatch.setattr(plr.PLR, "_positive_value_loss", spied)
     spanning = 0
-    for lesson in range(12):
-        expected = sorted((env, issued, resolved, loss) for env, issued, resolved, _, loss in loop.lesson())
+    for update in range(12):
+        expected = sorted((env, issued, resolved, loss) for env, issued, resolved, _, loss in loop.update())
         done, loss = losses[-1]
         found = sorted(zip(done.env.tolist(), done.issued.tolist(), done.resolved.tolist(), loss.tolist(), strict=True))
         assert [row[:3] for row in found] == [row[:3] for row in expected]
         # Differences of sums of eight numbers below 1.
         np.testing.assert_allclose([row[3] for row in found], [row[3] for row in expected], rtol=0, atol=1e-5)
-        spanning += sum(issued < STEPS * lesson < resolved for _, issued, resolved, _ in expected)
+        spanning += sum(issued < STEPS * update < resolved for _, issued, resolved, _ in expected)
     assert spanning > 50
 
 
@@ -118,7 +118,7 @@ def test_the_buffer_holds_what_a_plain_list_holds():
     places = [None] * 40  # goal, score, step that it was made on
     refreshed = stale = 0
     for _ in range(40):
-        found = loop.lesson()
+        found = loop.update()
         renewed = {}
         for _, issued, _, (_, note, replayed), loss in found:
             if replayed and places[note - 1][2] < issued:
@@ -150,7 +150,7 @@ def test_the_buffer_holds_what_a_plain_list_holds():
 
 
 def test_a_note_on_a_replaced_level_is_not_written():
-    """A goal that was issued on the step of a lesson which then replaced its level leaves the new one alone."""
+    """A goal that was issued on the step of an update which then replaced its level leaves the new one alone."""
     selector = plr.Config(capacity=2, fill=0.5).build(SPACES, 0)
     selector._score.copy_(torch.tensor([1.0, 2.0]))
     selector._made.fill_(10)
@@ -203,7 +203,7 @@ def test_nothing_is_replayed_before_the_buffer_is_filled():
     """Below its share of levels every goal is uniform and marked so; above, the configured share is replayed."""
     loop = Loop(fill=1.0, replay=0.7)
     while not loop.selector.replaying:
-        loop.lesson()
+        loop.update()
     assert not any(choice[2] for *_, choice in loop.closed)
     n = 20_000
     draws = loop.random(n, 4)
@@ -221,7 +221,7 @@ def test_the_robust_learner_takes_replayed_goals_only():
     arguments = [torch.arange(4), torch.zeros(4, 4), torch.zeros(4, 2), loop.random(4, 6, 2), loop.random(4, 4)]
     assert not loop.selector.propose(*arguments).learn.any()
     while not loop.selector.replaying:
-        loop.lesson()
+        loop.update()
     arguments[4][:, 1] = torch.tensor([0.0, 0.49, 0.51, 0.9])
     assert loop.selector.propose(*arguments).learn.tolist() == [True, True, False, False]
 

@@ -103,7 +103,7 @@ def test_flat_parameters_keep_the_network():
 
 
 def test_adam_is_torchs():
-    """Fifty steps over changing gradients and step sizes end where torch.optim.Adam ends."""
+    """Fifty steps over changing gradients and learning rates end where torch.optim.Adam ends."""
     generator = torch.Generator().manual_seed(0)
     ours, theirs = (torch.nn.Parameter(torch.ones(33)) for _ in range(2))
     ours.grad, theirs.grad = torch.zeros(33), torch.zeros(33)
@@ -141,7 +141,7 @@ def filled(ppo, seed=1, *, truncations=False):
 def end_in(rollout, final_obs):
     """Let the truncated steps end in these observations, shape (num_steps, num_envs, obs_dim)."""
     rows = [truncated.nonzero().squeeze(1) for truncated in rollout.truncated]
-    rollout.ends = [(t, worlds, final_obs[t, worlds]) for t, worlds in enumerate(rows)]
+    rollout.ends = [(torch.full_like(worlds, t), worlds, final_obs[t, worlds]) for t, worlds in enumerate(rows)]
 
 
 def rsl_rl_like(ppo, rollout):
@@ -205,7 +205,7 @@ def test_returns_differ_from_rsl_rls_at_time_limits_only_by_the_value():
 
 @pytest.mark.parametrize("clip_value", [True, False])
 def test_a_full_update_is_rsl_rls(monkeypatch, clip_value):
-    """After 5 x 4 minibatches in the same order, losses, step size and all weights agree to float32 rounding."""
+    """After 5 x 4 minibatches in the same order, losses, learning rate and all weights agree to float32 rounding."""
     ppo = small_learner(clip_value=clip_value)
     rollout = filled(ppo)
     learner = rsl_rl_like(ppo, rollout)
@@ -242,7 +242,7 @@ def test_transitions_of_weight_zero_teach_nothing():
 
 @pytest.mark.parametrize("counting", [0, 1, NUM_ENVS * NUM_STEPS // 4 - 1])  # a minibatch has one more
 def test_too_few_transitions_teach_nothing(counting):
-    """Where fewer transitions count than a minibatch has, weights and step size stay, whatever Adam remembers."""
+    """Where fewer transitions count than a minibatch has, weights and learning rate stay, whatever Adam remembers."""
     ppo = small_learner()
     ppo.update(filled(ppo))
     rollout = filled(ppo, seed=2)
@@ -272,7 +272,7 @@ def test_the_step_size_follows_the_divergence(kl, factor):
 
 
 def test_the_step_size_stays_in_its_range():
-    """However often it is adapted, the step size stays in [1e-5, 1e-2]."""
+    """However often it is adapted, the learning rate stays in [1e-5, 1e-2]."""
     ppo = small_learner()
     for kl, limit in ((1.0, 1e-5), (1e-6, 1e-2)):
         for _ in range(40):
@@ -306,7 +306,7 @@ def test_a_learner_goes_on_from_its_state_bit_for_bit():
 
 
 def test_exploration_belongs_to_seed_world_and_step():
-    """Two shards explore as the whole does, a rollout goes on where the last one ended, and seeds differ."""
+    """Two shards explore as the whole does, a rollout continues where the last one ended, and seeds differ."""
     ppo, noise = small_learner(), torch.empty(2 * NUM_STEPS, NUM_ENVS, 3)
     ppo.draw_noise(noise, 0)
     later = torch.empty(NUM_STEPS, NUM_ENVS, 3)

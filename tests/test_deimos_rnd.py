@@ -17,7 +17,7 @@ ROWS = torch.arange(NUM_ENVS)
 
 
 class World:
-    """Decisions whose candidates are uniform in [-1, 1]^2, and what became of them."""
+    """Decisions whose candidates are uniform in [-1, 1]^2, and their outcomes."""
 
     def __init__(self, seed=0, **changes):
         self.selector = rnd.Config(**changes).build(SPACES, seed)
@@ -35,7 +35,7 @@ class World:
         )
         return ROWS, state, goal, candidates, torch.rand(NUM_ENVS, 4, generator=self.generator)
 
-    def lesson(self, choose=None):
+    def update(self, choose=None):
         """Decide once in every world, by the selector or by ``choose``, and learn from it; returns the log."""
         arguments = self.decision()
         proposal = self.selector.propose(*arguments)
@@ -51,7 +51,7 @@ def test_scores_are_the_predictors_errors(monkeypatch, kernel):
     monkeypatch.setattr(fusion, "kernels_run_on", lambda device: kernel)
     world = World()
     assert (world.selector._fused is not None) == kernel
-    world.lesson()
+    world.update()
     selector = world.selector
     _, state, goal, candidates, _ = world.decision()
     everything = torch.cat([torch.cat([state, goal], 1).unsqueeze(1).expand(-1, CANDIDATES, -1), candidates], dim=2)
@@ -65,7 +65,7 @@ def test_scores_are_the_predictors_errors(monkeypatch, kernel):
 def test_the_most_surprising_goal_or_in_proportion(rule):
     """Argmax takes the largest surprise; proportional draws the others too, and larger ones more often."""
     world = World(rule=rule)
-    world.lesson()
+    world.update()
     arguments = world.decision()
     surprise = world.selector.surprise(*arguments[1:4])
     proposal = world.selector.propose(*arguments)
@@ -74,7 +74,7 @@ def test_the_most_surprising_goal_or_in_proportion(rule):
     assert proposal.score.mean() > surprise.mean()
 
 
-def test_before_the_first_lesson_it_is_uniform():
+def test_before_the_first_update_it_is_uniform():
     """As long as nothing can be whitened it picks as Uniform does and has no opinion."""
     world = World()
     rows, state, goal, candidates, draws = world.decision()
@@ -93,7 +93,7 @@ def test_whitening_knows_uniform_candidates_only():
         return torch.ones(NUM_ENVS, 2)
 
     for _ in range(30):
-        world.lesson(corner)
+        world.update(corner)
         states.append(torch.cat(world.interactions.issued(world.interactions.now - 1)[1:3], dim=1))
     selector = world.selector
     seen = torch.cat([torch.cat(states), torch.cat(goals)], dim=1).double()
@@ -106,7 +106,7 @@ def test_what_never_changes_is_ignored():
     """A constant input is whitened to 0, before and after it changes, and nothing becomes infinite."""
     world = World()
     world.constant = True
-    world.lesson()
+    world.update()
     _, state, goal, candidates, _ = world.decision()
     before = world.selector.surprise(state, goal, candidates)
     state[:, 1] = 1000.0
@@ -121,12 +121,12 @@ def test_surprise_falls_where_goals_repeat():
     def left(candidates):
         return candidates[:, 0] * torch.tensor([0.2, 1.0]) - torch.tensor([0.8, 0.0])
 
-    world.lesson(left)
+    world.update(left)
     _, state, goal, candidates, _ = world.decision()
     known, unknown = left(candidates).unsqueeze(1), -left(candidates).unsqueeze(1)
     first = [world.selector.surprise(state, goal, options).mean().item() for options in (known, unknown)]
     target = [parameter.clone() for parameter in world.selector.target.parameters()]
-    rows = [world.lesson(left) for _ in range(150)]
+    rows = [world.update(left) for _ in range(150)]
     last = [world.selector.surprise(state, goal, options).mean().item() for options in (known, unknown)]
     assert last[0] < first[0] / 3
     assert last[1] > 2 * last[0]
@@ -135,15 +135,15 @@ def test_surprise_falls_where_goals_repeat():
 
 
 def test_every_goal_is_learnt_from_once():
-    """A lesson uses what was issued since the last one, and none when nothing was."""
+    """An update uses what was issued since the last one, and none when nothing was."""
     world = World()
-    world.lesson()
+    world.update()
     assert world.selector._moments[0, 0] == NUM_ENVS
     before = [parameter.clone() for parameter in world.selector.predictor.parameters()]
     row = world.selector.learn(world.interactions, None)
     assert all(math.isnan(value) for value in row.values())
     assert all(torch.equal(a, b) for a, b in zip(before, world.selector.predictor.parameters(), strict=True))
-    world.lesson()
+    world.update()
     assert world.selector._moments[0, 0] == 2 * NUM_ENVS
 
 

@@ -23,7 +23,7 @@ class Recorder(GoalSelector):
     def __init__(self, place, score, **proposal):
         self.num_candidates = place + 1
         self.place, self.score, self.proposal = place, score, proposal
-        self.lessons = []
+        self.updates = []
 
     def propose(self, rows, state, goal, candidates, draws):
         """See ``GoalSelector.propose``."""
@@ -31,7 +31,7 @@ class Recorder(GoalSelector):
 
     def learn(self, interactions, rollout):
         """See ``GoalSelector.learn``."""
-        self.lessons.append((interactions.now, interactions.resolved().score))
+        self.updates.append((interactions.now, interactions.resolved().score))
         return {f"recorder/{self.place}": float(interactions.now)}
 
 
@@ -66,7 +66,7 @@ def trainer(selector):
 
 @pytest.mark.parametrize(("at", "switch"), [(0.5, 48), (0.3, 48), (0.2, 24), (0.9, 96)])
 def test_it_switches_once_at_its_share(recorders, at, switch):
-    """From the first lesson at or after its share of the training on, the second method chooses, and it stays so."""
+    """From the first update at or after its share of the training on, the second method chooses, and it stays so."""
     run = trainer(schedule.Config(first="one", second="two", at=at))
     selector = run.loop.selector
     for rollout in range(1, 5):
@@ -80,15 +80,15 @@ def test_it_switches_once_at_its_share(recorders, at, switch):
 
 
 def test_the_second_learns_from_the_start_without_the_firsts_scores(recorders):
-    """It sees every lesson, but no score until they are its own; the first learns only as long as it chooses."""
+    """It sees every update, but no score until they are its own; the first learns only as long as it chooses."""
     run = trainer(schedule.Config(first="one", second="two", at=0.5))
     for _ in range(4):
         run.iterate()
-    assert [now for now, _ in recorders["one"].lessons] == [24, 48]
-    assert [now for now, _ in recorders["two"].lessons] == [24, 48, 72, 96]
-    assert all((score == 1.0).all() for _, score in recorders["one"].lessons)
-    assert all(score.isnan().all() and len(score) for _, score in recorders["two"].lessons[:2])
-    assert (recorders["two"].lessons[3][1] == 2.0).all()
+    assert [now for now, _ in recorders["one"].updates] == [24, 48]
+    assert [now for now, _ in recorders["two"].updates] == [24, 48, 72, 96]
+    assert all((score == 1.0).all() for _, score in recorders["one"].updates)
+    assert all(score.isnan().all() and len(score) for _, score in recorders["two"].updates[:2])
+    assert (recorders["two"].updates[3][1] == 2.0).all()
 
 
 def test_every_row_has_the_same_columns(recorders):

@@ -368,8 +368,8 @@ def test_boltzmann_follows_its_temperature():
 
 
 def test_predictions_are_judged_once_and_before_they_are_learnt_from(monkeypatch):
-    """The calibration of a lesson is that of the scores at issue of what has resolved since the last one."""
-    # Goals that last for most of a rollout, so that the window reaches back beyond the last lesson.
+    """The calibration of an update is that of the scores at issue of what has resolved since the last one."""
+    # Goals that last for most of a rollout, so that the window reaches back beyond the last update.
     monkeypatch.setitem(SMALL_ENVS, "particle", {"goal_period": 16, "max_speed": 70.0, "max_force": 30.0})
     run, resumed = trainer("particle", "p75"), trainer("particle", "p75")
     selector, interactions = run.loop.selector, run.loop.interactions
@@ -381,7 +381,7 @@ def test_predictions_are_judged_once_and_before_they_are_learnt_from(monkeypatch
     window = interactions.resolved()
     assert (window.resolved == 144).any()
     recent = window.where((window.resolved > 144) & window.score.isfinite())
-    # A forecast keeps the prior that it was issued with, while the share of crashes goes on changing.
+    # A forecast keeps the prior that it was issued with, while the crash rate keeps changing.
     before = torch.sigmoid(recent.score / selector.calibration.temperature)
     row = selector.learn(interactions, None)
     assert_same(resumed.loop.selector.learn(resumed.loop.interactions, None), row)

@@ -81,9 +81,9 @@ def test_any_percentile_can_be_asked_for(tmp_path):
 
 def test_environment_takes_a_training_preset(tmp_path):
     """An environment may name a preset of the training; what the study says itself comes before it."""
-    flat = '[[environment]]\nname = "quad"\npreset = "quad-thesis"\n'
+    flat = '[[environment]]\nname = "quad"\npreset = "quad-large"\n'
     (cell,) = plan.expand(described(tmp_path, flat), seeds=[2], methods=["p25"])
-    base = training_preset("quad-thesis")
+    base = training_preset("quad-large")
     assert cell.config == dataclasses.replace(base, method="p25", seed=2, threads=1)
     toml = """
 [[environment]]

@@ -175,7 +175,7 @@ def test_empty_folder_has_no_report(tmp_path):
 
 def test_text_is_escaped():
     """What HTML or a Markdown table would take for markup is only text."""
-    blocks = ["# a < b", document.Table(["x"], [["P(a | b) & <c>"]])]
+    blocks = ["# a < b", [{"x": "P(a | b) & <c>"}]]
     assert "<h1>a &lt; b</h1>" in document.to_html(blocks, None)
     assert "<td>P(a | b) &amp; &lt;c&gt;</td>" in document.to_html(blocks, None)
     assert "| P(a \\| b) & <c> |" in document.to_markdown(blocks, "figures")
@@ -235,7 +235,7 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
         return ["# Mine", *pictures]
 
     def draw(data, environment):
-        return {f"own-{environment}": ("A caption.", lambda: figures.boxes(data, environment, 100))}
+        return {f"own-{environment}": ("A caption.", figures.boxes(data, environment, 100))}
 
     report.write(folder, tmp_path, page=page, draw=draw)
     assert (tmp_path / "report.md").read_text().startswith("# Mine\n\n![A caption.](figures/own-directional.png)")

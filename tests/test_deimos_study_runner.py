@@ -37,7 +37,7 @@ RUN = """
 import sys
 from pathlib import Path
 from deimos.study import cli
-cli.run(cli.RunOptions(folder=Path(sys.argv[1]), workers=2))
+cli.RunOptions(folder=Path(sys.argv[1]), workers=2).run()
 """
 
 
@@ -53,7 +53,7 @@ def file(tmp_path_factory):
 def whole(file, tmp_path_factory):
     """The study run without interruption."""
     folder = tmp_path_factory.mktemp("studies") / "whole"
-    cli.run(cli.RunOptions(folder=folder, file=file, workers=2))
+    cli.RunOptions(folder=folder, file=file, workers=2).run()
     return StudyFolder(folder)
 
 
@@ -117,7 +117,7 @@ def test_finished_study_starts_nothing(whole, file, monkeypatch):
     paths = [whole.cell_path(cell) / "result.json" for cell in whole.cells()]
     before = [path.read_bytes() for path in paths]
     monkeypatch.setattr(subprocess, "Popen", None)
-    cli.run(cli.RunOptions(folder=whole.path, file=file))
+    cli.RunOptions(folder=whole.path, file=file).run()
     assert [path.read_bytes() for path in paths] == before
 
 
@@ -126,7 +126,7 @@ def test_stopped_and_killed_study_ends_with_the_same_table(whole, file, tmp_path
     study = StudyFolder(tmp_path / "broken")
     options = cli.RunOptions(folder=study.path, file=file, workers=2)
     with pytest.raises(SystemExit) as stop:
-        cli.run(options, stopped=lambda: min(iterations(study).values(), default=0) >= 2)
+        options.run(stopped=lambda: min(iterations(study).values(), default=0) >= 2)
     assert stop.value.code == 130
     stopped_at = iterations(study)
     assert all(2 <= count < ITERATIONS for count in stopped_at.values())
@@ -142,7 +142,7 @@ def test_stopped_and_killed_study_ends_with_the_same_table(whole, file, tmp_path
             pass
     assert len(study.results().rows) < 4
 
-    cli.run(cli.RunOptions(folder=study.path, workers=2))
+    cli.RunOptions(folder=study.path, workers=2).run()
     assert table(study) == table(whole)
     assert len(study.results().rows) == 4
     assert len(study.results().curves) == 2
@@ -175,10 +175,10 @@ def test_worker_that_dies_is_retried_once_then_given_up(file, tmp_path, capsys):
     with pytest.raises(
         RunError, match=rf"1 of 2 cells failed, {victim.name.replace('+', '.')} first: killed by SIGKILL"
     ):
-        cli.run(cli.RunOptions(folder=study.path))
-    cli.show(cli.ShowOptions(folder=study.path))
+        cli.RunOptions(folder=study.path).run()
+    cli.ShowOptions(folder=study.path).run()
     assert f"{victim.name} failed: {error}" in capsys.readouterr().out
-    cli.run(cli.RunOptions(folder=study.path, retry_failed=True))
+    cli.RunOptions(folder=study.path, retry_failed=True).run()
     assert study.finished(study.cells()) == {cell.digest for cell in study.cells()}
 
 
@@ -186,13 +186,13 @@ def test_study_that_is_worked_on_is_refused(whole):
     """A second runner, here or on another machine, is refused in one line that names the first."""
     command = cli.RunOptions(folder=whole.path)
     with whole.hold(), pytest.raises(RunError, match=f"whole is being worked on by process {os.getpid()} on "):
-        cli.run(command)
+        command.run()
     lock = whole.path / "lock"
     lock.write_text('{"machine": "elsewhere", "process": 7}')
     with pytest.raises(RunError, match="whole was last worked on by process 7 on elsewhere"):
-        cli.run(command)
+        command.run()
     lock.unlink()
-    cli.run(command)
+    command.run()
 
 
 def test_cell_that_is_worked_on_is_refused(whole, tmp_path, monkeypatch):
@@ -259,7 +259,7 @@ def test_cell_of_another_version_is_refused(whole, tmp_path):
     (cell,) = study.cells()
     study.cell_path(cell).rename(study.path / "cells" / "directional-p25-s0-00000000")
     with pytest.raises(RunError, match="was made by another version of Deimos"):
-        cli.run(cli.RunOptions(folder=study.path))
+        cli.RunOptions(folder=study.path).run()
 
 
 def test_worker_without_results_has_failed(whole, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -26,6 +27,7 @@ from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import director, uniform
 from deimos.learn.ppo import PPOConfig
 from deimos.learn.rollout import Rollout
+from deimos.nn.random import Purpose, normals
 from deimos.run import presets, training
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
@@ -87,7 +89,7 @@ def go_on(trainer, folder, iterations=None):
 
 
 def resume(path):
-    """Go on with a run to its end, by the command line."""
+    """Resume a run and finish it, by the command line."""
     assert cli.main(["train", "--resume", str(path)]) == 0
 
 
@@ -243,7 +245,7 @@ def test_seed_reaches_everything():
         lambda trainer: trainer.loop.selector.fear.network[0].weight,
         lambda trainer: trainer.loop.selector.fear.generator.get_state(),
         lambda trainer: trainer.env.tensors["position"],
-        lambda trainer: trainer.env.tensors["target"],
+        lambda trainer: trainer.env.tensors["goal"],
         lambda trainer: trainer.env.sample_goals(torch.arange(2), 3),
         lambda trainer: trainer.env.draw(torch.arange(2)),
     ):
@@ -251,22 +253,22 @@ def test_seed_reaches_everything():
 
 
 def poison_actor(trainer):
-    """Spoil one weight of the actor."""
+    """Make one weight invalid of the actor."""
     trainer.ppo.actor.mean[0].weight.data[3, 2] = torch.nan
 
 
 def poison_critic(trainer):
-    """Spoil one weight of the critic."""
+    """Make one weight invalid of the critic."""
     trainer.ppo.critic[2].bias.data[1] = torch.nan
 
 
 def poison_fear(trainer):
-    """Spoil one weight of the fear network."""
+    """Make one weight invalid of the fear network."""
     trainer.loop.selector.fear.network[0].weight.data[0, 0] = torch.inf
 
 
 def poison_world(name):
-    """Spoil one number of world 17."""
+    """Make one number of world 17 invalid."""
 
     def poison(trainer):
         trainer.env.tensors[name][17, 1] = torch.nan
@@ -287,7 +289,7 @@ def poison_world(name):
     ids=["actor", "critic", "fear", "position", "velocity", "goal"],
 )  # fmt: skip
 def test_nan_stops_the_run_and_keeps_the_checkpoint(tmp_path, poison, message):
-    """NaN in a weight or a world stops the run, says where, and leaves the checkpoint of before, which loads."""
+    """NaN in a weight or a world stops the run, says where, and leaves the previous checkpoint, which loads."""
     trainer, folder = run(CONFIG, tmp_path / "run", iterations=2)
     before = (folder.path / "checkpoint.pt").read_bytes(), (folder.path / "policy.pt").read_bytes()
     poison(trainer)
@@ -306,7 +308,7 @@ def test_nan_is_one_line_on_the_command_line(tmp_path, monkeypatch, capfd):
     collect = training.Trainer.collect
 
     def poisoned(trainer):
-        if trainer.iteration == 2:
+        if trainer.iteration == 1:  # before the second
             trainer.env.tensors["position"][5] = torch.nan
         collect(trainer)
 
@@ -360,7 +362,7 @@ def forbid_writing(path, monkeypatch):
 
 @pytest.mark.parametrize("break_disk", [fill_disk_at_sync, fill_disk_in_torch, fill_disk_for_good, forbid_writing])
 def test_failed_write_keeps_the_last_checkpoint(tmp_path, break_disk):
-    """A checkpoint that cannot be written raises RunError, leaves the one of before and nothing half-written."""
+    """A checkpoint that cannot be written raises RunError, leaves the previous one and nothing half-written."""
     trainer, folder = run(CONFIG, tmp_path / "run", iterations=1)
     before = files(folder.path)
     trainer.iterate()
@@ -378,7 +380,7 @@ def test_failed_write_keeps_the_last_checkpoint(tmp_path, break_disk):
 
 
 def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch):
-    """A run that a full disk stopped at a checkpoint goes on from the last good one, bit for bit."""
+    """A run that a full disk stopped at a checkpoint resumes from the last good one, bit for bit."""
     path = tmp_path / "run"
     trainer, folder = training.start(CONFIG, path, None)
     synced = []
@@ -400,7 +402,7 @@ def test_run_goes_on_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch)
 
 
 def test_full_disk_is_one_line_on_the_command_line(undisturbed, tmp_path):
-    """Where no file can grow any more the run ends with one line and exit code 2, whoever met it, and can go on."""
+    """Where no file can grow any more the run ends in one line with exit code 2, whoever met it, and can be resumed."""
     path = tmp_path / "run"
     process = start_process(path, 1e9, file_size=4096)  # TensorBoard's file is the first to reach it
     _, stderr = process.communicate(timeout=60)
@@ -497,7 +499,7 @@ CONFIGS = {
         env=particle.Config(
             variant="relative", goal_period=7, max_speed=3.3, max_force=float("inf"), goal_range=0.1,
             reward="reciprocal", reward_length=1e-3, spawn_range=999.0, time_limit=55, stagger_goals=True,
-            obs_scale="raw",
+            obs_scale="raw", crash_penalty=2.5,
         ),
         selector=director.Config(
             percentile=33.3, rule="argmin", candidates=17, probe=0.05, control="shuffled",
@@ -582,7 +584,7 @@ def test_policy_acts_as_the_actor_in_physical_units(tmp_path, variant, obs_scale
     policy = deimos.load_policy(tmp_path / "run")
 
     env, state = trainer.env, trainer.env.tensors
-    goal = state["target"] - state["position"] if variant == "relative" else state["target"]
+    goal = state["goal"] - state["position"] if variant == "relative" else state["goal"]
     physical = torch.cat([state["velocity"], state["position"], state["force"], goal], dim=1)
     mean = trainer.ppo.actor(env.obs).detach()
     expected = mean.clamp(-0.3, 0.3)
@@ -647,3 +649,42 @@ def test_a_preset_is_a_training_configuration():
         assert kind(presets.preset(name).env) == presets.environment(name)
     with pytest.raises(ValueError, match=r"no preset 'nonsense'; there are: .*particle"):
         presets.preset("nonsense")
+
+
+def test_exploration_is_addressed_by_world_and_step():
+    """The first rollout draws the noise of steps 0 to T - 1, the second goes on after it."""
+    trainer = training.Trainer(CONFIG, torch.device("cpu"))
+    steps, worlds = CONFIG.ppo.num_steps, torch.arange(CONFIG.num_envs)
+    for first in (0, steps):
+        trainer.iterate()
+        numbers = torch.arange(first, first + steps).unsqueeze(1)
+        expected = normals(CONFIG.seed, Purpose.EXPLORATION, worlds, numbers, 3)
+        assert torch.equal(trainer.rollout.noise, expected)
+
+
+def test_a_rollout_keeps_no_graph():
+    """What an environment or a caller hands over with gradients is recorded without."""
+    rollout = Rollout(2, 3, 4, 1, torch.device("cpu"))
+    wanting = torch.ones(3, requires_grad=True)
+    no, yes = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)
+    rollout.record(
+        0, obs=wanting.unsqueeze(1).expand(3, 4), reward=2 * wanting, terminated=no, truncated=yes, invalid=no,
+        weight=wanting, cut_off=torch.arange(3),
+    )  # fmt: skip
+    kept = [value for value in vars(rollout).values() if isinstance(value, torch.Tensor)]
+    assert not any(value.requires_grad for value in [*kept, *rollout.cut_off()])
+
+
+def test_a_run_leaves_all_global_streams_alone():
+    """Building, training and saving under selectors with networks moves neither torch's nor NumPy's global stream."""
+    before = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+    for name in ("p75", "rnd", "vds"):
+        config = TrainConfig(
+            env=particle.Config(goal_period=4), method=name, ppo=PPOConfig(hidden=(8,)), num_envs=16, evaluation=False
+        )
+        trainer = training.Trainer(config, torch.device("cpu"))
+        for _ in range(2):
+            trainer.iterate()
+        trainer.load_state_dict(trainer.state_dict())
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert str(np.random.get_state()) == str(before[1])  # noqa: NPY002

@@ -42,7 +42,8 @@ def random_rollout(env, seed=0):
         rollout.truncated &= ~rollout.terminated
         for t, truncated in enumerate(rollout.truncated):
             rows = truncated.nonzero().squeeze(1)
-            rollout.ends.append((t, rows, torch.randn(len(rows), env.obs_dim, generator=generator)))
+            last = torch.randn(len(rows), env.obs_dim, generator=generator)
+            rollout.ends.append((torch.full_like(rows, t), rows, last))
     rollout.weight.bernoulli_(0.9, generator=generator)
     return rollout
 
@@ -87,7 +88,7 @@ class Alone:
 
 
 def orders(selector, count):
-    """The orders that its next lesson will draw, one per critic."""
+    """The orders that its next update will draw, one per critic."""
     generator = torch.Generator()
     generator.set_state(selector.generator.get_state())
     return [torch.randperm(NUM_ENVS * NUM_STEPS, generator=generator) for _ in range(count)]
@@ -97,15 +98,15 @@ def orders(selector, count):
 @pytest.mark.parametrize(("activation", "piece"), [("elu", 7), ("elu", 10_000), ("relu", None)])
 @pytest.mark.parametrize("max_grad_norm", [0.05, 10.0])
 def test_ten_stacked_critics_equal_ten_separate_ones(activation, piece, max_grad_norm):
-    """Over five lessons every member stays what it becomes alone, with its own returns, order and gradient clip."""
+    """Over five updates every member stays what it becomes alone, with its own returns, order and gradient clip."""
     env = worlds()
     selector = ensemble(env, max_grad_norm=max_grad_norm, activation=activation)
     assert (selector.stack.fused is None) == (piece is not None)
     selector.stack._piece = piece
     single = [Alone(copy.deepcopy(net), selector.config) for net in selector.stack.nets]
     start = selector.stack.parameters.detach().clone()
-    for lesson in range(5):
-        rollout = random_rollout(env, lesson)
+    for update in range(5):
+        rollout = random_rollout(env, update)
         for critic, order in zip(single, orders(selector, 10), strict=True):
             critic.learn(rollout, order)
         selector.learn(no_interactions(env), rollout)
@@ -121,7 +122,7 @@ def test_ten_stacked_critics_equal_ten_separate_ones(activation, piece, max_grad
 
 
 def test_one_critic_is_ppos_own():
-    """K = 1 with PPO's weights, order and step size has PPO's critic over five updates, with the same baseline."""
+    """K = 1 with PPO's weights, order and learning rate has PPO's critic over five updates, with the same baseline."""
     env = worlds()
     config = PPOConfig(
         num_steps=NUM_STEPS, hidden=SMALL["hidden"], activation="elu", desired_kl=0.0, epochs=2, minibatches=3
@@ -323,7 +324,7 @@ def test_roles():
 
 
 def test_values_that_the_learner_asked_for_are_not_stale():
-    """A lesson after the learner's question equals one without, also when the rollout's memory holds new numbers."""
+    """An update after the learner's question equals one without, also when the rollout's memory holds new numbers."""
     env = worlds(time_limit=0)
     asked, silent = ensemble(env), ensemble(env)
     rollout = random_rollout(env)

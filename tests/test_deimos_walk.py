@@ -36,5 +36,5 @@ def test_it_stays_on_its_feet(walked):
 
 
 def test_it_is_small():
-    """The policy and what training goes on from fit into 2 MB."""
+    """The policy and what training resumes from fit into 2 MB."""
     assert sum(path.stat().st_size for path in HOME.iterdir()) < 2_000_000

@@ -16,7 +16,10 @@ from deimos.run.loop import spaces
 from deimos.run.training import TrainConfig, Trainer
 from deimos.sim.envs import particle
 
-DOCS = Path(__file__).parent.parent / "docs"
+HOME = Path(__file__).parent.parent
+DOCS = HOME / "docs"
+PAGES = [HOME / "README.md", HOME / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("lab/*.md"))]
+SUFFIXES = {".py", ".md", ".toml", ".json", ".csv", ".png", ".svg"}
 
 
 @pytest.fixture
@@ -61,3 +64,43 @@ def test_every_method_is_explained():
     text = (DOCS / "selectors.md").read_text()
     for name in [*METHODS, *plugins.names(selectors)]:
         assert f"`{name}`" in text or f"selector:{name}`" in text, name
+
+
+def named_paths(page):
+    """Paths of the repository that a page names in backticks, from its root, or links to."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for name in re.findall(r"`([\w./-]+)`", text):
+        if "/" in name and Path(name).suffix in SUFFIXES and not re.search(r"\b[A-Z]+\b", name):
+            yield name, (HOME / name,)
+    for link in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
+        if "://" not in link:
+            yield link, (page.parent / link,)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(HOME).as_posix())
+def test_every_path_that_a_page_names_exists(page):
+    """Files of the repository in backticks and in links are there; NAME stands for any name."""
+    missing = [name for name, places in named_paths(page) if not any(place.exists() for place in places)]
+    assert not missing, missing
+
+
+def test_every_link_into_a_page_has_its_heading():
+    """A link to a part of a page names one of its headings, as GitHub abbreviates them."""
+    for page in PAGES:
+        for link, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            if "://" in link:
+                continue
+            target = (page.parent / link if link else page).read_text(encoding="utf-8")
+            titles = re.findall(r"^#+ (.*)$", target, re.MULTILINE)
+            known = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+            assert anchor in known, f"{page.name}: {link}#{anchor}"
+
+
+def test_the_check_of_paths_finds_what_it_looks_for(tmp_path):
+    """Backticked files, images and links are found; placeholders, commands and other sites are not."""
+    page = tmp_path / "page.md"
+    page.write_text(
+        "`a/b.py` `a/NAME.py` `python x/y.py` `b.py` ![p](images/c.png) [q](d.md#part) [r](https://e.org/f.md)\n"
+        "```sh\n`g/h.py`\n```\n"
+    )
+    assert [name for name, _ in named_paths(page)] == ["a/b.py", "images/c.png", "d.md"]

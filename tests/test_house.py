@@ -18,6 +18,8 @@ from deimos.goals import selectors
 from deimos.run import config
 from deimos.run.folder import RunFolder
 from deimos.sim import envs
+from deimos.sim.envs import quad
+from deimos.sim.legged import robots
 
 HOME = Path(deimos.__file__).resolve().parent.parent
 PACKAGES = ("deimos", "kernels", "terrain")
@@ -56,6 +58,17 @@ class Longest(GoalSelector):
         best = score.argmax(dim=1)
         every = torch.arange(len(rows), device=rows.device)
         return Proposal(candidates[every, best], score[every, best])
+'''
+
+ROBOT = '''
+"""A stiff Go1."""
+
+from deimos.sim.legged.robots import go1
+
+
+def build(stiffness=77.0, **gains):
+    """A Go1 whose joints are stiff unless they are told otherwise."""
+    return go1.build(stiffness=stiffness, **gains)
 '''
 
 
@@ -407,17 +420,34 @@ def test_dropped_in_file_is_a_selector(tmp_path, monkeypatch, capsys):
         sys.modules.pop("deimos.goals.selectors.longest", None)
 
 
-def test_entry_point_is_a_selector(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Installs another distribution, of one module that is registered under an entry-point group."""
+
+    def write(group, name, source):
+        (tmp_path / "other_module.py").write_text(source)
+        information = tmp_path / "other-1.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+        (information / "entry_points.txt").write_text(f"[{group}]\n{name} = other_module\n")
+        monkeypatch.syspath_prepend(str(tmp_path))
+
+    yield write
+    sys.modules.pop("other_module", None)
+
+
+def test_entry_point_is_a_selector(install, tmp_path, capsys):
     """A module of another distribution that is registered under ``deimos.selectors`` is a selector too."""
-    (tmp_path / "other_module.py").write_text(SELECTOR)
-    information = tmp_path / "other-1.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[deimos.selectors]\nfurthest = other_module\n")
     before = plugins.names(selectors)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    try:
-        assert plugins.names(selectors) == sorted([*before, "furthest"])
-        assert_selector_works(tmp_path, "furthest", capsys)
-    finally:
-        sys.modules.pop("other_module", None)
+    install("deimos.selectors", "furthest", SELECTOR)
+    assert plugins.names(selectors) == sorted([*before, "furthest"])
+    assert_selector_works(tmp_path, "furthest", capsys)
+
+
+def test_entry_point_is_a_robot(install):
+    """A module of another distribution that is registered under ``deimos.robots`` can be asked for by its name."""
+    before = plugins.names(robots)
+    install("deimos.robots", "stiff", ROBOT)
+    assert plugins.names(robots) == sorted([*before, "stiff"])
+    robot = quad.Config(robot="stiff", damping=2.0).make_robot()
+    assert {(joint.stiffness, joint.damping) for joint in robot.joints} == {(77.0, 2.0)}

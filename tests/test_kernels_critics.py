@@ -144,7 +144,7 @@ def test_a_unit_that_is_infinitely_silent_is_silent():
 
 
 def test_an_old_value_that_is_not_a_number_breaks_the_loss():
-    """It shows in the loss, as it does in ``ppo.value_gradient``, though no gradient comes of it."""
+    """It shows in the loss, as it does in ``returns.value_gradient``, though no gradient comes of it."""
     units = (4, 9)
     memory, _, gradient = critics(units, network(units))
     numbers, loss = arrays(5, 4), wp.zeros(COUNT, dtype=float, device="cpu")

@@ -4,8 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from deimos.kernels.random import Purpose, draw_uniforms, draw_words, vec4u
+
+from deimos.nn import random
 
 ONES = 0xFFFFFFFF
 # Of the paper's own implementation, Random123: examples/kat_vectors, philox4x32 with 10 rounds.
@@ -116,6 +119,13 @@ def test_purposes_are_distinct():
     assert len({int(purpose) for purpose in Purpose}) == len(Purpose.__members__)
 
 
+def test_purposes_of_torch_are_in_the_table():
+    """What torch draws by address has the numbers that the table of purposes keeps for it."""
+    assert {purpose.name: int(purpose) for purpose in random.Purpose}.items() <= {
+        purpose.name: int(purpose) for purpose in Purpose
+    }.items()
+
+
 def test_uniforms_are_independent_of_the_other_rows(device):
     """A world draws the same numbers alone, in any order, and whatever the others have drawn so far."""
     count = np.arange(50)
@@ -196,3 +206,18 @@ def test_draw_uniforms_rejects(device, wrong, message):
     arrays = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in (right | wrong).items()}
     with pytest.raises(ValueError, match=message):
         draw_uniforms(**arrays, seed=0, purpose=Purpose.GOAL, world_offset=0)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**31, ONES])
+def test_uniforms_are_torchs(torch_device, seed):
+    """For every world and count they are the numbers of ``deimos.nn.random``, bit for bit."""
+    rng = np.random.default_rng(seed)
+    count = rng.integers(2**31, size=257, dtype=np.int32)
+    row = rng.integers(257, size=1000, dtype=np.int32)
+    device = "cpu" if torch_device.type == "cpu" else "cuda:0"
+    arrays = [wp.array(values, dtype=wp.int32, device=device) for values in (row, count)]
+    expected = wp.zeros(1000, dtype=wp.vec4, device=device)
+    draw_uniforms(*arrays, expected, seed=seed, purpose=Purpose.GOAL, world_offset=12_345)
+    world, count = (torch.from_numpy(values).long().to(torch_device) for values in (row, count))
+    found = random.uniforms(seed, Purpose.GOAL, world + 12_345, count[world])
+    assert torch.equal(found.cpu(), torch.from_numpy(expected.numpy()))

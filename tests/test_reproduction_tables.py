@@ -35,6 +35,15 @@ def test_table_of_populations_has_medians_and_ranges(tmp_path, capsys):
     assert (len(found["evaluations"]), found["audits"]) == (2 * len(cells), [{"seed": 0}])
 
 
+def test_audits_are_printed(capsys):
+    """A row of ``audit_fear`` with its seed and steps is one row of the table; without audits there is none."""
+    row = {"auroc": 0.8, "low": 0.75, "high": 0.85, "contexts": 200, "tried": 210, "crash_rate": 0.02, "iteration": 84}
+    particle_population.print_audits([])
+    assert capsys.readouterr().out == ""
+    particle_population.print_audits([row | {"seed": 3, "steps": 2000}])
+    assert "| 3 | 2000 | 200 of 210 | 0.020 | 0.800 | [0.750, 0.850] |" in capsys.readouterr().out
+
+
 def test_table_of_rough_ground_has_quarters(tmp_path):
     """The quarters of a run have their means over worlds, levels and memory, and the figure is drawn."""
     path = tmp_path / "worlds.npz"

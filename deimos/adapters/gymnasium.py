@@ -47,7 +47,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._begin(seed)
         env = self.loop.env
         self.single_observation_space = Box(-np.inf, np.inf, (env.obs_dim,), np.float32)
-        self.single_action_space = Box(-env.action_bound, env.action_bound, (env.action_dim,), np.float32)
+        low, high = env.action_range
+        self.single_action_space = Box(low.numpy(), high.numpy(), dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 

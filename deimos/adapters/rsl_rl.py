@@ -72,7 +72,7 @@ class RslRlVecEnv(VecEnv):
         Raises:
             SimulationError: If an action is not finite, or more worlds become invalid than may.
         """
-        step = self.env.step(actions)
+        step = self.env.step(actions.detach())
         self.env.check()  # rsl_rl looks for NaN in what comes back, but a clipped NaN is a number
         rewards = step.reward * self.reward_scale
         dones = step.terminated | step.truncated

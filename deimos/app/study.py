@@ -1,28 +1,22 @@
 """``deimos study``: the commands of ``deimos.study.cli``."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from deimos.app import console
-from deimos.study.cli import COMMANDS
+from deimos.study.cli import COMMANDS, RunOptions
 
 
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos study``."""
-    commands = {
-        name: ((options.__doc__ or "").splitlines()[0], _command(options, function))
-        for name, (options, function) in COMMANDS.items()
-    }
+    commands = {name: (options.__doc__.splitlines()[0], partial(_run, options)) for name, options in COMMANDS.items()}
     console.dispatch(commands, "Trains and compares populations of policies.", arguments, program)
 
 
-def _command(options: Any, function: Callable[..., None]) -> console.Command:
-    def command(arguments: list[str], program: str) -> None:
-        parsed = console.parse(options, arguments, program)
-        if program.endswith(" run"):  # the one that takes long
-            with console.stop_on_interrupt() as stopped:
-                function(parsed, stopped)
-        else:
-            function(parsed)
-
-    return command
+def _run(options: Any, arguments: list[str], program: str) -> None:
+    parsed = console.parse(options, arguments, program)
+    if isinstance(parsed, RunOptions):  # the one that takes long
+        with console.stop_on_interrupt() as stopped:
+            parsed.run(stopped)
+    else:
+        parsed.run()

@@ -1,1 +1,1 @@
-"""Who chooses the goals, and what became of them; torch and NumPy alone, so that it installs anywhere."""
+"""Who chooses the goals, and their outcomes; torch and NumPy alone, so that it installs anywhere."""

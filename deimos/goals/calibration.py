@@ -17,7 +17,7 @@ class Calibration(Stateful):
 
     Class weights n / (2 n_class) multiply the odds that a classifier learns by (1 - pi) / pi, with pi the
     share of crashes; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What is left is a
-    matter of over- and underfitting, which one temperature on held-out data repairs [2]_.
+    matter of over- and underconfidence, which one temperature on held-out data corrects [2]_.
 
     Attributes:
         prior: log(pi / (1 - pi)).
@@ -39,11 +39,11 @@ class Calibration(Stateful):
         return self.of_log_odds(score + self.prior)
 
     def of_log_odds(self, log_odds: Tensor) -> Tensor:
-        """Probability of a crash where the prior, perhaps one of another day, has been added already."""
+        """Probability of a crash where the prior, perhaps an earlier one, has been added already."""
         return torch.sigmoid(log_odds / self.temperature)
 
     def set_share(self, share: float) -> None:
-        """Take over the share of crashes, in (0, 1), that the class weights were made from."""
+        """Set the share of crashes, in (0, 1), that the class weights were made from."""
         self.prior = math.log(share / (1.0 - share))
 
     def fit(self, log_odds: Tensor, crashed: Tensor, steps: int = 3) -> None:
@@ -53,7 +53,7 @@ class Calibration(Stateful):
 
         Args:
             log_odds: Logits and prior as they were at issue, shape (n,).
-            crashed: What became of them, bool, shape (n,); both classes.
+            crashed: Their outcomes, True for a crash, bool, shape (n,); both classes.
             steps: Newton steps, at least 1.
         """
         z, y = log_odds.double(), crashed.double()
@@ -87,7 +87,7 @@ def reliability(probability: Tensor, crashed: Tensor, bins: int = BINS) -> Relia
 
     Args:
         probability: Predictions in [0, 1], shape (n,), n at least 1.
-        crashed: What became of them, bool, shape (n,).
+        crashed: Their outcomes, True for a crash, bool, shape (n,).
         bins: Bins; fewer where there are fewer predictions.
     """
     n = len(probability)
@@ -105,7 +105,7 @@ def evaluate(probability: Tensor, crashed: Tensor) -> dict[str, float]:
 
     Args:
         probability: Predictions in [0, 1], shape (n,).
-        crashed: What became of them, bool, shape (n,).
+        crashed: Their outcomes, True for a crash, bool, shape (n,).
 
     Returns:
         ``brier``, the mean squared error, and its parts over equal-mass bins [1]_: ``reliability`` (0 is

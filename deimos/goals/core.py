@@ -1,10 +1,10 @@
-"""What becomes of goals between two steps, in Deimos' own loop as in other people's: outcomes first, then choices."""
+"""Goals between two steps, in Deimos' own loop as in other people's: outcomes first, then choices."""
 
 import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import GoalSelector, Spaces
@@ -101,12 +101,3 @@ class GoalCore(Stateful):
         )
         self.weight[rows] = 1.0 if chosen.learn is None else chosen.learn.float()
         return chosen.goal
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``Stateful.load_state_dict``."""
-        kept = state["interactions"]
-        if "horizon" not in kept:  # written when every interaction had the same
-            marks = nn.functional.pad(kept["marks"], (0, 1), value=self.goal_period)
-            horizon = torch.full_like(kept["issued"], self.goal_period)
-            state = state | {"interactions": kept | {"issued_at": kept["issued"], "horizon": horizon, "marks": marks}}
-        super().load_state_dict(state)

@@ -1,4 +1,4 @@
-"""A goal selector in other people's loops: one object, and torch is all that it imports."""
+"""A goal selector in other people's loops: one object, which needs only torch and NumPy."""
 
 from dataclasses import dataclass
 
@@ -25,10 +25,10 @@ class Assignment:
 
 
 class GoalDirector:
-    """Chooses the goals of any vectorised environment, and learns from what becomes of them.
+    """Chooses the goals of any vectorised environment, and learns from their outcomes.
 
     It keeps the goal clocks and the interactions, and lets the selector learn. Call ``step`` once after
-    every step of the worlds, and put the goals that it returns into force. It keeps copies, without gradients.
+    every step of the worlds, and make the goals that it returns the active ones. It keeps copies, without gradients.
 
     Selectors that learn from the learner's transitions (``vds``, ``plr``) need Deimos' own loop.
 
@@ -67,7 +67,7 @@ class GoalDirector:
 
     @property
     def interactions(self) -> Interactions:
-        """What became of its goals; see ``selector`` for when it is known."""
+        """The outcomes of its goals; see ``selector`` for when it is known."""
         return self._known.interactions
 
     @property
@@ -95,7 +95,7 @@ class GoalDirector:
 
         Args:
             state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be
-                that of before or after its reset: nothing is chosen for it.
+                that from before or after its reset: nothing is chosen for it.
             goal: Goals that were active during the step, shape (num_envs, goal_dim).
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
@@ -109,6 +109,8 @@ class GoalDirector:
         """
         self._check(state, goal, terminated, truncated, candidates)
         core = self._core or self._begin(state, goal)
+        if core.interactions.now % self.goal_period == 0:  # no world's goal is due twice within T steps
+            self._draw()
         self._clock += 1
         due = self._clock >= self.goal_period
         reward = torch.zeros(len(state), device=state.device) if tracking is None else tracking.float()
@@ -117,8 +119,7 @@ class GoalDirector:
         goals = torch.where(done.unsqueeze(1), candidates[:, 0], goal)
         rows = changes.due
         if len(rows):
-            draws = uniforms(self._seed, Purpose.GOAL, rows, self._count[rows])
-            goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], draws)
+            goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], self._draws[rows])
             self._count[rows] += 1
         self._clock.masked_fill_(due | done, 0)
         if core.interactions.now % self.learn_every == 0:
@@ -136,6 +137,11 @@ class GoalDirector:
         self._clock, self._count = torch.zeros(2, len(state), dtype=torch.int64, device=state.device)
         self._core = GoalCore(selector, spaces)
         return self._core
+
+    def _draw(self) -> None:
+        """Draw for the next decision of every world; many worlds at once cost what one does."""
+        worlds = torch.arange(len(self._count), device=self._count.device)
+        self._draws = uniforms(self._seed, Purpose.GOAL, worlds, self._count)
 
     def _check(self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor) -> None:
         n, state_dim, goal_dim = self._sizes or (len(state), state.shape[-1], goal.shape[-1])
@@ -180,7 +186,7 @@ class GoalDirector:
         }
 
     def load_state_dict(self, state: dict, observed: Tensor, goal: Tensor) -> None:
-        """Go on from ``state_dict()``.
+        """Continue from ``state_dict()``.
 
         Args:
             state: What it returned.
@@ -190,3 +196,4 @@ class GoalDirector:
         self._begin(observed, goal).load_state_dict(state["core"])
         self._clock.copy_(state["clock"])
         self._count.copy_(state["count"])
+        self._draw()

@@ -24,7 +24,7 @@ class FearConfig:
     activation: Activation = "relu"
     """Between the layers."""
     learning_rate: float = 1e-2
-    """Step size of Adam, positive."""
+    """Learning rate of Adam, positive."""
     epochs: int = 1
     """Passes over the window of interactions in every fit, at least 1."""
     minibatches: int = 8
@@ -108,7 +108,7 @@ class Fear(Stateful):
         assert self._parameters.grad is not None
         self._parameters.grad.zero_()
         logit = self._pass.forward(inputs).squeeze(1)
-        delta = torch.sigmoid(logit).sub_(target).mul_(weight * scale)  # slope of the cross-entropy by the logit
+        delta = torch.sigmoid(logit).sub_(target).mul_(weight * scale)  # derivative of the loss by the logit
         self._pass.backward(delta.unsqueeze(1))
         mean_over_ranks(self._parameters.grad)
         self.optimizer.step()

@@ -70,7 +70,7 @@ class FearSelector(GoalSelector):
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
-        # As a forecast it keeps the prior of its day, whatever the share of crashes is when it is evaluated.
+        # As a forecast it keeps the prior at issue time, whatever the crash rate is when it is evaluated.
         return Proposal(picks.take(candidates, pick), picks.take(score, pick) + self.calibration.prior, probe=probe)
 
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:

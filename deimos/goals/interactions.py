@@ -57,7 +57,7 @@ class Resolved:
 class Interactions(Stateful):
     """One pending interaction per world, and the resolved ones of the last steps.
 
-    Each world has a small ring of its own for what it resolved, so that nothing waits for a count and
+    Each world has a small ring buffer of its own for what it resolved, so that nothing waits for a count and
     the memory is bounded. What is stored is a copy and carries no gradient.
 
     Args:

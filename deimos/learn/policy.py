@@ -16,7 +16,7 @@ SCHEMA = 1
 
 
 class Policy(nn.Module):
-    """Physical observations to actions, by the mean of the trained policy.
+    """Physical observations to the deterministic (mean) actions of the trained policy.
 
     Attributes:
         layout: What stands where in the observation, with units.
@@ -56,7 +56,7 @@ def save_policy(path: Path, policy: Policy) -> None:
     """Write a policy that needs nothing else to run.
 
     Raises:
-        RunError: If it cannot be written; the file of before is untouched.
+        RunError: If it cannot be written; the previous file is untouched.
     """
     save_tensors(path, {
         "schema": SCHEMA,

@@ -41,7 +41,7 @@ class PPOConfig:
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, positive."""
     desired_kl: float = 0.01
-    """KL divergence of one update that the adaptive schedule aims at, at least 0; 0 keeps the step size fixed."""
+    """KL divergence of one update that the adaptive schedule aims at, at least 0; 0 keeps the learning rate fixed."""
     discount: float = 0.99
     """Weight of the next step's reward (gamma), in [0, 1]."""
     gae_lambda: float = 0.95
@@ -311,7 +311,7 @@ class PPO(Stateful):
         return torch.cat([losses, kl.unsqueeze(0)])
 
     def _policy_gradient(self, batch: Batch, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The clipped surrogate and its gradient by mean and by deviation.
+        """The clipped surrogate and its gradient with respect to mean and standard deviation.
 
         With actions along the first axis every operation runs over long contiguous rows.
 
@@ -326,7 +326,7 @@ class PPO(Stateful):
         ratio = log_prob.sub_(batch.log_prob).exp_()
         plain = -batch.advantage * ratio
         clipped = -batch.advantage * ratio.clamp(1.0 - clip, 1.0 + clip)
-        slope = plain * batch.weight * (plain >= clipped)  # of the loss by log r
+        slope = plain * batch.weight * (plain >= clipped)  # derivative of the loss by log r
         grad_mean = z.mul_(slope).div_(std)
         grad_std = (squares.sub_(1.0) @ slope) / self.actor.std
         return torch.maximum(plain, clipped) @ batch.weight, grad_mean, grad_std
@@ -345,7 +345,7 @@ class PPO(Stateful):
         return std.log().sum() + 0.5 * len(std) * math.log(2 * math.pi)
 
     def load_weights(self, state: dict) -> None:
-        """Take over the networks alone.
+        """Load the networks alone.
 
         Raises:
             RuntimeError: If they have other sizes.

@@ -41,15 +41,15 @@ class Rollout:
         self.reward = torch.zeros(num_steps, n, device=device)
         self.terminated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
-        self.ends: list[tuple[int, Tensor, Tensor]] = []
-        """Steps that truncated worlds: the step, the worlds, int64, shape (m,), and the observations that their
-        episodes ended in, before any reset, shape (m, obs_dim)."""
+        self.ends: list[tuple[Tensor, Tensor, Tensor]] = []
+        """What ``cut_off`` joins, for every step that truncated worlds; where none does it takes no memory."""
         self.advantage = torch.zeros(num_steps, n, device=device)
         """Advantages in units of scaled rewards, before they are normalised; see ``estimate``."""
         self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.weight = torch.ones(num_steps, n, device=device)
         """Weight of the transition in everything learnt: 0 leaves it out."""
 
+    @torch.no_grad()
     def record(
         self, t: int, *, obs: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, invalid: Tensor,
         weight: Tensor, cut_off: Tensor,
@@ -74,7 +74,7 @@ class Rollout:
         self.invalid[t] = invalid
         self.weight[t] = weight
         if len(cut_off):
-            self.ends.append((t, cut_off, obs[cut_off]))
+            self.ends.append((torch.full_like(cut_off, t), cut_off, obs[cut_off]))
 
     def exclude_invalid(self) -> None:
         """Give weight 0 to what led to an invalid state: every transition of that world since its last reset."""
@@ -86,13 +86,9 @@ class Rollout:
 
     def cut_off(self) -> tuple[Tensor, Tensor, Tensor]:
         """Steps and worlds that were truncated, int64, shape (m,) each, and their last observations, (m, obs_dim)."""
-        steps = [torch.full_like(worlds, t) for t, worlds, _ in self.ends]
-        empty = self.obs.new_empty(0, dtype=torch.int64), self.obs[0, :0]
-        return (
-            torch.cat([empty[0], *steps]),
-            torch.cat([empty[0], *(worlds for _, worlds, _ in self.ends)]),
-            torch.cat([empty[1], *(obs for *_, obs in self.ends)]),
-        )
+        nobody = torch.zeros(0, dtype=torch.int64, device=self.obs.device)
+        step, world, obs = zip((nobody, nobody, self.obs[0, :0]), *self.ends, strict=True)
+        return torch.cat(step), torch.cat(world), torch.cat(obs)
 
     def estimate(self, critic: Callable[[Tensor], Tensor]) -> Tensor:
         """Fill in ``advantage``.

@@ -16,7 +16,7 @@ class Adam(Stateful):
 
     Args:
         parameters: The vector, with its ``grad`` set (see ``networks.flatten_parameters``).
-        learning_rate: Step size, a scalar tensor on the device, so that a schedule can change it there.
+        learning_rate: A scalar tensor on the device, so that a schedule can change it there.
 
     References:
         .. [1] Kingma and Ba, *Adam: A Method for Stochastic Optimization*, ICLR 2015, algorithm 1.

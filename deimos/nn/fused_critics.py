@@ -114,15 +114,15 @@ def _views(layers: _Layers, layout: Layout, table: Tensor, gradient: Tensor) -> 
         outputs, inputs = weight.shape[1:]
         loads += zip(_places(layout, layer, inputs, outputs, table), (weight, bias), strict=True)
         stores += zip((weight_grad, bias_grad), _places(layout, layer, inputs, outputs, gradient), strict=True)
-        if 0 < layer < len(layout.turned):
-            turned = layout.turned[layer]
-            loads.append((table[:, turned : turned + outputs, :inputs], weight))
+        if 0 < layer < len(layout.transposed):
+            transposed = layout.transposed[layer]
+            loads.append((table[:, transposed : transposed + outputs, :inputs], weight))
     return loads, stores
 
 
 def _places(layout: Layout, layer: int, inputs: int, outputs: int, table: Tensor) -> tuple[Tensor, Tensor]:
     """A layer's weights, shape (K, outputs, inputs), and biases, shape (K, outputs), in the tables."""
     start = layout.start[layer]
-    if layer == len(layout.turned):  # the output's
+    if layer == len(layout.transposed):  # the output's
         return table[:, start : start + 1, :inputs], table[:, start + 1, :1]
     return table[:, start : start + inputs, :outputs].transpose(1, 2), table[:, start + inputs, :outputs]

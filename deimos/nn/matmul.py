@@ -77,7 +77,7 @@ def activate_(x: Tensor, activation: nn.Module) -> Tensor:
 
 
 def multiply_by_slope_(delta: Tensor, y: Tensor, activation: nn.Module) -> None:
-    """Multiply ``delta`` by the slope of an activation, which its output ``y`` determines, in place."""
+    """Multiply ``delta`` by the derivative of an activation, which its output ``y`` determines, in place."""
     aten = torch.ops.aten
     if isinstance(activation, nn.ReLU):
         aten.threshold_backward(delta, y, 0, grad_input=delta)

@@ -148,7 +148,7 @@ class Backprop:
         """Add the gradient of every parameter to its ``grad``.
 
         Args:
-            delta: Gradient of the loss by the output of the last ``forward``, shape (n, outputs).
+            delta: Gradient of the loss with respect to the output of the last ``forward``, shape (n, outputs).
         """
         for layer, x in zip(reversed(self._linears), reversed(self._inputs), strict=True):
             assert layer.weight.grad is not None

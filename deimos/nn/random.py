@@ -1,7 +1,7 @@
 """Counter-based random numbers, on any device: the very ones that ``kernels.random`` draws.
 
 A draw is a pure function of its address: *who* draws *what* for *which time*. So two halves of the worlds draw what
-the whole draws, and a resumed run goes on with the very numbers that it would have had. The generator is
+the whole draws, and a resumed run continues with the very numbers that it would have had. The generator is
 Philox4x32-10 of Salmon et al., *Parallel Random Numbers: As Easy as 1, 2, 3*, SC 2011.
 """
 

@@ -58,7 +58,7 @@ def advantages(
 def value_gradient(
     value: Tensor, old_value: Tensor, returns: Tensor, weight: Tensor, *, clip: float, coef: float
 ) -> tuple[Tensor, Tensor]:
-    """The clipped value loss and its gradient by the value.
+    """The clipped value loss and its gradient with respect to the value.
 
     Where the value has moved too far and clipping makes the loss larger, the clipped loss counts,
     and that one is flat. Inside the clip both are the same but for rounding, which must not decide.

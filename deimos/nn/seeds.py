@@ -8,7 +8,7 @@ import torch
 
 
 def derive(seed: int, use: str) -> int:
-    """The seed of one use of chance.
+    """The seed of one use of randomness.
 
     Two networks, or a network and its noise, that were seeded alike would be correlated; numbers that
     are derived are not, however alike the seeds and the uses are.
@@ -24,7 +24,7 @@ def derive(seed: int, use: str) -> int:
 
 
 def generator(seed: int, use: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """A generator of its own for one use of chance; the arguments are those of ``derive``.
+    """A generator of its own for one use of randomness; the arguments are those of ``derive``.
 
     Weights are drawn on the CPU, whatever the device of their network.
     """
@@ -32,16 +32,16 @@ def generator(seed: int, use: str, device: torch.device | str = "cpu") -> torch.
 
 
 def restore(generator: torch.Generator, state: torch.Tensor) -> None:
-    """Go on from ``generator.get_state()``, also from one of another kind of device.
+    """Continue from ``generator.get_state()``, also from one of another kind of device.
 
-    States of CPUs and of GPUs cannot be converted into each other. The stream then goes on from a seed that follows
+    States of CPUs and of GPUs cannot be converted into each other. The stream then continues from a seed that follows
     from the saved state: as good a stream, and the same whenever it is done, but not the saved one.
     """
     if state.numel() == generator.get_state().numel():
         generator.set_state(state)
         return
     warnings.warn(
-        f"The random numbers of a {generator.device.type} go on from a checkpoint of another kind of device: "
+        f"The random numbers of a {generator.device.type} continue from a checkpoint of another kind of device: "
         "the run is no bit-for-bit continuation.",
         stacklevel=2,
     )

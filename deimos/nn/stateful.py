@@ -24,7 +24,7 @@ class Stateful:
         return {name.lstrip("_"): _state(getattr(self, name)) for name in self.saved}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``.
+        """Continue from ``state_dict()``.
 
         Raises:
             KeyError: If something is missing in it.

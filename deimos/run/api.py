@@ -33,7 +33,7 @@ def train(config: TrainConfig | None = None, out: Path | str | None = None) -> P
 
     Raises:
         RunError: If the folder exists, the worlds do not fit into memory, or a file cannot be written.
-        SimulationError: If a number is not finite; the last checkpoint is that of before.
+        SimulationError: If a number is not finite; the last checkpoint is intact.
     """
     config = config or TrainConfig()
     device = training.resolve_device(config.device)

@@ -48,8 +48,8 @@ class EvalConfig:
     adversary_crashes: int = 500
     """Crashes among them that it needs, at least 0."""
     adversary_enough: Literal["all", "any"] = "all"
-    """Whether it needs all of these before it stops collecting, or is content with the first of its interactions
-    and its crashes; simulators of robots are too slow for more."""
+    """``all``: it collects until all of these are reached. ``any``: it stops at whichever limit comes first,
+    interactions or crashes; simulators of robots are too slow for more."""
     adversary_patience: int = 10
     """It gives up collecting after this many times ``adversary_steps``, at least 1."""
     fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32, min_per_class=8))
@@ -87,7 +87,7 @@ def evaluate(
     """Evaluate a policy against Naive and against Adversary.
 
     Args:
-        policy: What acts; by its mean, if it is a Gaussian.
+        policy: What acts; of a Gaussian policy, its deterministic (mean) actions.
         env_config: The environment that it was trained in; randomisations are switched off.
         config: Sizes and seed.
         device: Where to simulate.

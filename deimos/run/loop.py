@@ -45,7 +45,7 @@ class GoalLoop:
         self.renew(step, self.resolve(step))
 
     def resolve(self, step: Step) -> Changes:
-        """The first half of ``advance``: what became of the goals; nothing is reset yet."""
+        """The first half of ``advance``: the outcomes of the goals; nothing is reset yet."""
         return self.core.advance(step.terminated, step.truncated, step.goal_due, step.reward, step.tracking)
 
     def renew(self, step: Step, changes: Changes) -> None:
@@ -65,10 +65,9 @@ class GoalLoop:
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
-        state = self.core.state_dict()
-        return {"env": self.env.state_dict(), "learn": state.pop("weight"), **state}
+        return {"env": self.env.state_dict(), **self.core.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``."""
+        """Continue from ``state_dict()``."""
         self.env.load_state_dict(state["env"])
-        self.core.load_state_dict(state | {"weight": state["learn"]})
+        self.core.load_state_dict(state)

@@ -55,7 +55,7 @@ class TrainConfig:
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
         if self.method is not None and self.selector is not None:
-            raise ValueError(f"method '{self.method}' and a selector exclude each other; give one of them.")
+            raise ValueError(f"method '{self.method}' and a selector cannot be combined; give one of them.")
         if self.method is not None:
             method(self.method)
         if self.evaluation and self.eval.steps < 2 * self.env.goal_period:
@@ -108,6 +108,7 @@ class Trainer:
         with on_threads(1):
             self._collect()
 
+    @torch.no_grad()
     def _collect(self) -> None:
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
         ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
@@ -134,11 +135,11 @@ class Trainer:
             The row of ``progress.csv``.
 
         Raises:
-            SimulationError: If a number is not finite. This trainer is spoilt then; the last checkpoint is not.
+            SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
         """
-        self.iteration += 1
         try:
             self.collect()
+            self.iteration += 1
             self.env.check()
             if self.env.may_go_on_invalid:
                 self.rollout.exclude_invalid()
@@ -180,7 +181,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from ``state_dict()``.
+        """Continue from ``state_dict()``.
 
         Raises:
             RunError: If it is that of another environment or another network size.
@@ -198,7 +199,7 @@ class Trainer:
 
 
 def _identity(config: TrainConfig) -> dict:
-    """What a checkpoint must have in common with the run that goes on from it."""
+    """What a checkpoint must have in common with the run that resumes from it."""
     return {"env": to_dict(config.env), "selector": to_dict(config.goals), "num_envs": config.num_envs}
 
 

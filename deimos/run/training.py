@@ -1,4 +1,4 @@
-"""From nothing or from a checkpoint to a trained policy: how a run begins, goes on, is saved and ends."""
+"""From nothing or from a checkpoint to a trained policy: how a run begins, resumes, is saved and ends."""
 
 import os
 import platform
@@ -21,7 +21,7 @@ from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 
 SCHEMA = 1  # of config.json
-CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be taken over, but its worlds cannot go on
+CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be loaded, but not its worlds
 CHECKPOINT_SECONDS = 30.0
 LEAST_BYTES = 100  # of any transition, and of any world
 
@@ -122,7 +122,7 @@ def _check_memory(config: TrainConfig) -> None:
 
 
 def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
-    """Take over the networks of another run, whose observations must mean the same."""
+    """Load the networks of another run, whose observations must mean the same."""
     state = load_checkpoint(origin)
     try:
         layout = load_policy(origin.path).layout
@@ -166,12 +166,12 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
 
 
 def resume(path: Path, env_steps: int | None = None, device: str | None = None) -> tuple[Trainer, RunFolder]:
-    """Go on with a run from its last checkpoint.
+    """Resume a run from its last checkpoint.
 
     Args:
         path: Its folder.
         env_steps: A larger budget; ``None`` for the one that it had.
-        device: Where to go on; ``None`` for where it was.
+        device: Where to resume; ``None`` for where it was.
 
     Raises:
         RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.
@@ -210,7 +210,7 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     """Write the checkpoint and the policy.
 
     Raises:
-        RunError: If they cannot be written; the ones of before are whole.
+        RunError: If they cannot be written; the previous ones are intact.
     """
     save_tensors(folder.path / "checkpoint.pt", {"schema": CHECKPOINT_SCHEMA, **trainer.state_dict()})
     ppo, env = trainer.config.ppo, trainer.env
@@ -236,8 +236,8 @@ def train(
         Whether the budget was used up.
 
     Raises:
-        SimulationError: If a number is not finite; the last checkpoint is that of before.
-        RunError: If a file cannot be written; the last checkpoint is whole.
+        SimulationError: If a number is not finite; the last checkpoint is intact.
+        RunError: If a file cannot be written; the last checkpoint is intact.
     """
     from torch.utils.tensorboard import SummaryWriter
 

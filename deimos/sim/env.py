@@ -1,7 +1,7 @@
 """What every environment promises.
 
 The order of one step is part of the contract: physics; crash test; reward, against the goal that was
-in force; clocks; the observation that the step ended in, still with the old goal. ``step`` never
+active; clocks; the observation that the step ended in, still with the old goal. ``step`` never
 resets a world and never changes a goal: ``deimos.run.loop`` does both, between two steps.
 """
 
@@ -35,7 +35,7 @@ class Step:
     truncated: Tensor
     """True where the episode was cut off without a crash, bool, shape (num_envs,)."""
     goal_due: Tensor
-    """True where the goal has been in force for its whole period and the state is valid, bool, shape (num_envs,)."""
+    """True where the goal has been active for its whole period and the state is valid, bool, shape (num_envs,)."""
     invalid: Tensor
     """True where the state is not physical any more, bool, shape (num_envs,). Such a world is truncated too, unless
     it crashed."""
@@ -52,7 +52,7 @@ class EnvConfig(abc.ABC):
     """
 
     goal_period: int = 100
-    """T: steps that a goal is in force, at least 1."""
+    """T: steps that a goal is active, at least 1."""
     crash_penalty: float = 0.0
     """What the step of a crash costs the learner, in multiples of the largest goal-matching reward of one step, at
     least 0. Scores and reported rewards do not see it."""
@@ -103,11 +103,11 @@ class Env(abc.ABC):
     """What stands where in the observation; the field named ``goal`` is the goal slot."""
     action_dim: int
     action_bound: float
-    """Actions are clipped to [-action_bound, action_bound]; may be infinite."""
+    """Bound of every component of an action, in absolute value; may be infinite. See ``action_range``."""
     dt: float
     """Duration of a step [s]; 1 where the world has no seconds."""
     goal_period: int
-    """T: steps that a goal is in force."""
+    """T: steps that a goal is active."""
     time_limit: int
     """Steps after which an episode is truncated; 0 for never."""
     crash_penalty: float = 0.0
@@ -115,7 +115,7 @@ class Env(abc.ABC):
     obs: Tensor
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
     may_go_on_invalid: bool = False
-    """Whether the run goes on where a world becomes invalid; else ``check`` stops it."""
+    """Whether the run continues where a world becomes invalid; else ``check`` stops it."""
     goal_groups: tuple[slice, ...] = (slice(None),)
     """Components of a goal that are met or missed together."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
@@ -210,6 +210,12 @@ class Env(abc.ABC):
         return None
 
     @property
+    def action_range(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest value of every component of an action, beyond which it is clipped, on the CPU."""
+        bound = torch.full((self.action_dim,), self.action_bound)
+        return -bound, bound
+
+    @property
     def obs_dim(self) -> int:
         """Components of the observation."""
         return sum(field.size for field in self.layout)
@@ -231,7 +237,7 @@ class Env(abc.ABC):
 
     @property
     def goal(self) -> Tensor:
-        """The goals in force as the policies see them, shape (num_envs, goal_dim); a view."""
+        """The active goals as the policies see them, shape (num_envs, goal_dim); a view."""
         return self.obs[:, self.goal_slice]
 
     def state(self, obs: Tensor) -> Tensor:
@@ -270,7 +276,7 @@ class Env(abc.ABC):
         return {name: tensor.clone() for name, tensor in self.tensors.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from ``state_dict()``.
+        """Continue from ``state_dict()``.
 
         Raises:
             ValueError: If ``state`` is that of another environment or another number of worlds.

@@ -138,7 +138,7 @@ class WarpEnv(Env):
         """
         self.launch_step, self._launch_reset, self._valid_goals = step, reset, valid_goals
         self._launch_goals = set_goals(self._row.array, self._new_goal.array, self.worlds)
-        self._launch_draw = draw_uniforms(
+        self._launch_draw: wp.Launch = draw_uniforms(
             self._row.array, self.worlds.goal_count, self._draw.array, seed=self._seed, purpose=Purpose.GOAL,
             world_offset=self._offset, record=True,
         )  # fmt: skip

@@ -35,20 +35,16 @@ class _Interrupted(Exception):
 def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: False) -> bool:
     """Train and evaluate a cell from wherever it stands, and write its ``result.json``.
 
-    Args:
-        study: The study.
-        cell: One of its cells.
-        stopped: Asked now and then; true ends the work early, with everything done so far kept.
-
-    Returns:
-        Whether the cell is finished.
+    ``stopped`` is asked now and then; true ends the work early, with everything done so far kept. Returns whether the
+    cell is finished.
 
     Raises:
         RunError: If another process works on it, a file cannot be read or written, or the run cannot begin.
         SimulationError: If a number is not finite.
     """
-    with hold(study.cell_path(cell) / "lock", f"Cell {cell.name}", patience=PATIENCE_SECONDS):
-        path = study.cell_path(cell) / "run"
+    home = study.cell_path(cell)
+    with hold(home / "lock", f"Cell {cell.name}", patience=PATIENCE_SECONDS):
+        path = home / "run"
         device = training.resolve_device(cell.config.device)
         with one_stream(device):
             if (path / "checkpoint.pt").exists():
@@ -62,7 +58,7 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
                 rows = _evaluated(folder, cell, device, stopped)
             except _Interrupted:
                 return False
-        RunFolder(study.cell_path(cell)).write_json("result.json", result(cell, folder, rows))
+        RunFolder(home).write_json("result.json", result(cell, folder, rows))
         return True
 
 

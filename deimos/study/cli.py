@@ -1,14 +1,15 @@
-"""The commands of ``deimos study``: options and a function for each."""
+"""The commands of ``deimos study``: the options of each, and ``run``, which does what it is for."""
 
 import contextlib
 import math
 import re
-import statistics
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from statistics import median
+from typing import Any, Literal
 
 import tyro
 from rich.console import Console
@@ -24,11 +25,18 @@ from deimos.study.runner import Progress, Runner
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """Train and evaluate every cell of a study that is not finished yet."""
-
+class _FolderOptions:
     folder: tyro.conf.Positional[Path]
-    """Folder of the study. One process works on it at a time."""
+    """Folder of the study."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(_FolderOptions):
+    """Train and evaluate every cell of a study that is not finished yet.
+
+    One process works on a folder at a time.
+    """
+
     file: Path | None = None
     """The study, in a TOML file (docs/study.md). By default the one that was begun in the folder."""
     seeds: str | None = None
@@ -57,13 +65,89 @@ class RunOptions:
         if given and self.file is None:
             raise ValueError(f"{', '.join(given)} change a file; give one too.")
 
+    def run(self, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Work on a study until it is finished.
+
+        Raises:
+            RunError: If the study is not well described or another process works on it, or if a cell has failed; the
+                rest are finished then.
+            SystemExit: With 130, if it was stopped before the end.
+        """
+        study = StudyFolder(self.folder)
+        if self.file is not None:
+            cells = self._described(self.file)
+            found = study.results()
+            check_comparable([*found.rows, *found.curves, *map(identity, [*study.cells(), *cells])])
+            study.add(cells)
+        if not study.cells():
+            raise RunError(f"{study.path} holds no study; begin one with --file.")
+        if self.retry_failed:
+            study.forget_failures()
+        with _live() as report:
+            end = Runner(study, LocalProcesses(study), self.workers).run(report, stopped)
+        if end.finished + len(end.failed) < end.total:
+            print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
+                  f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
+            raise SystemExit(130)
+        if end.failed:
+            name, error = next(iter(end.failed.items()))
+            raise RunError(
+                f"{len(end.failed)} of {end.total} cells failed, {name} first: {error}. See log.txt in their folders; "
+                f"--retry-failed tries them again."
+            )
+        print(study.path)
+
+    def _described(self, file: Path) -> list[plan.Cell]:
+        train = {name: getattr(self, name) for name in ("num_envs", "env_steps", "device", "threads")}
+        return plan.expand(
+            plan.read(file), seeds=None if self.seeds is None else parse_seeds(self.seeds), methods=self.methods,
+            environments=self.environments, train={name: x for name, x in train.items() if x is not None},
+        )  # fmt: skip
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Seeds of ``10`` (the first ten), ``10-19`` or ``0,3,5``; raises ``RunError`` for anything else."""
+    if re.fullmatch(r"[1-9]\d*", text):
+        return list(range(int(text)))
+    seeds: list[int] = []
+    for part in text.split(","):
+        if not (found := re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())):
+            raise RunError(f"seeds must be a number of seeds, a range like 10-19 or a list like 0,3,5, got '{text}'.")
+        first, last = int(found[1]), int(found[2] or found[1])
+        if last < first:
+            raise RunError(f"seeds must be a range that rises, got '{text}'.")
+        seeds += range(first, last + 1)
+    return seeds
+
 
 @dataclass(frozen=True, kw_only=True)
-class ShowOptions:
+class ShowOptions(_FolderOptions):
     """Print where a study stands."""
 
-    folder: tyro.conf.Positional[Path]
-    """Folder of the study."""
+    def run(self) -> None:
+        """Print the medians of a study and what has failed or is open; ``RunError`` if there is no study."""
+        study = StudyFolder(self.folder)
+        cells, rows = study.cells(), study.results().rows
+        if not cells and not rows:
+            raise RunError(f"{study.path} holds no study and no results.")
+        table = Table(title="Medians over seeds", title_justify="left")
+        for name in ("environment", "method", "goals", "T", "seeds", "crashes/1000", "score", "reward", "FPS"):
+            table.add_column(name, justify="left" if name in ("environment", "method", "goals") else "right")
+        groups: dict[tuple, list[dict]] = defaultdict(list)
+        for row in rows:
+            groups[row["environment"], row["goals"], row["goal_period"], row["method"]].append(row)
+        columns = {"crashes_per_1000": ".3g", "score": ".3f", "reward": ".4f", "fps": ".0f"}
+        for (environment, goals, period, name), group in sorted(groups.items()):
+            values = {column: [row[column] for row in group if not math.isnan(row[column])] for column in columns}
+            medians = [format(median(values[column] or [math.nan]), form) for column, form in columns.items()]
+            table.add_row(environment, name, goals, str(period), str(len(group)), *medians)
+        Console().print(table)
+        if cells:
+            finished = study.finished(cells)
+            print(f"{len(finished)} of {len(cells)} cells are finished.")
+            for cell in cells:
+                for error in study.failures(cell) if cell.digest not in finished else []:
+                    print(f"{cell.name} failed: {error}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,13 +163,23 @@ class MergeOptions:
         if not self.sources:
             raise ValueError("sources must be one or more study folders, got none.")
 
+    def run(self) -> None:
+        """Merge them and say what was added; see ``deimos.study.results.merge``."""
+        added, present, differing = merge(self.folder, self.sources)
+        print(f"{added} rows added, {present} were there already.")
+        if differing:
+            print(f"{differing} of those have other numbers in the source; the first ones stay. Cells repeat bit for "
+                  f"bit only on the same kind of device with the same versions.")  # fmt: skip
+
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions:
+class ExportOptions(_FolderOptions):
     """Write results.csv and curves.csv into the folder of a study."""
 
-    folder: tyro.conf.Positional[Path]
-    """Folder of the study."""
+    def run(self) -> None:
+        """Write them; ``RunError`` if there are no results."""
+        merge(self.folder, [self.folder])  # refuses a folder without results
+        print(self.folder / "results.csv")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,144 +191,17 @@ class ReportOptions:
     out: Path | None = None
     """Where to write. By default the folder itself."""
 
+    def run(self) -> None:
+        """Write them; ``RunError`` if there are no results."""
+        from deimos.study.report import write
 
-def run(options: RunOptions, stopped: Callable[[], bool] = lambda: False) -> None:
-    """Work on a study until it is finished.
-
-    Raises:
-        RunError: If the study is not well described or another process works on it, or if a cell has failed; the
-            rest are finished then.
-        SystemExit: With 130, if it was stopped before the end.
-    """
-    study = StudyFolder(options.folder)
-    if options.file is not None:
-        cells = _described(options, options.file)
-        found = study.results()
-        check_comparable([*found.rows, *found.curves, *map(identity, [*study.cells(), *cells])])
-        study.add(cells)
-    if not study.cells():
-        raise RunError(f"{study.path} holds no study; begin one with --file.")
-    if options.retry_failed:
-        study.forget_failures()
-    with _live() as report:
-        end = Runner(study, LocalProcesses(study), options.workers).run(report, stopped)
-    if end.finished + len(end.failed) < end.total:
-        print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
-              f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
-        raise SystemExit(130)
-    if end.failed:
-        name, error = next(iter(end.failed.items()))
-        raise RunError(
-            f"{len(end.failed)} of {end.total} cells failed, {name} first: {error}. See log.txt in their folders; "
-            f"--retry-failed tries them again."
-        )
-    print(study.path)
+        print(write(self.folder, self.out or self.folder))
 
 
-def _described(options: RunOptions, file: Path) -> list[plan.Cell]:
-    names = ("num_envs", "env_steps", "device", "threads")
-    train = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    seeds = None if options.seeds is None else parse_seeds(options.seeds)
-    return plan.expand(
-        plan.read(file), seeds=seeds, methods=options.methods, environments=options.environments, train=train
-    )
-
-
-def parse_seeds(text: str) -> list[int]:
-    """Seeds of ``10`` (the first ten), ``10-19`` or ``0,3,5``.
-
-    Raises:
-        RunError: If it is none of these.
-    """
-    if re.fullmatch(r"[1-9]\d*", text):
-        return list(range(int(text)))
-    seeds: list[int] = []
-    for part in text.split(","):
-        if not (found := re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())):
-            raise RunError(f"seeds must be a number of seeds, a range like 10-19 or a list like 0,3,5, got '{text}'.")
-        first, last = int(found[1]), int(found[2] or found[1])
-        if last < first:
-            raise RunError(f"seeds must be a range that rises, got '{text}'.")
-        seeds += range(first, last + 1)
-    return seeds
-
-
-def show(options: ShowOptions) -> None:
-    """Print the medians of a study and what has failed or is open.
-
-    Raises:
-        RunError: If there is no study.
-    """
-    study = StudyFolder(options.folder)
-    cells, rows = study.cells(), study.results().rows
-    if not cells and not rows:
-        raise RunError(f"{study.path} holds no study and no results.")
-    table = Table(title="Medians over seeds", title_justify="left")
-    for name in ("environment", "method", "goals", "T", "seeds", "crashes/1000", "score", "reward", "FPS"):
-        table.add_column(name, justify="left" if name in ("environment", "method", "goals") else "right")
-    groups: dict[tuple, list[dict]] = {}
-    for row in rows:
-        groups.setdefault((row["environment"], row["goals"], row["goal_period"], row["method"]), []).append(row)
-    columns = {"crashes_per_1000": ".3g", "score": ".3f", "reward": ".4f", "fps": ".0f"}
-    for (environment, goals, period, name), group in sorted(groups.items()):
-        medians = [format(_median(row[column] for row in group), form) for column, form in columns.items()]
-        table.add_row(environment, name, goals, str(period), str(len(group)), *medians)
-    Console().print(table)
-    if cells:
-        finished = study.finished(cells)
-        print(f"{len(finished)} of {len(cells)} cells are finished.")
-        for cell in cells:
-            for error in study.failures(cell) if cell.digest not in finished else []:
-                print(f"{cell.name} failed: {error}")
-
-
-def _median(values: Iterator[float]) -> float:
-    kept = [value for value in values if not math.isnan(value)]
-    return statistics.median(kept) if kept else math.nan
-
-
-def merge_folders(options: MergeOptions) -> None:
-    """Merge study folders and say what was added.
-
-    Raises:
-        RunError: If one holds no results or has another schema, or they do not make one study.
-    """
-    added, present, differing = merge(options.folder, options.sources)
-    print(f"{added} rows added, {present} were there already.")
-    if differing:
-        print(f"{differing} of those have other numbers in the source; the first ones stay. Cells repeat bit for bit "
-              f"only on the same kind of device with the same versions.")  # fmt: skip
-
-
-def export(options: ExportOptions) -> None:
-    """Write the tables of a study.
-
-    Raises:
-        RunError: If there are no results, or the folder cannot be written.
-    """
-    merge(options.folder, [options.folder])  # refuses a folder without results
-    print(options.folder / "results.csv")
-
-
-def report(options: ReportOptions) -> None:
-    """Write the report.
-
-    Raises:
-        RunError: If there are no results, or the folder cannot be written.
-    """
-    from deimos.study.report import write
-
-    print(write(options.folder, options.out or options.folder))
-
-
-COMMANDS: dict[str, tuple[type, Callable[..., None]]] = {
-    "run": (RunOptions, run),
-    "show": (ShowOptions, show),
-    "merge": (MergeOptions, merge_folders),
-    "export": (ExportOptions, export),
-    "report": (ReportOptions, report),
-}
-"""Options and function of every command; ``run`` also takes a function that says when to stop."""
+COMMANDS: dict[str, Any] = {
+    "run": RunOptions, "show": ShowOptions, "merge": MergeOptions, "export": ExportOptions, "report": ReportOptions,
+}  # fmt: skip
+"""The options of every command, whose ``run`` does it; that of ``RunOptions`` takes what says when to stop."""
 
 
 @contextlib.contextmanager
@@ -245,12 +212,12 @@ def _live() -> Iterator[Callable[[Progress], None]]:
         with console.status("") as status:
             yield lambda progress: status.update(_summary(progress))
         return
-    said: list[tuple[int, int]] = []
+    said: list[int] = []
 
     def lines(progress: Progress) -> None:
-        state = (progress.finished, len(progress.failed))
-        if [state] != said[-1:]:
-            said.append(state)
+        ended = progress.finished + len(progress.failed)
+        if ended not in said:
+            said.append(ended)
             console.print(_summary(progress), highlight=False, soft_wrap=True, markup=False)
 
     yield lines

@@ -1,8 +1,8 @@
 """The results of a study as samples: one value per policy, by environment, goals, T and method."""
 
-import copy
 import math
 import re
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import cycle
@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos.run.folder import RunError
 from deimos.study.results import Results, Row
 from deimos.study.stats import Array
 
@@ -67,67 +66,33 @@ class Where:
         return f"{self.environment}, {self.goals.capitalize()}, T = {self.period}"
 
 
-@dataclass(frozen=True)
-class Curve:
-    """Means over stretches of one training run."""
-
-    env_steps: Array
-    """Parallel steps at the end of every stretch, shape (k,)."""
-    reward: Array
-    """Mean reward per transition, shape (k,)."""
-    crashes: Array
-    """Crashes per 1000 transitions, shape (k,)."""
-    selected_fraction: Array
-    """Share of the worlds whose goal the selector chose, shape (k,)."""
-
-
 class Data:
     """The results of a study. Rows of a weak adversary are counted, and left out of every sample.
 
-    Args:
-        results: Rows and training curves.
-        style: How methods are ordered and drawn; methods without a colour get one.
-
-    Raises:
-        RunError: If they are no one study; see ``Results.check``.
+    ``style`` says how methods are ordered and drawn; those without a colour get one. Raises ``RunError`` if the
+    results are no one study; see ``Results.check``.
     """
 
     def __init__(self, results: Results, style: Style | None = None) -> None:
         results.check()
-        self.rows = results.rows
+        self._results, self.rows = results, results.rows
         self.weak = [row for row in self.rows if row["weak_adversary"]]
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
-        self._samples: dict[tuple[Where, str], dict[int, Row]] = {}
+        self._samples: dict[tuple[Where, str], dict[int, Row]] = defaultdict(dict)
         for row in self.rows:
             if not row["weak_adversary"]:
                 where = Where(row["environment"], row["goals"], row["goal_period"])
-                self._samples.setdefault((where, row["method"]), {})[row["seed"]] = row
-        self._curves: dict[tuple[str, str], dict[int, Curve]] = {}
-        for line in results.curves:
-            names = ("env_steps", "reward", "crashes_per_1000", "selected_fraction")
-            curve = Curve(*(np.array(line[name]) for name in names))
-            self._curves.setdefault((line["environment"], line["method"]), {})[line["seed"]] = curve
+                self._samples[where, row["method"]][row["seed"]] = row
 
     @classmethod
     def read(cls, folder: Path, style: Style | None = None) -> "Data":
-        """Read the results of a folder.
-
-        Raises:
-            RunError: If there are none, a file is broken or of another schema, or they are no one study.
-        """
-        results = Results.read(folder)
-        if not results.rows:
-            raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
-        return cls(results, style)
+        """The results of a folder; raises ``RunError`` if there are none, or as ``Results.read`` and ``check`` do."""
+        return cls(Results.read(folder, may_be_empty=False), style)
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
-        found = copy.copy(self)
-        found.rows = [row for row in self.rows if row["method"] in methods]
-        found.weak = [row for row in self.weak if row["method"] in methods]
-        found._samples = {key: seeds for key, seeds in self._samples.items() if key[1] in methods}
-        found._curves = {key: seeds for key, seeds in self._curves.items() if key[1] in methods}
-        return found
+        rows, curves = ([row for row in rows if row["method"] in methods] for rows in (self.rows, self._results.curves))
+        return Data(Results(rows, curves), self.style)
 
     @property
     def environments(self) -> list[str]:
@@ -160,14 +125,8 @@ class Data:
     def sample(self, where: Where, method: str, metric: str, seeds: Sequence[int] | None = None) -> Array:
         """The values of a metric over the seeds of a method, in the seeds' order; NaN are left out.
 
-        ``log_crashes`` is log(1 + crashes), ``tracking:2`` the mean tracking of the goal's group 2, ``errors:NAME`` the
-        median of one of the environment's errors.
-
-        Args:
-            where: The evaluation.
-            method: The method.
-            metric: A column of the results, or one of these.
-            seeds: Which; ``None`` for all.
+        A metric is a column of the results, or ``log_crashes``, log(1 + crashes); ``tracking:2``, the mean tracking of
+        the goal's group 2; ``errors:NAME``, the median of one of the environment's errors.
         """
         rows = self._samples.get((where, method), {})
         chosen = sorted(rows) if seeds is None else [seed for seed in seeds if seed in rows]
@@ -181,10 +140,10 @@ class Data:
         errors = sorted({name for row in rows for name in row["errors"]})
         return [f"tracking:{i}" for i in range(groups)] + [f"errors:{name}" for name in errors]
 
-    def curves(self, environment: str, method: str) -> list[Curve]:
-        """The training curves of a method, seed by seed."""
-        found = self._curves.get((environment, method), {})
-        return [found[seed] for seed in sorted(found)]
+    def curves(self, environment: str, method: str, column: str = "crashes_per_1000") -> list[Array]:
+        """A column of the training curves of a method, seed by seed, each of shape (stretches,); see ``results``."""
+        found = [row for row in self._results.curves if (row["environment"], row["method"]) == (environment, method)]
+        return [np.array(row[column]) for row in sorted(found, key=lambda row: row["seed"])]
 
 
 def _metric(row: Row, name: str) -> float:

@@ -19,14 +19,8 @@ figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; 
 """
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of plain texts."""
-
-    header: Sequence[str]
-    """Titles of the columns."""
-    rows: Sequence[Sequence[str]]
-    """Its cells."""
+Table = list[dict[str, str]]
+"""Its rows: plain texts by the titles of the columns, which are those of the first row; at least one."""
 
 
 @dataclass(frozen=True)
@@ -61,25 +55,19 @@ def _html(block: Block, folder: Path) -> str:
             return "<ul>" + "".join(f"<li>{html.escape(item[2:])}</li>" for item in block.splitlines()) + "</ul>"
         case str():
             return f"<p>{html.escape(block)}</p>"
-        case Table(header, rows):
-            head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
-            lines = ("".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows)
-            body = "\n".join(f"<tr>{line}</tr>" for line in lines)
-            return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
         case Picture(name, caption):
             data = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
-            alt = html.escape(caption, quote=True)
-            image = f'<img alt="{alt}" src="data:image/png;base64,{data}">'
+            image = f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
             return f"<figure>{image}<figcaption>{html.escape(caption)}</figcaption></figure>"
+        case rows:
+            head = "".join(f"<th>{html.escape(title)}</th>" for title in rows[0])
+            lines = ("".join(f"<td>{html.escape(cell)}</td>" for cell in row.values()) for row in rows)
+            body = "\n".join(f"<tr>{line}</tr>" for line in lines)
+            return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
 
 
 def to_markdown(blocks: Sequence[Block], pictures: str) -> str:
-    """The page as Markdown, with links to the figures.
-
-    Args:
-        blocks: The page.
-        pictures: Folder of the figures, as seen from the page.
-    """
+    """The page as Markdown, with links to the figures in a folder, as seen from the page."""
     return "\n\n".join(_markdown(block, pictures) for block in blocks) + "\n"
 
 
@@ -87,8 +75,8 @@ def _markdown(block: Block, pictures: str) -> str:
     match block:
         case str():
             return block
-        case Table(header, rows):
-            lines = [header, ["---"] * len(header), *rows]
-            return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
         case Picture(name, caption):
             return f"![{caption}]({pictures}/{name}.png)"
+        case rows:
+            lines = [rows[0], ["---"] * len(rows[0]), *(row.values() for row in rows)]
+            return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -4,10 +4,10 @@ A cell's folder holds ``cell.json`` (what it is), ``run/`` (its run folder), ``r
 ``log.txt`` (what its workers said) and ``failures.jsonl`` (how they died).
 """
 
-import contextlib
 import json
 import time
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from deimos.run.folder import RunError, RunFolder
@@ -17,25 +17,17 @@ from deimos.study.results import Results
 
 
 class StudyFolder:
-    """See the module's docstring."""
+    """See the module's docstring. Whatever reads it raises ``RunError`` if a file is broken or of another schema."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def results(self) -> Results:
-        """The results that there are.
-
-        Raises:
-            RunError: If a file is broken or of another schema.
-        """
+        """The results that there are."""
         return Results.read(self.path)
 
-    def hold(self) -> contextlib.AbstractContextManager[None]:
-        """Hold the study as the only process that works on it.
-
-        Raises:
-            RunError: If another one does, or another machine may.
-        """
+    def hold(self) -> AbstractContextManager[None]:
+        """Hold the study as the only process that works on it; ``RunError`` if another does, or machine may."""
         return hold(self.path / "lock", str(self.path), one_machine=True)
 
     def cell_path(self, cell: Cell) -> Path:
@@ -43,27 +35,15 @@ class StudyFolder:
         return self.path / "cells" / cell.name
 
     def add(self, cells: Iterable[Cell]) -> None:
-        """Add cells to the study; those that are there already stay as they are.
-
-        Raises:
-            RunError: If they cannot be written.
-        """
+        """Add cells to the study; those that are there already stay as they are."""
         for cell in cells:
             path = self.cell_path(cell)
-            if (path / "cell.json").exists():
-                continue
-            try:
+            if not (path / "cell.json").exists():
                 path.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise RunError(f"The study's folder {path} cannot be made ({error.strerror}).") from error
-            RunFolder(path).write_json("cell.json", cell.to_dict())
+                RunFolder(path).write_json("cell.json", cell.to_dict())
 
     def cells(self) -> list[Cell]:
-        """All cells, seed by seed.
-
-        Raises:
-            RunError: If one cannot be read, or is not what it was when it was made.
-        """
+        """All cells, seed by seed; see ``cell``."""
         found = [self.cell(path.parent.name) for path in sorted(self.path.glob("cells/*/cell.json"))]
         return sorted(found, key=lambda cell: cell.config.seed)
 
@@ -85,16 +65,14 @@ class StudyFolder:
 
     def finished(self, cells: Iterable[Cell]) -> set[str]:
         """Digests of those of ``cells`` that have results, in their folders or in the study's tables."""
-        found = [cell for cell in cells if not (self.cell_path(cell) / "result.json").exists()]
-        known = {row["hash"] for row in self.results().rows} if found else set()
-        return {cell.digest for cell in cells} - {cell.digest for cell in found if cell.digest not in known}
+        there = {cell.digest for cell in cells if (self.cell_path(cell) / "result.json").exists()}
+        others = {cell.digest for cell in cells} - there
+        return there | (others & {row["hash"] for row in self.results().rows} if others else set())
 
     def failures(self, cell: Cell) -> list[str]:
         """How a cell's workers have died so far, one line each."""
-        try:
-            lines = (self.cell_path(cell) / "failures.jsonl").read_text().splitlines()
-        except FileNotFoundError:
-            return []
+        path = self.cell_path(cell) / "failures.jsonl"
+        lines = path.read_text().splitlines() if path.exists() else []
         return [json.loads(line)["error"] for line in lines if line.endswith("}")]
 
     def record_failure(self, cell: Cell, error: str) -> None:

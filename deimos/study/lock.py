@@ -31,8 +31,7 @@ else:
 def hold(path: Path, what: str, *, patience: float = 0.0, one_machine: bool = False) -> Iterator[None]:
     """Hold a lock for as long as the context lasts.
 
-    The file names its holder's machine and process. It is emptied when the context ends; after a kill it still names
-    them, but is not locked any more.
+    The file names its holder's machine and process until the context ends; after a kill it still does, unlocked.
 
     Args:
         path: The file; made if it is not there.
@@ -44,12 +43,16 @@ def hold(path: Path, what: str, *, patience: float = 0.0, one_machine: bool = Fa
     Raises:
         RunError: If another process holds it, or another machine may do so, or the file cannot be locked.
     """
-    with _opened(path) as file:
-        while not _is_taken(file, path):
-            if patience <= 0.0:
-                raise RunError(f"{what} is being worked on by {_holder(file)[1]}.")
-            time.sleep(POLL_SECONDS)
-            patience -= POLL_SECONDS
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(path.open("a+"))
+            while not _is_taken(file):
+                if patience <= 0.0:
+                    raise RunError(f"{what} is being worked on by {_holder(file)[1]}.")
+                time.sleep(POLL_SECONDS)
+                patience -= POLL_SECONDS
+        except OSError as error:
+            raise RunError(f"{path} cannot be locked ({error.strerror}).") from error
         machine, holder = _holder(file)
         if one_machine and machine not in ("", socket.gethostname()):
             raise RunError(
@@ -57,29 +60,18 @@ def hold(path: Path, what: str, *, patience: float = 0.0, one_machine: bool = Fa
                 f"has, delete {path}."
             )
         file.truncate(0)
+        stack.callback(file.truncate, 0)
         file.write(json.dumps({"machine": socket.gethostname(), "process": os.getpid()}))
         file.flush()
-        try:
-            yield
-        finally:
-            file.truncate(0)
+        yield
 
 
-def _opened(path: Path) -> IO[str]:
-    try:
-        return path.open("a+")
-    except OSError as error:
-        raise RunError(f"{path} cannot be opened ({error.strerror}).") from error
-
-
-def _is_taken(file: IO[str], path: Path) -> bool:
+def _is_taken(file: IO[str]) -> bool:
     """Take the lock of a file unless another process has it; returns whether it was taken."""
     try:
         _lock(file)
     except (BlockingIOError, PermissionError):  # of POSIX and of Windows
         return False
-    except OSError as error:
-        raise RunError(f"{path} cannot be locked ({error.strerror}).") from error
     return True
 
 

@@ -7,7 +7,7 @@ import tomllib
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
@@ -46,19 +46,19 @@ class Cell:
     def digest(self) -> str:
         """First 12 hexadecimal digits of the SHA-256 of everything that the numbers depend on."""
         selector, periods = _spelled_out(self.config.goals), list(self.goal_periods)
-        return _digest({"config": to_dict(self.config), "selector": selector, "goal_periods": periods})
+        return _digest(config=to_dict(self.config), selector=selector, goal_periods=periods)
 
     @cached_property
     def setting(self) -> str:
         """The same of what the cells of one environment must share to be compared: all but selector and seed."""
         config = to_dict(self.config)
         shared = {name: value for name, value in config.items() if name not in ("method", "selector", "seed")}
-        return _digest({"config": shared, "goal_periods": list(self.goal_periods)})
+        return _digest(config=shared, goal_periods=list(self.goal_periods))
 
     @cached_property
     def selector(self) -> str:
         """The same of what the cells of one method must share: what the method's name stands for."""
-        return _digest({"selector": _spelled_out(self.config.goals)})
+        return _digest(selector=_spelled_out(self.config.goals))
 
     @cached_property
     def name(self) -> str:
@@ -66,11 +66,8 @@ class Cell:
         return f"{self.environment}-{self.config.label}-s{self.config.seed}-{self.digest[:8]}"
 
     def to_dict(self) -> dict:
-        """As JSON types."""
-        return {
-            "schema": SCHEMA, "environment": self.environment, "config": to_dict(self.config),
-            "goal_periods": list(self.goal_periods),
-        }  # fmt: skip
+        """As JSON types; see ``read_cell``."""
+        return {"schema": SCHEMA} | to_dict(self)
 
 
 def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
@@ -83,24 +80,19 @@ def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
     return fields | ({"methods": named} if named else {})
 
 
-def _digest(data: dict) -> str:
+def _digest(**data: Any) -> str:
     text = json.dumps({"schema": SCHEMA} | data, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def read_cell(path: Path) -> Cell:
-    """Read a ``cell.json``.
-
-    Raises:
-        RunError: If it is broken or of another version.
-    """
+    """Read a ``cell.json``; raises ``RunError`` if it is broken or of another version."""
     try:
         data = json.loads(path.read_text())
-        if data["schema"] != SCHEMA:
-            raise ValueError(f"its schema is {data['schema']}, not {SCHEMA}")
-        config = from_dict(TrainConfig, data["config"])
-        return Cell(environment=data["environment"], config=config, goal_periods=tuple(data["goal_periods"]))
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        if (found := data.pop("schema")) != SCHEMA:
+            raise ValueError(f"its schema is {found}, not {SCHEMA}")
+        return from_dict(Cell, data)
+    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
 
 
@@ -113,8 +105,7 @@ def read(path: Path) -> dict:
     ``preset`` is one of ``deimos.run.presets``, where its environment and settings come from that are not said.
     ``base`` names another such file, as seen from this one, where everything comes from that is not said.
 
-    Raises:
-        RunError: If it or its base cannot be read or is not TOML.
+    Raises ``RunError`` if it or its base cannot be read or is not TOML.
     """
     try:
         data = tomllib.loads(path.read_text())
@@ -151,63 +142,56 @@ def expand(
         raise RunError("A study must have an [[environment]].")
     names = [str(table.get("name", "")) for table in tables]
     _check_unique("environment", names)
-    if environments is not None:
-        if unknown := [name for name in environments if name not in names]:
-            raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}.")
-        tables = [table for table in tables if table["name"] in environments]
+    if unknown := [name for name in environments or () if name not in names]:
+        raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}.")
+    wanted = names if environments is None else environments
     numbers = _seeds(description.get("seeds", 10) if seeds is None else list(seeds))
-    shared = _merged({"threads": 1}, description.get("train", {}))
     try:
-        grid = [_environment(table, shared, description.get("methods"), methods, train or {}) for table in tables]
-        return [_cell(environment, name, seed) for seed in numbers for environment in grid for name in environment[2]]
+        grid = [
+            cell for name, table in zip(names, tables, strict=True) if name in wanted
+            for cell in _environment(table, description, methods, train or {})
+        ]  # fmt: skip
+        return [replace(cell, config=replace(cell.config, seed=seed)) for seed in numbers for cell in grid]
     except (AttributeError, TypeError, ValueError) as error:  # what from_dict and the configurations raise
         raise RunError(" ".join(str(error).split())) from error
 
 
-def _environment(
-    table: dict, shared: dict, default: Any, chosen: Sequence[str] | None, last: dict
-) -> tuple[str, dict, list[str], list[int] | None]:
-    """Name, fields of ``TrainConfig``, methods and goal periods of an environment."""
+def _environment(table: dict, study: dict, methods: Sequence[str] | None, train: dict) -> list[Cell]:
+    """A cell, without its seed, for each method of an environment; arguments as those of ``expand``."""
     _check_keys("An [[environment]]", table, _ENVIRONMENT_KEYS)
     name = table.get("name")
     if not isinstance(name, str) or not name.replace("_", "").replace(".", "").isalnum():
         raise RunError(f"An [[environment]] must have a name of letters, digits, '.' and '_', got {name!r}.")
-    own = table.get("train", {})
+    shared, own = study.get("train", {}), table.get("train", {})
     if taken := sorted((set(shared) | set(own)) & _GRID):
         raise RunError(f"{', '.join(taken)} cannot stand in 'train': the grid of the study says it.")
-    try:
-        ready = _training_preset(table)
-        env = from_dict(EnvConfig, _merged(ready["env"], table.get("env", {})))
-    except ValueError as error:
-        raise RunError(f"Environment '{name}': {error}") from error
-    settings = {key: value for key, value in ready.items() if key not in _GRID | {"threads", "device"}}
-    methods = list(chosen if chosen is not None else table.get("methods", default) or [])
+    methods = list(table.get("methods", study.get("methods")) or [] if methods is None else methods)
     if not methods:
         raise RunError(f"Environment '{name}' has no methods.")
-    for each in methods:
-        method(each)
     _check_unique("method", methods)
-    fields = _merged(_merged(_merged(settings, shared), own), last) | {"env": to_dict(env)}
-    return name, fields, methods, table.get("goal_periods")
+    try:
+        ready = _training_preset(table)
+        env = from_dict(EnvConfig, _merged(ready.pop("env", {}), table.get("env", {})))
+    except ValueError as error:
+        raise RunError(f"Environment '{name}': {error}") from error
+    fields = reduce(_merged, (ready, {"threads": 1}, shared, own, train, {"env": to_dict(env)}))
+    configs = [from_dict(TrainConfig, fields | {"method": each}) for each in methods]
+    periods = tuple(table.get("goal_periods") or [env.goal_period])
+    return [Cell(environment=name, config=config, goal_periods=periods) for config in configs]
 
 
 def _training_preset(table: dict) -> dict:
-    """Fields of ``TrainConfig`` of the preset that an environment's table names; an empty ``env`` if it names none."""
+    """What the preset that an environment's table names says of ``TrainConfig``, but for the grid and the machine."""
     if "preset" not in table:
-        return {"env": {}}
+        return {}
     name = table["preset"]
     if not isinstance(name, str):
         raise ValueError(f"preset must be the name of one, got {name!r}.")
     kind = table.get("env", {}).get("kind", presets.environment(name))
     if kind != presets.environment(name):
         raise ValueError(f"preset '{name}' is for {presets.environment(name)}, not for {kind}.")
-    return to_dict(presets.preset(name))
-
-
-def _cell(environment: tuple[str, dict, list[str], list[int] | None], method_name: str, seed: int) -> Cell:
-    name, fields, _, periods = environment
-    config = from_dict(TrainConfig, fields | {"method": method_name, "seed": seed})
-    return Cell(environment=name, config=config, goal_periods=tuple(periods or [config.env.goal_period]))
+    fields = to_dict(presets.preset(name))
+    return {key: value for key, value in fields.items() if key == "env" or key not in _GRID | {"threads", "device"}}
 
 
 def _seeds(given: Any) -> list[int]:

@@ -8,24 +8,26 @@ import csv
 import io
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from deimos.files import write_whole
 from deimos.run.folder import RunError, RunFolder
 from deimos.study.plan import Cell
 
 SCHEMA = 1  # of result.json
 Row = dict[str, Any]
 
-RESULT_COLUMNS: dict[str, type] = {
+_CELL: dict[str, type] = {
+    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
+}  # fmt: skip
+RESULT_COLUMNS = _CELL | {
     # What was run.
-    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str,
-    "num_envs": int, "env_steps": int, "trained_period": int,
+    "env_steps": int, "trained_period": int,
     # How it was evaluated.
     "goals": str, "goal_period": int, "eval_seed": int, "worlds": int, "steps": int,
     # What came out.
@@ -37,14 +39,12 @@ RESULT_COLUMNS: dict[str, type] = {
     # By what.
     "fps": float, "weights": str, "device": str, "versions": str,
 }  # fmt: skip
+MEANS = ("reward", "crashes_per_1000", "selected_fraction")
+"""Columns of ``progress.csv`` that a training curve has means of."""
+CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS), tuple)
+TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 TIMED = ("fps",)
 """Columns that two runs of the same cell may differ in."""
-
-CURVE_COLUMNS: dict[str, type] = {
-    "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
-    "env_steps": tuple, "reward": tuple, "crashes_per_1000": tuple, "selected_fraction": tuple,
-}  # fmt: skip
-TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 FORMER_NAMES = {"selected_share": "selected_fraction"}
 """Columns of version 0.1.0 that have another name today."""
 
@@ -59,21 +59,21 @@ class Results:
     """One per training, with ``CURVE_COLUMNS``."""
 
     @classmethod
-    def read(cls, folder: Path) -> "Results":
-        """The results of a study's folder, or of one that holds tables only; none where there is nothing.
+    def read(cls, folder: Path, *, may_be_empty: bool = True) -> "Results":
+        """The results of a study's folder, or of one that holds tables only.
 
-        Raises:
-            RunError: If a file is broken or of another schema.
+        Raises ``RunError`` if a file is broken or of another schema, or if there must be results and are none.
         """
         found = cls()
         for path in sorted(folder.glob("cells/*/result.json")):
             data = RunFolder(path.parent).read_json(path.name)
             if not isinstance(data, dict) or data.get("schema") != SCHEMA:
                 raise RunError(f"{path} is not the result of a cell of schema {SCHEMA}.")
-            for row in data["rows"]:
-                found.rows.append({name: _value(kind, row.get(name)) for name, kind in RESULT_COLUMNS.items()})
-            found.curves.append({name: _value(kind, data["curve"][name]) for name, kind in CURVE_COLUMNS.items()})
+            found.rows += [_row(RESULT_COLUMNS, row) for row in data["rows"]]
+            found.curves.append(_row(CURVE_COLUMNS, data["curve"]))
         found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())))
+        if not found.rows and not may_be_empty:
+            raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
         return found
 
     def add(self, other: "Results") -> int:
@@ -85,66 +85,48 @@ class Results:
         return len(fresh)
 
     def check(self) -> None:
-        """Refuse what is no one study.
+        """Raise ``RunError`` if what cannot be compared is mixed, or if a policy is there twice.
 
-        Raises:
-            RunError: If what cannot be compared is mixed, or a policy is there twice: one of the two would silently
-                count for nothing.
+        One of the two would silently count for nothing.
         """
         check_comparable([*self.rows, *self.curves])
-        for rows, more in ((self.rows, ("goals", "goal_period")), (self.curves, ())):
-            names = ("environment", "method", "seed", *more)
+        policy = ("environment", "method", "seed")
+        for rows, names in ((self.rows, (*policy, "goals", "goal_period")), (self.curves, policy)):
             for key, count in Counter(tuple(row[name] for name in names) for row in rows).items():
                 if count > 1:
                     what = ", ".join(f"{name} {value}" for name, value in zip(names, key, strict=True))
                     raise RunError(f"There are two rows of {what}; keep one of them in the folder.")
 
     def write(self, folder: Path) -> None:
-        """Write the tables, each whole or not at all; numbers of a curve have five digits.
-
-        Raises:
-            RunError: If they cannot be written.
-        """
+        """Write the tables, each as ``write_table`` does; numbers of a curve have five digits."""
         for rows, (name, columns) in zip((self.rows, self.curves), TABLES.items(), strict=True):
             write_table(folder / name, columns, rows)
 
 
-def result(cell: Cell, run: RunFolder, evaluated: Iterable[Row], points: int = 100) -> Row:
-    """What a finished cell writes to its ``result.json``.
-
-    Args:
-        cell: The cell.
-        run: Its run.
-        evaluated: The rows of its evaluations.
-        points: Stretches of the training, at most, that its curve has means over.
-    """
+def result(cell: Cell, run: RunFolder, evaluated: Iterable[Row]) -> Row:
+    """What a finished cell writes to its ``result.json``, from its run and the rows of its evaluations."""
     stored = run.read_json("config.json")
-    versions = stored["versions"]
     names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
     shared = identity(cell) | {
         "env_steps": stored["config"]["env_steps"],
         "trained_period": cell.config.env.goal_period,
         "fps": median(float(row["fps"]) for row in run.read_csv("timing.csv")),
         "device": stored["config"]["device"],
-        "versions": " ".join(f"{name}={versions[name]}" for name in names),
+        "versions": " ".join(f"{name}={stored['versions'][name]}" for name in names),
     }
     rows = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in evaluated]
     # Where a goal has one group of components, its tracking is the reward.
     rows = [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in rows]
-    return {"schema": SCHEMA, "rows": rows, "curve": identity(cell) | _curve(run.read_csv("progress.csv"), points)}
+    return {"schema": SCHEMA, "rows": rows, "curve": identity(cell) | _curve(run.read_csv("progress.csv"))}
 
 
-def _curve(rows: list[dict[str, str]], points: int) -> Row:
+def _curve(rows: list[dict[str, str]], points: int = 100) -> Row:
     """Means of the columns of ``progress.csv`` over as many stretches as ``points``, or fewer."""
     rows = [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
     count = min(points, len(rows))
-    bounds = [len(rows) * i // count for i in range(count + 1)]
-    stretches = [rows[low:high] for low, high in pairwise(bounds)]
-    means = {
-        name: [sum(float(row[name]) for row in stretch) / len(stretch) for stretch in stretches]
-        for name in ("reward", "crashes_per_1000", "selected_fraction")
-    }
-    return {"env_steps": [float(stretch[-1]["env_steps"]) for stretch in stretches]} | means
+    stretches = [rows[len(rows) * i // count : len(rows) * (i + 1) // count] for i in range(count)]
+    means = {name: [sum(float(row[name]) for row in part) / len(part) for part in stretches] for name in MEANS}
+    return {"env_steps": [float(part[-1]["env_steps"]) for part in stretches]} | means
 
 
 def identity(cell: Cell) -> Row:
@@ -163,115 +145,92 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
         sources: Study folders; all are checked before anything is written.
 
     Returns:
-        How many rows of evaluations were added, how many were there already, and how many of those
-        have other numbers in the source: of those the first stay.
+        How many rows of evaluations were added, how many were there already, and how many of those have other
+        numbers in the source: of those the first stay.
 
     Raises:
         RunError: If a folder has no results or those of another schema, or they do not make one study.
     """
     merged = Results.read(target)
     added = present = differing = 0
+    numbers = ("weights", "crashes", "reward")
     for source in sources:
-        found = Results.read(source)
-        if not found.rows:
-            raise RunError(f"{source} holds no results; it is empty, or no study folder.")
-        known = {(row["hash"], row["goals"], row["goal_period"]): row for row in merged.rows}
-        for row in found.rows:
-            old = known.get((row["hash"], row["goals"], row["goal_period"]))
-            present += old is not None
-            differing += old is not None and any(
-                _text(old[name]) != _text(row[name]) for name in ("weights", "crashes", "reward")
-            )
+        found = Results.read(source, may_be_empty=False)
+        ours, theirs = (
+            {(row["hash"], row["goals"], row["goal_period"]): [_text(row[name]) for name in numbers] for row in rows}
+            for rows in (merged.rows, found.rows)
+        )
+        both = ours.keys() & theirs.keys()
+        present += len(both)
+        differing += sum(ours[key] != theirs[key] for key in both)
         added += merged.add(found)
     merged.check()
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"The folder {target} cannot be made ({error.strerror}).") from error
+    target.mkdir(parents=True, exist_ok=True)
     merged.write(target)
     return added, present, differing
 
 
-_SHARED = {  # what the rows that share the other columns must share too, with what to say if they do not
-    "setting": (
-        ("environment",),
-        "The cells of environment '{environment}' were run with {count} different settings ({found}) and cannot be "
-        "compared; keep one setting in a folder.",
-    ),
-    "selector": (
-        ("environment", "method"),
-        "Method '{method}' stands for {count} different selectors in environment '{environment}' ({found}), which are "
-        "no one population; keep one of them in a folder.",
-    ),
-}
-
-
 def check_comparable(rows: Iterable[Row]) -> None:
-    """Refuse to mix what cannot be compared: an environment has one setting, and a method in it one selector.
+    """Raise ``RunError`` unless an environment has one setting, and a method in it one selector.
 
-    Args:
-        rows: Rows of either kind, or cells' identities.
-
-    Raises:
-        RunError: If there are more.
+    ``rows`` are of either kind, or the identities of cells.
     """
-    rows = list(rows)
-    for column, (names, message) in _SHARED.items():
-        values: dict[tuple, set[str]] = {}
-        for row in rows:
-            values.setdefault(tuple(row[name] for name in names), set()).add(row[column])
-        for key, found in values.items():
-            if len(found) > 1:
-                known = dict(zip(names, key, strict=True)) | {"count": len(found), "found": ", ".join(sorted(found))}
-                raise RunError(message.format(**known))
+    settings, selectors = defaultdict(set), defaultdict(set)
+    for row in rows:
+        settings[row["environment"]].add(row["setting"])
+        selectors[row["environment"], row["method"]].add(row["selector"])
+    for environment, found in settings.items():
+        if len(found) > 1:
+            raise RunError(
+                f"The cells of environment '{environment}' were run with {len(found)} different settings "
+                f"({', '.join(sorted(found))}) and cannot be compared; keep one setting in a folder."
+            )
+    for (environment, method), found in selectors.items():
+        if len(found) > 1:
+            raise RunError(
+                f"Method '{method}' stands for {len(found)} different selectors in environment '{environment}' "
+                f"({', '.join(sorted(found))}), which are no one population; keep one of them in a folder."
+            )
 
 
 def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     """All whole rows of a table, in which empty cells are NaN in columns of numbers, else None; none if it is missing.
 
-    Raises:
-        RunError: If it has other columns, or holds what is no value of its column.
+    Raises ``RunError`` if it has other columns, or holds what is no value of its column.
     """
     try:
         text = path.read_text()
     except FileNotFoundError:
         return []
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise RunError(f"{path} cannot be read ({error}).") from error
     lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())  # version 0.1.0 may have left half a line
     names = [FORMER_NAMES.get(name, name) for name in next(lines, columns)]
-    if set(names) != set(columns):
-        both = (
-            ("missing", [n for n in columns if n not in names]),
-            ("unknown", [n for n in names if n not in columns]),
-        )
-        parts = [f"{what}: {', '.join(found)}" for what, found in both if found]
-        raise RunError(f"{path} is a table of another schema; {'; '.join(parts)}.")
+    missing, unknown = ([n for n in a if n not in b] for a, b in ((columns, names), (names, columns)))
+    if missing or unknown:
+        lists = f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}"
+        raise RunError(f"{path} is a table of another schema; {lists}.")
     rows = []
     for number, values in enumerate(lines, start=2):
         try:
-            rows.append({name: _value(columns[name], text) for name, text in zip(names, values, strict=True)})
+            rows.append(_row(columns, dict(zip(names, values, strict=True))))
         except ValueError as error:
             raise RunError(f"{path}, line {number}, does not fit its columns ({error}).") from error
     return rows
 
 
 def write_table(path: Path, columns: dict[str, type], rows: Iterable[Row]) -> None:
-    """Write a table, whole or not at all.
-
-    Raises:
-        RunError: If it cannot be written.
-    """
+    """Write a table, whole or not at all; raises ``RunError`` if it cannot be written."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows([_text(row.get(name)) for name in columns] for row in rows)
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        temporary.write_text(out.getvalue())
-        temporary.replace(path)
-    except OSError as error:
-        raise RunError(f"{path} could not be written ({error.strerror}).") from error
+    write_whole(path, lambda file: file.write(out.getvalue().encode()))
+
+
+def _row(columns: dict[str, type], given: Row) -> Row:
+    """A row with the values of all columns; see ``_value``."""
+    return {name: _value(kind, given.get(name)) for name, kind in columns.items()}
 
 
 def _value(kind: type, given: Any) -> Any:
@@ -296,4 +255,4 @@ def _text(value: Any) -> str:
         return " ".join(f"{part:.5g}" for part in value)
     if isinstance(value, dict):
         return json.dumps(value) if value else ""
-    return repr(value) if isinstance(value, float) else str(value)
+    return str(value)

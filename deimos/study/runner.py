@@ -52,14 +52,11 @@ class Runner:
     _killed: bool = False
 
     def run(self, report: Callable[[Progress], None], stopped: Callable[[], bool]) -> Progress:
-        """Work until every cell is finished or given up, or until ``stopped()``.
+        """Work until every cell is finished or given up, or until ``stopped()``; returns where the study stands then.
 
         Args:
             report: Called a few times per second.
             stopped: Asked as often; true lets the running cells write their checkpoints and end.
-
-        Returns:
-            Where the study stands then.
 
         Raises:
             RunError: If another process works on the study.

@@ -17,12 +17,13 @@ Statistic = Callable[..., Array]
 
 RESAMPLES = 10_000
 LEVEL = 0.95
+ENDS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
 POWER = 0.8
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with its interval."""
+    """An estimate with its interval, which has NaN as its ends where there is none; formats as its numbers do."""
 
     estimate: float
     """Of the samples themselves."""
@@ -30,6 +31,11 @@ class Interval:
     """Lower end."""
     high: float
     """Upper end."""
+
+    def __format__(self, form: str) -> str:
+        if math.isnan(self.low):
+            return format(self.estimate, form)
+        return f"{self.estimate:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
 def iqm(x: Array) -> Array:
@@ -92,16 +98,9 @@ def distribution(
 def bootstrap(
     samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
-    """Percentile interval of a statistic by the stratified bootstrap; see ``distribution``.
-
-    Args:
-        samples: One array per stratum (method or task).
-        statistic: Vectorised over leading axes.
-        resamples: Number of bootstrap resamples; ``None`` for ``RESAMPLES``.
-        seed: Of the resampling.
-    """
+    """Percentile interval of a statistic by the stratified bootstrap; arguments as those of ``distribution``."""
     values = distribution(samples, statistic, resamples=resamples, seed=seed)
-    return Interval(float(statistic(*map(_checked, samples))), *_quantiles(values))
+    return Interval(float(statistic(*map(_checked, samples))), *_ends(values))
 
 
 def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Interval:
@@ -111,18 +110,17 @@ def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Int
         .. [1] Efron and Tibshirani, *An Introduction to the Bootstrap*, 1993, section 12.5.
     """
     x = _checked(x)
-    mean, error = x.mean(), x.std(ddof=1) / math.sqrt(len(x))
+    mean, error = float(x.mean()), float(stats.sem(x))
     if error == 0.0:
-        return Interval(float(mean), float(mean), float(mean))
+        return Interval(mean, mean, mean)
 
     def student(draws: Array) -> Array:
         away = draws.mean(axis=-1) - mean
-        errors = draws.std(axis=-1, ddof=1) / math.sqrt(len(x))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(away == 0.0, 0.0, away / errors)  # infinite where all drawn values are the same
+        with np.errstate(divide="ignore", invalid="ignore"):  # infinite where all drawn values are the same
+            return np.where(away == 0.0, 0.0, away / stats.sem(draws, axis=-1))
 
-    low, high = _quantiles(distribution([x], student, resamples=resamples, seed=seed))
-    return Interval(float(mean), float(mean - high * error), float(mean - low * error))
+    low, high = _ends(distribution([x], student, resamples=resamples, seed=seed))
+    return Interval(mean, mean - high * error, mean - low * error)
 
 
 def probability_of_improvement(
@@ -144,10 +142,9 @@ def probability_of_improvement(
         x, y = _checked(x), _checked(y)
         wins = (x[:, None] > y) + 0.5 * (x[:, None] == y)
         estimate += wins.mean() / len(pairs)
-        counts = [rng.multinomial(len(z), np.full(len(z), 1 / len(z)), size=resamples) / len(z) for z in (x, y)]
-        values += np.einsum("ri,ij,rj->r", counts[0], wins, counts[1], optimize=True) / len(pairs)
-    low, high = _quantiles(values)
-    return Interval(float(estimate), low, high)
+        drawn = [_drawn(len(z), resamples, rng) for z in (x, y)]
+        values += np.einsum("ri,ij,rj->r", drawn[0], wins, drawn[1], optimize=True) / len(pairs)
+    return Interval(float(estimate), *_ends(values))
 
 
 def performance_profile(
@@ -167,15 +164,16 @@ def performance_profile(
     References:
         .. [1] Agarwal et al., arXiv:2108.13264, section 4.2.
     """
-    samples = [_checked(x) for x in samples]
-    share = np.mean([(x[:, None] > thresholds).mean(axis=0) for x in samples], axis=0)
     rng, resamples = np.random.default_rng(seed), resamples or RESAMPLES
-    values = np.zeros((resamples, len(thresholds)))
-    for x in samples:
-        counts = rng.multinomial(len(x), np.full(len(x), 1 / len(x)), size=resamples) / len(x)
-        values += counts @ (x[:, None] > thresholds) / len(samples)
-    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
-    return share, low, high
+    above = [_checked(x)[:, None] > thresholds for x in samples]
+    values = sum(_drawn(len(x), resamples, rng) @ x / len(samples) for x in above)
+    low, high = np.quantile(values, ENDS, axis=0)
+    return np.mean([x.mean(axis=0) for x in above], axis=0), low, high
+
+
+def _drawn(n: int, resamples: int, rng: np.random.Generator) -> Array:
+    """Share that each of n values has in every resample of them, shape (resamples, n)."""
+    return rng.multinomial(n, np.full(n, 1 / n), size=resamples) / n
 
 
 def detectable_probability(n: int, m: int, alpha: float = 0.05) -> float:
@@ -192,11 +190,9 @@ def detectable_probability(n: int, m: int, alpha: float = 0.05) -> float:
     return min(1.0, 0.5 + float(z) * math.sqrt((n + m) / (12 * n * m)))
 
 
-def _quantiles(values: Array) -> tuple[float, float]:
-    """Ends of the percentile interval; infinite values count."""
-    finite = bool(np.isfinite(values).all())  # there is nothing between two infinities
-    ends = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
-    low, high = np.quantile(values, ends) if finite else np.quantile(values, ends, method="nearest")
+def _ends(values: Array) -> tuple[float, float]:
+    """Ends of the percentile interval; infinite values count, and there is nothing between two of them."""
+    low, high = np.quantile(values, ENDS, method="linear" if np.isfinite(values).all() else "nearest")
     return float(low), float(high)
 
 

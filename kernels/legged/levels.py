@@ -1,14 +1,11 @@
 """Levels of the legged robots' terrain: who does well goes to harder tiles, who does not to easier ones.
 
-What an episode was worth is a number in [0, 1]: the mean linear tracking, or by the rule of displacements the mean,
-over the goals of the episode, of how well the robot's displacement agrees with that of the commanded path: the smaller
-of the two over the larger. The path of a goal (v_x, v_y, w) is an arc where yaw is asked for: in t seconds it leads
-
-    |v| t                      where w = 0, and
-    |v| |2 sin(w t / 2) / w|   elsewhere
-
-away, so that whoever walks in circles as told is not taken for one who stands still, as by Legged Gym's rule, which
-compares half an episode's straight way of the last goal. Goals that lead less than ``SHORTEST`` away say nothing.
+An episode's worth is a number in [0, 1]: the mean linear tracking, or, by the rule of displacements, the mean over the
+episode's goals of how well the robot's displacement agrees with that of the commanded path (the smaller of the two over
+the larger). The path of a goal (v_x, v_y, w) is an arc where yaw is asked for; in t seconds it leads |v| t away where
+w = 0, and |v| |2 sin(w t / 2) / w| elsewhere. Goals that lead less than ``SHORTEST`` away say nothing. (Legged Gym
+compares with half of the straight way that the last goal would ask for in a whole episode: who walks in circles, as
+told, goes down by it.)
 """
 
 import warp as wp

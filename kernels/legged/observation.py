@@ -111,7 +111,7 @@ def finish_obs(legged: LeggedWorlds, mask: wp.array, *, wanted: bool) -> None:
     A height is seen as 5 clip(z - standing height - ground, -1 m, 1 m), z being the base's, at points that turn with
     the robot's yaw alone. Legged Gym subtracts 0.5 m from every robot; with the robot's own height the inputs are
     around 0 on level ground. Inputs that are all the same and far from 0 act as one bias with a hundred times
-    the step size of the other weights.
+    the learning rate of the other weights.
 
     Args:
         legged: The worlds; their observations are updated, their clocks address the draws.

@@ -61,7 +61,7 @@ class LocomotionParams:
     dt: float  # duration of a step [s]
     stagger: wp.bool  # whether the clocks of a world's first episode start at random steps
     noise: wp.bool  # whether observations are noisy
-    push_interval: int  # steps from push to push, 0 for none
+    push_interval: int  # steps from push to push, 0 disables pushes
     push_speed: float  # bound of the velocity that a push sets [m/s]
     weight: vecT  # of the reward's terms
     air_time_target: float  # [s]

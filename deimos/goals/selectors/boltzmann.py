@@ -40,7 +40,7 @@ class Boltzmann(FearSelector):
     """See ``Config``."""
 
     config: Config
-    # A run that goes on with a larger budget keeps the schedule that it began with.
+    # A run that is resumed with a larger budget keeps the schedule that it began with.
     saved = (*FearSelector.saved, "beta", "_steps")
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:

@@ -127,7 +127,7 @@ class PLR(GoalSelector):
         Many worlds replay the same level at once: its score is the mean over them.
         """
         place = (done.note - 1).clamp(min=0)
-        # What was issued on the step of an update was issued before it, from the levels of before.
+        # What was issued on the step of an update was issued before it, from the previous levels.
         valid = (done.note > 0) & (self._made[place] < done.issued)
         place = place[valid]
         self._score.scatter_reduce_(0, place, loss[valid], "mean", include_self=False)

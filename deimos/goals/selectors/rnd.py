@@ -36,7 +36,7 @@ class Config(SelectorConfig):
     activation: Activation = "relu"
     """Between the layers."""
     learning_rate: float = 1e-3
-    """Step size of Adam, positive."""
+    """Learning rate of Adam, positive."""
     epochs: int = 1
     """Passes over the interactions that were issued since the last time, at least 1."""
     minibatches: int = 4

@@ -17,7 +17,7 @@ class Config(SelectorConfig):
     """The first method chooses the goals up to a share of the training, the second one from there on.
 
     The second learns from the start what the first one's goals teach: outcomes and transitions. (Of candidates, which
-    RND, grid and PLR learn from as well, it sees none before it chooses.) The first goes on learning as long as it
+    RND, grid and PLR learn from as well, it sees none before it chooses.) The first keeps learning as long as it
     chooses, and beyond where the learner has its baseline from it.
     """
 
@@ -42,7 +42,7 @@ class Config(SelectorConfig):
 class Schedule(Delegate):
     """See ``Config``."""
 
-    # A run that goes on with a larger budget keeps the schedule that it began with.
+    # A run that is resumed with a larger budget keeps the schedule that it began with.
     saved = ("parts", "switched", "_switch", "_keys")
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:

@@ -49,7 +49,7 @@ class Config(SelectorConfig):
     activation: Activation = "relu"
     """Between the layers."""
     learning_rate: float = 1e-3
-    """Step size of Adam, positive."""
+    """Learning rate of Adam, positive."""
     epochs: int = 5
     """Passes over every critic's data, at least 1."""
     minibatches: int = 4
@@ -161,7 +161,8 @@ class VDS(GoalSelector):
         elif shared:
             value = self.values(rollout.obs)
         else:
-            value = self._own_values(rollout.obs, worlds)
+            own = self._spaces.state_then_goal(rollout.obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds, inputs)
+            value = self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
         old, next_value = value.transpose(0, 1)[:-1], value.transpose(0, 1)[1:]  # (num_steps, K, worlds of each)
         reward, terminated, truncated = (
             tensor[:, worlds] for tensor in (rollout.reward, rollout.terminated, rollout.truncated)
@@ -177,11 +178,6 @@ class VDS(GoalSelector):
             discount=rollout.discount, gae_lambda=rollout.gae_lambda,
         )  # fmt: skip
         return old.transpose(0, 1), (advantage + old).transpose(0, 1)
-
-    def _own_values(self, obs: Tensor, worlds: Tensor) -> Tensor:
-        """Values of every critic's own worlds by itself, shape (K, steps, worlds of each)."""
-        own = self._spaces.state_then_goal(obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds of each, inputs)
-        return self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
 
     def _fit(self, rollout: Transitions, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
         """Adam on the clipped value loss; returns its mean over critics and minibatches.
@@ -204,7 +200,7 @@ class VDS(GoalSelector):
         )  # fmt: skip
         losses = torch.zeros(len(worlds), device=old.device)
         assert self.stack.parameters.grad is not None
-        # A thread of torch's that has had work goes on waiting for more, and would take the processor from the updates.
+        # A thread of torch's that has had work keeps waiting for more, and would take the processor from the updates.
         with on_threads(1):
             for _ in range(self.config.epochs):
                 for start in range(0, minibatches * size, size):

@@ -30,7 +30,7 @@ class Config(LocomotionConfig):
     def largest_reward(self) -> float:
         """See ``EnvConfig.largest_reward``: perfect tracking, and the end effector at its goal."""
         per_second = max(self.arm_rewards.reach, 0.0) + max(self.arm_rewards.precision, 0.0)
-        return super().largest_reward + per_second * self.physics.timestep * self.physics.substeps
+        return super().largest_reward + per_second * self.physics.control_period
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,5 +59,5 @@ PRESETS = {
         "env_steps": 4800,
         "ppo": _PPO | {"discount": 0.95, "gae_lambda": 0.9},
     },
-    "quad-arm-thesis": quad.PRESETS["quad-thesis"] | {"ppo": _PPO | {"hidden": (512, 256, 128)}},
+    "quad-arm-large": quad.PRESETS["quad-large"] | {"ppo": _PPO | {"hidden": (512, 256, 128)}},
 }  # fmt: skip

@@ -43,7 +43,7 @@ class LocomotionConfig(EnvConfig):
     """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0. Off in Legged
     Gym, but for its ANYmal."""
     push_interval: float = 15.0
-    """Time from push to push, each robot in a phase of its own [s], at least 0; 0 for none."""
+    """Time from push to push, each robot in a phase of its own [s], at least 0; 0 disables them."""
     push_speed: float = 1.0
     """Bound of the horizontal velocity that a push sets [m/s], at least 0."""
     noise: bool = True
@@ -82,7 +82,7 @@ class LocomotionConfig(EnvConfig):
     def largest_reward(self) -> float:
         """See ``EnvConfig.largest_reward``: perfect tracking."""
         per_second = max(self.rewards.linear_tracking, 0.0) + max(self.rewards.yaw_tracking, 0.0)
-        return per_second * self.physics.timestep * self.physics.substeps
+        return per_second * self.physics.control_period
 
     def without_randomness(self) -> "LocomotionConfig":
         """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns."""

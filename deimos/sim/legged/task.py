@@ -4,11 +4,11 @@ The task is Legged Gym's (Rudin et al. 2021) as Gauthier's thesis uses it (4.1.2
 rise and fall with the reward.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -90,8 +90,8 @@ class Locomotion(WarpEnv):
         super().__init__(
             config, num_envs, device, seed, env_offset,
             layout=_layout(robot, parts, len(self.points)), goal_range=[half for part in parts for half in part.range],
-            action_dim=len(robot.joints), action_bound=_action_bound(robot), dt=config.physics.control_period,
-            time_limit=config.episode_steps,
+            action_dim=len(robot.joints), dt=config.physics.control_period, time_limit=config.episode_steps,
+            action_bound=max(abs(end) for joint in robot.joints for end in joint.action_range),
         )  # fmt: skip
         ground = config.load_terrain()
         self.terrain = ground or terrain.flat()
@@ -133,7 +133,7 @@ class Locomotion(WarpEnv):
             goal_dim=self.goal_dim, num_groups=len(self.goal_groups), num_terms=len(self.columns),
             arm_fields=sum(field.size for part in self.parts for field in part.fields),
         )  # fmt: skip
-        numbers = {name: size for name, size in sizes.items() if name != "num_envs"}
+        numbers: dict[str, Any] = {name: size for name, size in sizes.items() if name != "num_envs"}
         low, high = np.array([joint.range for joint in joints]).T
         action_low, action_high = np.array([joint.action_range for joint in joints]).T
         scale, device = [joint.action_scale for joint in joints], warp_device(self.device)
@@ -190,8 +190,10 @@ class Locomotion(WarpEnv):
             self._sums += self.term.sum(0)
             self._steps_reported += 1
 
-        validate = next((part.validate for part in self._launches if part.validate), None)
-        valid_goals = partial(validate, self._row.array, self._candidate_scale.array) if validate else None
+        validations = [part.validate for part in self._launches if part.validate]
+        if len(validations) > 1:
+            raise ValueError(f"At most one part may restrict which goals are valid, got {len(validations)}.")
+        valid_goals = partial(validations[0], self._row.array, self._candidate_scale.array) if validations else None
         self.begin(step, Captured(self._run_reset, self.device), valid_goals=valid_goals)
         self.physics.buffer_use()  # what the recording needed says nothing about these worlds
 
@@ -210,6 +212,12 @@ class Locomotion(WarpEnv):
         for part in self._launches:
             part.reset()
         finish_obs(self.legged, self.worlds.mask, wanted=True)
+
+    @property
+    def action_range(self) -> tuple[Tensor, Tensor]:
+        """See ``Env.action_range``: what takes the joints' targets to the ends of their ranges."""
+        low, high = torch.tensor([joint.action_range for joint in self.robot.joints]).T
+        return low, high
 
     def describe_fault(self, world: int) -> str:
         """See ``WarpEnv.describe_fault``."""
@@ -257,15 +265,6 @@ class Locomotion(WarpEnv):
         """See ``Env.goal_point``."""
         places = [part.points for part in self._launches if part.points]
         return places[0]()[world] if places else None
-
-    def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
-        """See ``Env.reference_policy``. Nobody has written down how to walk."""
-        return None
-
-
-def _action_bound(robot: Robot) -> float:
-    """The largest action that any joint can do; those of every joint are in the robot's data."""
-    return max(abs(end) for joint in robot.joints for end in joint.action_range)
 
 
 def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:

@@ -1,7 +1,7 @@
 """A robot on a terrain, in many worlds: stepping, reset, health.
 
 This is the only file that knows mujoco-warp. What it shows to others are Warp arrays with MuJoCo's
-names and layout, so that another engine fits behind the same face.
+names and layout, so that another engine fits behind the same interface.
 """
 
 import math
@@ -212,7 +212,7 @@ class Physics:
                 gather_contacts(self._contacts, substep=substep)
 
     def bare_step(self) -> None:
-        """Launch the substeps of one control step and nothing else: the yardstick of benchmarks."""
+        """Launch the substeps of one control step and nothing else: the baseline of benchmarks."""
         with _device(self.device):
             for _ in range(self.config.substeps):
                 self._mjw.step(self._model, self._data)
@@ -321,8 +321,8 @@ def _buffer_sizes(model: "mujoco.MjModel", num_envs: int, config: PhysicsConfig,
     """Buffer sizes: contacts in all worlds, and constraint rows in each.
 
     Buffers cost time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 136
-    rows a policy's robots needed 64 at most, but for worlds that blew up (108), and robots that were thrown about by
-    their own legs 93.
+    rows a policy's robots needed 64 at most, but for worlds that diverged (108), and robots under large random
+    leg targets 93.
     """
     contacts, pairs, rows = _largest_demand(model, plane=plane)
     contact_share, row_share = (1 / 2, 1.0) if plane else (1 / 4, 4 / 5)

@@ -11,7 +11,7 @@ Where the numbers come from:
 * The hips are balls of mjlab's radius, where they stick out of the trunk: a Go1 that lies on its side touches the
   ground with them. They are watched as parts of the base, since the thesis counts "any part of the robot's base"
   as a crash and a hip holds the trunk's motors; without them a robot on its side rested on thighs and calves and
-  went on.
+  did not crash.
 * Gains: those of the Unitree A1 in Legged Gym (20 N m/rad, 0.5 N m s/rad) raised by half, since a Go1
   is heavier; the default pose is the A1's, with the rear thighs as the front ones so that it stands level.
 """
