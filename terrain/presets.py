@@ -1,4 +1,4 @@
-"""Ready-made grids, and grids from TOML files."""
+"""Grids from TOML files: the ready-made ones in ``terrain/grids``, and those of others."""
 
 import tomllib
 from pathlib import Path
@@ -8,33 +8,12 @@ from .catalog import convert, make
 from .grid import Terrain
 from .world import Grid, Share, build
 
-# Proportions of Legged Gym: smooth slopes (half of them up), rough slopes, stairs up, stairs down, discrete.
-_LEGGED_GYM: list[dict[str, Any]] = [
-    {"name": "slope-up", "share": 0.05},
-    {"name": "slope-down", "share": 0.05},
-    {"name": "rough-slope-down", "share": 0.1},
-    {"name": "stairs-up", "share": 0.35},
-    {"name": "stairs-down", "share": 0.25},
-    {"name": "discrete", "share": 0.2},
-]
-# The Go1's legs are 0.43 m long, so its steps end at 0.18 m. A sunk rectangle beside a raised one makes 2 h.
-_LOWER = {
-    "rough-slope-down": {"amplitude": (0.01, 0.05)},
-    "stairs-up": {"height": (0.05, 0.18)},
-    "stairs-down": {"height": (0.05, 0.18)},
-    "discrete": {"height": (0.03, 0.09)},
-}
-_GO1 = [table | _LOWER.get(table["name"], {}) for table in _LEGGED_GYM]
-_PRESETS: dict[str, dict[str, Any]] = {
-    "legged-gym": {"shape": _LEGGED_GYM},
-    "go1": {"shape": _GO1, "border": 5.0, "max_step": 0.18},
-}
-"""What a file would say; see ``read_grid``."""
+_FOLDER = Path(__file__).with_name("grids")
 
 
 def preset_names() -> list[str]:
-    """Names of the presets, sorted."""
-    return sorted(_PRESETS)
+    """Names of the presets, sorted: those of the files in ``terrain/grids``."""
+    return sorted(path.stem for path in _FOLDER.glob("*.toml"))
 
 
 def preset(name: str, **changes: Any) -> Grid:
@@ -47,7 +26,7 @@ def preset(name: str, **changes: Any) -> Grid:
     Raises:
         ValueError: If there is no such preset, or a value is out of its range.
     """
-    return _grid(_look_up(name), changes)
+    return _grid(_read_preset(name), changes)
 
 
 def read_grid(path: str | Path, **changes: Any) -> Grid:
@@ -65,9 +44,9 @@ def read_grid(path: str | Path, **changes: Any) -> Grid:
         ValueError: If it is not such a file, or a value is out of its range.
     """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = _read(Path(path))
         if "preset" in table:
-            table = _look_up(table.pop("preset")) | table
+            table = _read_preset(table.pop("preset")) | table
         if not table.get("shape"):
             raise ValueError(f"it needs a [[shape]], or preset = one of {', '.join(preset_names())}")
         return _grid(table, changes)
@@ -75,10 +54,14 @@ def read_grid(path: str | Path, **changes: Any) -> Grid:
         raise ValueError(f"{path}: {str(error).rstrip('.')}.") from error
 
 
-def _look_up(name: str) -> dict[str, Any]:
-    if name not in _PRESETS:
+def _read(path: Path) -> dict[str, Any]:
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+def _read_preset(name: str) -> dict[str, Any]:
+    if name not in preset_names():
         raise ValueError(f"There is no preset '{name}'; there are: {', '.join(preset_names())}.")
-    return _PRESETS[name]
+    return _read(_FOLDER / f"{name}.toml")
 
 
 def _grid(table: dict[str, Any], changes: dict[str, Any]) -> Grid:

@@ -65,11 +65,6 @@ class TileShape(abc.ABC):
         """Highest step that a robot may have to take up or down [m]; gaps are crossed, not stepped into."""
         return 0.0
 
-    @property
-    def standing_room(self) -> float:
-        """Side of the square around the middle that is level [m]."""
-        return self.platform
-
 
 def at(ramp: Ramp, difficulty: float) -> float:
     """Value of a ramp at a difficulty in [0, 1]."""

@@ -247,6 +247,14 @@ def test_toml_file_may_build_on_a_preset(tmp_path):
     assert presets.read_grid(path) == dataclasses.replace(terrain.preset("go1"), shapes=flat)
 
 
+def test_dropped_in_file_is_a_preset(tmp_path, monkeypatch):
+    """One file in the folder of presets, and nothing else, makes a new preset."""
+    (tmp_path / "mine.toml").write_text(TOML)
+    monkeypatch.setattr(presets, "_FOLDER", tmp_path)
+    assert presets.preset_names() == ["mine"]
+    assert terrain.preset("mine", seed=2) == presets.read_grid(tmp_path / "mine.toml", seed=2)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

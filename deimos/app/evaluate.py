@@ -20,6 +20,7 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
 _CHANGES = ("worlds", "steps", "seed", "oracle_worlds")
+_AUDITS = ("contexts", "calibration")
 _EVALUATION = (
     ("score (0 does nothing, 1 reference)", "score", ".3f"),
     ("reward per transition", "reward", ".4f"),
@@ -70,14 +71,14 @@ class EvaluateOptions:
     against the exact outcomes of cloned worlds. 0 disables it."""
 
     def __post_init__(self) -> None:
-        asked = [name for name in ("contexts", "calibration") if getattr(self, name)]
-        for name in ("contexts", "calibration"):
+        for name in _AUDITS:
             check_at_least(name, getattr(self, name), 0)
-        given = [name for name in (*_CHANGES, "goal_period") if getattr(self, name) is not None]
-        if asked and given + asked[1:]:
+        asked = [name for name in _AUDITS if getattr(self, name)]
+        others = [name for name in (*_CHANGES, "goal_period") if getattr(self, name) is not None] + asked[1:]
+        if asked and others:
             raise ValueError(
                 f"{asked[0]} evaluates the fear network of the run as it was trained and cannot be combined with "
-                f"{', '.join(given + asked[1:])}."
+                f"{', '.join(others)}."
             )
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from deimos.app import console
 from deimos.checks import RunError, check_range
@@ -124,13 +122,13 @@ def _about(shape: TileShape) -> str:
 
 
 def _build_tile(name: str, arguments: list[str], program: str) -> None:
-    options = console.parse(_tile_options(catalog.make(name)), arguments, program)
+    default = catalog.make(name)
+    options = console.parse(_tile_options(default), arguments, program)
     check_range("difficulty", options.difficulty, 0, 1)
-    parameters = catalog.make(name).parameters()
+    shape = catalog.make(name, {key: getattr(options, key) for key in default.parameters()})
     grid = Grid(
-        shapes=(Share(shape=catalog.make(name, {key: getattr(options, key) for key in parameters})),),
-        levels=1, columns=1, tile=options.tile, border=options.border, cell=options.cell, easiest=options.difficulty,
-        hardest=options.difficulty, max_step=options.max_step, seed=options.seed,
+        shapes=(Share(shape=shape),), levels=1, columns=1, tile=options.tile, border=options.border, cell=options.cell,
+        easiest=options.difficulty, hardest=options.difficulty, max_step=options.max_step, seed=options.seed,
     )  # fmt: skip
     _make(grid, options, f"{name}, difficulty {options.difficulty:g}, seed {options.seed}")
 
@@ -170,19 +168,17 @@ def _make(grid: Grid, outputs: Outputs, title: str) -> None:
     low, high = float(terrain.heights.min()) + 0.0, float(terrain.heights.max()) + 0.0  # no -0
     nx, ny = terrain.heights.shape
     levels = f"{grid.easiest:g} to {grid.hardest:g} in {grid.levels} levels"
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-    table.add_row("extents [m]", " x ".join(f"{size:.3g}" for size in (*terrain.size, high - low)))
-    table.add_row("heights [m]", f"{low:.3f} to {high:.3f}")
-    table.add_row("difficulty", f"{grid.easiest:g}" if grid.levels == 1 else levels)
-    table.add_row("steepest slope", f"{steepest_slope(mesh):.3f} rise over run")
-    table.add_row("highest riser [m]", f"{highest_riser(mesh):.3f}")
-    table.add_row("mesh", f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
-    table.add_row("height grid", f"{nx:,} x {ny:,} samples, {terrain.cell:g} m apart")
-    table.add_row("time [s]", f"{seconds:.2f}")
-    screen = Console(highlight=False, markup=False)
-    screen.print(title, style="bold")
-    screen.print(table)
-    print(*jobs, sep="\n", end="\n" if jobs else "")
+    report = {
+        "extents [m]": " x ".join(f"{size:.3g}" for size in (*terrain.size, high - low)),
+        "heights [m]": f"{low:.3f} to {high:.3f}",
+        "difficulty": f"{grid.easiest:g}" if grid.levels == 1 else levels,
+        "steepest slope": f"{steepest_slope(mesh):.3f} rise over run",
+        "highest riser [m]": f"{highest_riser(mesh):.3f}",
+        "mesh": f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces",
+        "height grid": f"{nx:,} x {ny:,} samples, {terrain.cell:g} m apart",
+        "time [s]": f"{seconds:.2f}",
+    }
+    print(title, *[f"{name:18} {value}" for name, value in report.items()], *jobs, sep="\n")
 
 
 def _check_outputs(outputs: Outputs) -> None:

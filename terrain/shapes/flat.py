@@ -12,11 +12,6 @@ from ..shape import TileShape
 class Shape(TileShape):
     """Flat ground at every difficulty."""
 
-    @property
-    def standing_room(self) -> float:
-        """All of it."""
-        return self.tile
-
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         return rings(np.array([self.tile / 2]), np.zeros(1))

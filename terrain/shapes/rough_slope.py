@@ -35,11 +35,6 @@ class Shape(TileShape):
         if self.room > self.platform:
             raise ValueError(f"room must be at most platform = {self.platform:g} m, got {self.room:g} m.")
 
-    @property
-    def standing_room(self) -> float:
-        """The square without noise."""
-        return self.room
-
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         amplitude = at(self.amplitude, difficulty)

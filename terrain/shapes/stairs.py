@@ -27,17 +27,13 @@ class Shape(TileShape):
     tread: float = 0.3
     """Depth of a step [m], positive."""
 
-    @property
-    def num_steps(self) -> int:
-        """Steps between the edge of the tile and its middle."""
-        return math.floor((self.tile - self.platform) / (2 * self.tread) + 1e-9)
-
     def step(self, difficulty: float) -> float:
         """Height of every step [m]."""
         return at(self.height, difficulty)
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
-        k = np.arange(self.num_steps + 1)
+        count = math.floor((self.tile - self.platform) / (2 * self.tread) + 1e-9)
+        k = np.arange(count + 1)
         rise = k * self.step(difficulty)
         return rings(self.tile / 2 - k * self.tread, -rise if self.direction == "up" else rise)
