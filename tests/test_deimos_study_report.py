@@ -151,7 +151,7 @@ def test_tracking_and_errors_stand_beside_the_crashes(folder):
 def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):
     """The bootstrap is seeded: another call writes the same Markdown."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
-    monkeypatch.setattr(figures, "draw", lambda figures, out: {})
+    monkeypatch.setattr(figures, "write", lambda figures, out: [])
     thesis.write(folder, tmp_path)
     text = re.sub(r"!\[.*\n\n", "", (folder / "report.md").read_text())
     assert (tmp_path / "report.md").read_text() == text
@@ -229,10 +229,9 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
     """A page of the caller's own is what is written, figures that it names included."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
 
-    def page(data, captions):
-        assert list(captions) == ["own-directional", "own-quad"]
-        pictures = [document.Picture(name, caption) for name, caption in captions.items()]
-        return ["# Mine", *pictures]
+    def page(data, pictures):
+        assert [each.name for own in pictures.values() for each in own] == ["own-directional", "own-quad"]
+        return ["# Mine", *pictures["directional"], *pictures["quad"]]
 
     def draw(data, environment):
         return {f"own-{environment}": ("A caption.", figures.boxes(data, environment, 100))}

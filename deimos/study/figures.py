@@ -11,6 +11,7 @@ import numpy as np
 
 from deimos.study import stats
 from deimos.study.data import Data, Style, Where
+from deimos.study.document import Picture
 from deimos.study.stats import Array
 
 if TYPE_CHECKING:
@@ -48,18 +49,18 @@ def of_environment(data: Data, environment: str) -> Figures:
     return figures
 
 
-def draw(figures: Figures, folder: Path) -> dict[str, str]:
-    """Write figures, each as PNG and SVG; returns captions of those that there are data for, by their names."""
+def write(figures: Figures, folder: Path) -> list[Picture]:
+    """Write figures, each as PNG and SVG, and return those that there are data for as blocks of a page."""
     import matplotlib
 
-    captions = {}
+    pictures = []
     for name, (caption, figure) in figures.items():
         if figure is not None:
             figure.savefig(folder / f"{name}.png", dpi=DPI)
             with matplotlib.rc_context({"svg.hashsalt": name}):  # the same file from the same data
                 figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-            captions[name] = caption
-    return captions
+            pictures.append(Picture(name, caption))
+    return pictures
 
 
 def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) -> "tuple[Figure, Any]":
@@ -100,16 +101,12 @@ def _boxes(axes: "Axes", style: Style, samples: Mapping[str, Array]) -> None:
         )  # fmt: skip
         hatch = None if style.panel(name) == first else "//"
         drawn["boxes"][0].set(facecolor=style.colour(name), alpha=0.85, hatch=hatch)
+        place = i + 0.4 * (np.arange(len(values)) * 0.618034 % 1.0 - 0.5)  # spread, but not in the order of the seeds
         axes.plot(
-            i + _jitter(len(values)), values, linestyle="", marker="o", markersize=3.2, color="white",
+            place, values, linestyle="", marker="o", markersize=3.2, color="white",
             markeredgecolor="black", markeredgewidth=0.6, zorder=3,
         )  # fmt: skip
     axes.grid(axis="y", alpha=0.3)
-
-
-def _jitter(count: int) -> Array:
-    """Sideways places for some points: evenly spread, in an order that does not follow the seeds."""
-    return np.asarray((np.arange(count) * 0.618034 % 1.0 - 0.5) * 0.4, np.float64)
 
 
 def logarithmic(axes: "Axes") -> None:

@@ -29,10 +29,14 @@ COVERAGE = (  # python -m reproduction coverage, its defaults
 )
 
 
-def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
-    """The sections that every study has; ``captions`` are those of its figures, by their names."""
+Pictures = Mapping[str, Sequence[Picture]]
+"""The figures of every environment."""
+
+
+def page(data: Data, pictures: Pictures) -> list[Block]:
+    """The sections that every study has."""
     return [
-        "# A study of goal selection", *what_was_run(data), *environments(data, captions),
+        "# A study of goal selection", *what_was_run(data), *environments(data, pictures),
         *over_all(data), *speed(data), "## Limits", "\n".join(f"* {text}" for text in limits(data)),
     ]  # fmt: skip
 
@@ -41,7 +45,7 @@ def write(
     folder: Path,
     out: Path,
     style: Style | None = None,
-    page: Callable[[Data, Mapping[str, str]], list[Block]] = page,
+    page: Callable[[Data, Pictures], list[Block]] = page,
     draw: Callable[[Data, str], Figures] = figures.of_environment,
 ) -> Path:
     """Write ``report.html``, ``report.md`` and ``figures/``.
@@ -57,10 +61,8 @@ def write(
     """
     data = Data.read(folder, style)
     (out / FIGURES).mkdir(parents=True, exist_ok=True)
-    captions: dict[str, str] = {}
-    for environment in data.environments:
-        captions |= figures.draw(draw(data, environment), out / FIGURES)
-    blocks = page(data, captions)
+    pictures = {name: figures.write(draw(data, name), out / FIGURES) for name in data.environments}
+    blocks = page(data, pictures)
     (out / "report.md").write_text(to_markdown(blocks, FIGURES))
     (out / "report.html").write_text(to_html(blocks, out / FIGURES))
     return out / "report.html"
@@ -104,7 +106,7 @@ def _weak_adversaries(data: Data) -> str:
     )
 
 
-def environments(data: Data, captions: Mapping[str, str]) -> list[Block]:
+def environments(data: Data, pictures: Pictures) -> list[Block]:
     """Of every environment a table for each evaluation, and its figures."""
     blocks: list[Block] = []
     for environment in data.environments:
@@ -112,8 +114,7 @@ def environments(data: Data, captions: Mapping[str, str]) -> list[Block]:
         for period in data.periods(environment):
             for goals in ("naive", "adversary", "oracle"):
                 blocks += _table(data, Where(environment, goals, period))
-        names = [name for name in captions if f"-{environment}-" in f"{name}-"]
-        blocks += [Picture(name, captions[name]) for name in names]
+        blocks += pictures[environment]
     return blocks
 
 
