@@ -97,10 +97,10 @@ def _boxes(axes: "Axes", style: Style, samples: Mapping[str, Array]) -> None:
             continue
         drawn = axes.boxplot(
             [values], positions=[i], widths=0.62, patch_artist=True, showfliers=False,
-            medianprops={"color": "white" if _is_dark(style.colour(name)) else "black", "linewidth": 1.8},
+            medianprops={"color": "white" if _is_dark(style.colours[name]) else "black", "linewidth": 1.8},
         )  # fmt: skip
         hatch = None if style.panel(name) == first else "//"
-        drawn["boxes"][0].set(facecolor=style.colour(name), alpha=0.85, hatch=hatch)
+        drawn["boxes"][0].set(facecolor=style.colours[name], alpha=0.85, hatch=hatch)
         place = i + 0.4 * (np.arange(len(values)) * 0.618034 % 1.0 - 0.5)  # spread, but not in the order of the seeds
         axes.plot(
             place, values, linestyle="", marker="o", markersize=3.2, color="white",
@@ -190,11 +190,11 @@ def _line(
 ) -> None:  # fmt: skip
     """A method's line with its band of that opacity, and a marker at ``every`` so many points."""
     axes.plot(
-        x, y, drawstyle=step and f"steps-{step}", color=style.colour(name), linewidth=1.6, label=name,
+        x, y, drawstyle=step and f"steps-{step}", color=style.colours[name], linewidth=1.6, label=name,
         marker=style.marker(name), markersize=4.5, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
     )  # fmt: skip
     if band is not None:
-        axes.fill_between(x, *band, step=step, color=style.colour(name), alpha=alpha, linewidth=0)
+        axes.fill_between(x, *band, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
 
 
 def _rolling(x: Array, window: int) -> Array:

@@ -19,18 +19,17 @@ from deimos.study.document import Block, Picture, to_html, to_markdown
 from deimos.study.figures import Figures, Style
 from deimos.study.stats import Array
 
+Pictures = Mapping[str, Sequence[Picture]]
+"""The figures of every environment."""
+
 FIGURES = "figures"
-_median = partial(np.median, axis=-1)
 COVERAGE = (  # python -m reproduction coverage, its defaults
     "The intervals of IQMs and medians are percentile bootstraps: they cover 93 to 94 % at n = 10, on normal and on "
     "lognormal data. Means have bootstrap-t intervals (94 % and 91 %); the percentile bootstrap would cover 90 % and "
     "81 %, BCa 90 % and 83 %. Intervals of ratios of spread cover more than 99 %: they are too wide, they only "
     "describe, and no difference is called on them. `python -m reproduction coverage` measures all of this again."
 )
-
-
-Pictures = Mapping[str, Sequence[Picture]]
-"""The figures of every environment."""
+_median = partial(np.median, axis=-1)
 
 
 def page(data: Data, pictures: Pictures) -> list[Block]:
@@ -48,7 +47,7 @@ def write(
     page: Callable[[Data, Pictures], list[Block]] = page,
     draw: Callable[[Data, str], Figures] = figures.of_environment,
 ) -> Path:
-    """Write ``report.html``, ``report.md`` and ``figures/``.
+    """Write ``report.html``, ``report.md`` and ``figures/``; returns the path of the HTML page.
 
     Args:
         folder: A study's folder, or one of exported tables.
@@ -57,7 +56,8 @@ def write(
         page: Makes the page.
         draw: Draws the figures of an environment.
 
-    Returns the path of the HTML page; raises ``RunError`` if there are no results, or they cannot be read.
+    Raises:
+        RunError: If there are no results, or they cannot be read.
     """
     data = Data.read(folder, style)
     (out / FIGURES).mkdir(parents=True, exist_ok=True)
@@ -140,14 +140,9 @@ def _table(data: Data, where: Where) -> list[Block]:
             "crashes per interaction": f"{np.median(rate):.4f}" if len(rate) else "-",
             "reward: IQM": _boot(reward, stats.iqm, ".4f"), "score: IQM": _boot(score, stats.iqm, ".3f"),
             f"P(more crashes than {data.style.reference})": more,
-            **{_part_name(part): _boot(data.sample(where, name, part), stats.iqm) for part in parts},
+            **{f"{what}: IQM": _boot(data.sample(where, name, part), stats.iqm) for part, what in parts.items()},
         })  # fmt: skip
     return [f"### {where}", rows] if rows else []
-
-
-def _part_name(part: str) -> str:
-    column, _, name = part.partition(":")
-    return f"tracking of goal group {name}: IQM" if column == "tracking" else f"{name}, median over goals: IQM"
 
 
 def _boot(x: Array, statistic: stats.Statistic, form: str = ".3g") -> str:
