@@ -52,7 +52,7 @@ def dose_response(data: Data, environment: str, period: int) -> "Figure | None":
                 low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
                 panel.errorbar(
                     ACHIEVED[name], middle, [[middle - low], [high - middle]], color="black",
-                    marker=data.style.marker(name), markerfacecolor=data.style.colour(name), markersize=8,
+                    marker=data.style.marker(name), markerfacecolor=data.style.colours[name], markersize=8,
                     capsize=3, linewidth=1,
                 )  # fmt: skip
         _parabola(panel, {n: x for n, x in samples.items() if n in DIRECTOR_METHODS and len(x)})

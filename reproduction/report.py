@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from deimos.study import report
@@ -22,13 +22,13 @@ def write(folder: Path, out: Path) -> Path:
     return report.write(folder, out, STYLE, page, figures)
 
 
-def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
+def page(data: Data, pictures: report.Pictures) -> list[Block]:
     """The sections of every study, the claims after what was run, and their tests at the end."""
     tested = data.only(LEGGED_METHODS)
     outcomes = [claims.test(claim, tested) for claim in CLAIMS]
     return [
         "# A study of goal selection", *report.what_was_run(data), *_verdicts(outcomes),
-        *report.environments(data, captions), *report.over_all(data),
+        *report.environments(data, pictures), *report.over_all(data),
         *_speed(data), *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip

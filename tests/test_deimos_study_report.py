@@ -151,7 +151,7 @@ def test_tracking_and_errors_stand_beside_the_crashes(folder):
 def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):
     """The bootstrap is seeded: another call writes the same Markdown."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
-    monkeypatch.setattr(figures, "draw", lambda figures, out: {})
+    monkeypatch.setattr(figures, "write", lambda figures, out: [])
     thesis.write(folder, tmp_path)
     text = re.sub(r"!\[.*\n\n", "", (folder / "report.md").read_text())
     assert (tmp_path / "report.md").read_text() == text
@@ -184,9 +184,9 @@ def test_text_is_escaped():
 def test_methods_have_their_own_colours():
     """No two of the thesis's methods share a colour or a marker, nor are two colours close to each other."""
     names = [*METHODS, "p10", "p50", "p90", "rnd", "cl", "vds+p75", "learnability"]
-    assert len({STYLE.colour(name) for name in names}) == len(names)
+    assert len({STYLE.colours[name] for name in names}) == len(names)
     assert len({STYLE.marker(name) for name in names}) == len(names)
-    codes = np.array([[int(STYLE.colour(name)[i : i + 2], 16) for i in (1, 3, 5)] for name in names])
+    codes = np.array([[int(STYLE.colours[name][i : i + 2], 16) for i in (1, 3, 5)] for name in names])
     apart = np.abs(codes[:, None] - codes[None]).sum(axis=2) + 1000 * np.eye(len(names))
     assert apart.min() > 40
 
@@ -194,11 +194,11 @@ def test_methods_have_their_own_colours():
 def test_methods_without_a_style_are_told_apart():
     """Methods that nobody gave a colour have one each; those that have one keep it, and it is not given again."""
     style = Style(colours={"mine": "#0072B2"}).complete(["a", "b", "mine", "c"])
-    assert style.colour("mine") == "#0072B2"
-    assert len({style.colour(name) for name in ("a", "b", "c", "mine")}) == 4
+    assert style.colours["mine"] == "#0072B2"
+    assert len({style.colours[name] for name in ("a", "b", "c", "mine")}) == 4
     assert len({style.marker(name) for name in ("a", "b", "c", "mine")}) == 4
     many = Style().complete([f"method {i}" for i in range(40)])
-    assert many.colour("method 39").startswith("#")
+    assert many.colours["method 39"].startswith("#")
 
 
 def test_order_is_the_callers_and_then_by_name(folder):
@@ -229,10 +229,9 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
     """A page of the caller's own is what is written, figures that it names included."""
     monkeypatch.setattr(stats, "RESAMPLES", 200)
 
-    def page(data, captions):
-        assert list(captions) == ["own-directional", "own-quad"]
-        pictures = [document.Picture(name, caption) for name, caption in captions.items()]
-        return ["# Mine", *pictures]
+    def page(data, pictures):
+        assert [each.name for own in pictures.values() for each in own] == ["own-directional", "own-quad"]
+        return ["# Mine", *pictures["directional"], *pictures["quad"]]
 
     def draw(data, environment):
         return {f"own-{environment}": ("A caption.", figures.boxes(data, environment, 100))}

@@ -269,7 +269,7 @@ def test_worker_without_results_has_failed(whole, tmp_path, monkeypatch):
     begun = []
 
     def idle(*arguments, **options):
-        begun.append(popen([sys.executable, "-c", ""]))
+        begun.append(popen([sys.executable, "-c", ""], stdin=subprocess.PIPE, bufsize=0))
         return begun[-1]
 
     popen = subprocess.Popen

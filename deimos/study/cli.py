@@ -111,12 +111,12 @@ def parse_seeds(text: str) -> list[int]:
         return list(range(int(text)))
     seeds: list[int] = []
     for part in text.split(","):
-        if not (found := re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())):
-            raise RunError(f"seeds must be a number of seeds, a range like 10-19 or a list like 0,3,5, got '{text}'.")
-        first, last = int(found[1]), int(found[2] or found[1])
-        if last < first:
-            raise RunError(f"seeds must be a range that rises, got '{text}'.")
-        seeds += range(first, last + 1)
+        found = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
+        span = range(int(found[1]), int(found[2] or found[1]) + 1) if found else ()
+        if not span:
+            example = "a number of seeds, a range that rises like 10-19 or a list like 0,3,5"
+            raise RunError(f"seeds must be {example}, got '{text}'.")
+        seeds += span
     return seeds
 
 

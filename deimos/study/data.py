@@ -28,7 +28,7 @@ class Style:
     everywhere: str = ""
     """A method whose training curve is in every panel, to compare with; empty for none."""
     colours: Mapping[str, str] = field(default_factory=dict)
-    """Hexadecimal colours of methods; others have one of Okabe and Ito's or the like."""
+    """Hexadecimal colours of methods, the same in every figure; others get one of Okabe and Ito's or the like."""
     reference: str = "uniform"
     """The method that tables compare the others with."""
 
@@ -37,10 +37,6 @@ class Style:
         free = cycle([colour for colour in _COLOURS if colour not in self.colours.values()] or _COLOURS)
         added = {name: next(free) for name in methods if name not in self.colours}
         return replace(self, colours={**self.colours, **added})
-
-    def colour(self, method: str) -> str:
-        """The colour of a method, the same in every figure."""
-        return self.colours[method]
 
     def marker(self, method: str) -> str:
         """The marker of a method, the same in every figure."""
@@ -133,15 +129,16 @@ class Data:
         values = np.array([_metric(rows[seed], metric) for seed in chosen], float)
         return values[~np.isnan(values)]
 
-    def parts(self, where: Where) -> list[str]:
-        """The metrics ``tracking:...`` and ``errors:...`` that an evaluation has."""
+    def parts(self, where: Where) -> dict[str, str]:
+        """The metrics ``tracking:...`` and ``errors:...`` that an evaluation has, with what they are."""
         rows = [row for (place, _), seeds in self._samples.items() if place == where for row in seeds.values()]
         groups = max((len(row["tracking"]) for row in rows), default=0)
         errors = sorted({name for row in rows for name in row["errors"]})
-        return [f"tracking:{i}" for i in range(groups)] + [f"errors:{name}" for name in errors]
+        tracking = {f"tracking:{i}": f"tracking of goal group {i}" for i in range(groups)}
+        return tracking | {f"errors:{name}": f"{name}, median over goals" for name in errors}
 
     def curves(self, environment: str, method: str, column: str = "crashes_per_1000") -> list[Array]:
-        """A column of the training curves of a method, seed by seed, each of shape (stretches,); see ``results``."""
+        """A column of the training curves of a method, see ``CURVE_COLUMNS``, seed by seed, each of shape (k,)."""
         found = [row for row in self._results.curves if (row["environment"], row["method"]) == (environment, method)]
         return [np.array(row[column]) for row in sorted(found, key=lambda row: row["seed"])]
 

@@ -37,42 +37,38 @@ class LocalProcesses:
     def __init__(self, study: StudyFolder) -> None:
         self._study = study
         self._lock = threading.Lock()
-        self._running: dict[subprocess.Popen, int] = {}  # processes, with the pipe that each listens to
+        self._running: set[subprocess.Popen] = set()  # each listens to its standard input
         self._stopping = False
 
     def run(self, cell: Cell) -> str | None:
         """See ``Engine.run``."""
-        with self._lock:
+        path = self._study.cell_path(cell) / "log.txt"
+        with self._lock, path.open("ab") as log:
             if self._stopping:
                 return None
-            listening, pipe = os.pipe()
-            process = self._start(cell, listening)
-            os.close(listening)
-            self._running[process] = pipe
-        code = process.wait()
-        with self._lock:
-            os.close(self._running.pop(process))
-        if (code == 0 and self._study.finished([cell])) or (code == STOPPED and self._stopping):
-            return None
-        return last_words(code, self._study.cell_path(cell) / "log.txt")
-
-    def _start(self, cell: Cell, listening: int) -> subprocess.Popen:
-        command = [sys.executable, "-m", "deimos.study.cell", str(self._study.path), cell.name]
-        threads = str(cell.config.threads or 1)
-        with (self._study.cell_path(cell) / "log.txt").open("ab") as log:
-            return subprocess.Popen(
-                command, stdin=listening, stdout=log, stderr=log,
+            threads = str(cell.config.threads or 1)
+            process = subprocess.Popen(
+                [sys.executable, "-m", "deimos.study.cell", str(self._study.path), cell.name],
+                stdin=subprocess.PIPE, stdout=log, stderr=log, bufsize=0,
                 env=os.environ | {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads},
                 start_new_session=True,  # Ctrl-C reaches the runner alone, which passes it on once
             )  # fmt: skip
+            self._running.add(process)
+        code = process.wait()
+        with self._lock:
+            self._running.remove(process)
+            process.stdin.close()
+        if (code == 0 and self._study.finished([cell])) or (code == STOPPED and self._stopping):
+            return None
+        return last_words(code, path)
 
     def stop(self) -> None:
         """See ``Engine.stop``."""
         with self._lock:
             self._stopping = True
-            for pipe in self._running.values():
+            for process in self._running:
                 with contextlib.suppress(BrokenPipeError):  # it has just ended
-                    os.write(pipe, b".")
+                    process.stdin.write(b".")
 
     def kill(self) -> None:
         """See ``Engine.kill``."""
@@ -83,12 +79,7 @@ class LocalProcesses:
 
 
 def last_words(code: int, log: Path) -> str:
-    """One line that says how a worker died.
-
-    Args:
-        code: Its exit code; negative is the number of a signal.
-        log: What it wrote.
-    """
+    """One line that says how a worker died, by its exit code (negative for a signal) and what it wrote."""
     if code < 0:
         name = signal.Signals(-code).name
         return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")

@@ -11,6 +11,7 @@ import numpy as np
 
 from deimos.study import stats
 from deimos.study.data import Data, Style, Where
+from deimos.study.document import Picture
 from deimos.study.stats import Array
 
 if TYPE_CHECKING:
@@ -48,18 +49,18 @@ def of_environment(data: Data, environment: str) -> Figures:
     return figures
 
 
-def draw(figures: Figures, folder: Path) -> dict[str, str]:
-    """Write figures, each as PNG and SVG; returns captions of those that there are data for, by their names."""
+def write(figures: Figures, folder: Path) -> list[Picture]:
+    """Write figures, each as PNG and SVG, and return those that there are data for as blocks of a page."""
     import matplotlib
 
-    captions = {}
+    pictures = []
     for name, (caption, figure) in figures.items():
         if figure is not None:
             figure.savefig(folder / f"{name}.png", dpi=DPI)
             with matplotlib.rc_context({"svg.hashsalt": name}):  # the same file from the same data
                 figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-            captions[name] = caption
-    return captions
+            pictures.append(Picture(name, caption))
+    return pictures
 
 
 def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) -> "tuple[Figure, Any]":
@@ -96,20 +97,16 @@ def _boxes(axes: "Axes", style: Style, samples: Mapping[str, Array]) -> None:
             continue
         drawn = axes.boxplot(
             [values], positions=[i], widths=0.62, patch_artist=True, showfliers=False,
-            medianprops={"color": "white" if _is_dark(style.colour(name)) else "black", "linewidth": 1.8},
+            medianprops={"color": "white" if _is_dark(style.colours[name]) else "black", "linewidth": 1.8},
         )  # fmt: skip
         hatch = None if style.panel(name) == first else "//"
-        drawn["boxes"][0].set(facecolor=style.colour(name), alpha=0.85, hatch=hatch)
+        drawn["boxes"][0].set(facecolor=style.colours[name], alpha=0.85, hatch=hatch)
+        place = i + 0.4 * (np.arange(len(values)) * 0.618034 % 1.0 - 0.5)  # spread, but not in the order of the seeds
         axes.plot(
-            i + _jitter(len(values)), values, linestyle="", marker="o", markersize=3.2, color="white",
+            place, values, linestyle="", marker="o", markersize=3.2, color="white",
             markeredgecolor="black", markeredgewidth=0.6, zorder=3,
         )  # fmt: skip
     axes.grid(axis="y", alpha=0.3)
-
-
-def _jitter(count: int) -> Array:
-    """Sideways places for some points: evenly spread, in an order that does not follow the seeds."""
-    return np.asarray((np.arange(count) * 0.618034 % 1.0 - 0.5) * 0.4, np.float64)
 
 
 def logarithmic(axes: "Axes") -> None:
@@ -193,11 +190,11 @@ def _line(
 ) -> None:  # fmt: skip
     """A method's line with its band of that opacity, and a marker at ``every`` so many points."""
     axes.plot(
-        x, y, drawstyle=step and f"steps-{step}", color=style.colour(name), linewidth=1.6, label=name,
+        x, y, drawstyle=step and f"steps-{step}", color=style.colours[name], linewidth=1.6, label=name,
         marker=style.marker(name), markersize=4.5, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
     )  # fmt: skip
     if band is not None:
-        axes.fill_between(x, *band, step=step, color=style.colour(name), alpha=alpha, linewidth=0)
+        axes.fill_between(x, *band, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
 
 
 def _rolling(x: Array, window: int) -> Array:

@@ -19,20 +19,23 @@ from deimos.study.document import Block, Picture, to_html, to_markdown
 from deimos.study.figures import Figures, Style
 from deimos.study.stats import Array
 
+Pictures = Mapping[str, Sequence[Picture]]
+"""The figures of every environment."""
+
 FIGURES = "figures"
-_median = partial(np.median, axis=-1)
 COVERAGE = (  # python -m reproduction coverage, its defaults
     "The intervals of IQMs and medians are percentile bootstraps: they cover 93 to 94 % at n = 10, on normal and on "
     "lognormal data. Means have bootstrap-t intervals (94 % and 91 %); the percentile bootstrap would cover 90 % and "
     "81 %, BCa 90 % and 83 %. Intervals of ratios of spread cover more than 99 %: they are too wide, they only "
     "describe, and no difference is called on them. `python -m reproduction coverage` measures all of this again."
 )
+_median = partial(np.median, axis=-1)
 
 
-def page(data: Data, captions: Mapping[str, str]) -> list[Block]:
-    """The sections that every study has; ``captions`` are those of its figures, by their names."""
+def page(data: Data, pictures: Pictures) -> list[Block]:
+    """The sections that every study has."""
     return [
-        "# A study of goal selection", *what_was_run(data), *environments(data, captions),
+        "# A study of goal selection", *what_was_run(data), *environments(data, pictures),
         *over_all(data), *speed(data), "## Limits", "\n".join(f"* {text}" for text in limits(data)),
     ]  # fmt: skip
 
@@ -41,10 +44,10 @@ def write(
     folder: Path,
     out: Path,
     style: Style | None = None,
-    page: Callable[[Data, Mapping[str, str]], list[Block]] = page,
+    page: Callable[[Data, Pictures], list[Block]] = page,
     draw: Callable[[Data, str], Figures] = figures.of_environment,
 ) -> Path:
-    """Write ``report.html``, ``report.md`` and ``figures/``.
+    """Write ``report.html``, ``report.md`` and ``figures/``; returns the path of the HTML page.
 
     Args:
         folder: A study's folder, or one of exported tables.
@@ -53,14 +56,13 @@ def write(
         page: Makes the page.
         draw: Draws the figures of an environment.
 
-    Returns the path of the HTML page; raises ``RunError`` if there are no results, or they cannot be read.
+    Raises:
+        RunError: If there are no results, or they cannot be read.
     """
     data = Data.read(folder, style)
     (out / FIGURES).mkdir(parents=True, exist_ok=True)
-    captions: dict[str, str] = {}
-    for environment in data.environments:
-        captions |= figures.draw(draw(data, environment), out / FIGURES)
-    blocks = page(data, captions)
+    pictures = {name: figures.write(draw(data, name), out / FIGURES) for name in data.environments}
+    blocks = page(data, pictures)
     (out / "report.md").write_text(to_markdown(blocks, FIGURES))
     (out / "report.html").write_text(to_html(blocks, out / FIGURES))
     return out / "report.html"
@@ -104,7 +106,7 @@ def _weak_adversaries(data: Data) -> str:
     )
 
 
-def environments(data: Data, captions: Mapping[str, str]) -> list[Block]:
+def environments(data: Data, pictures: Pictures) -> list[Block]:
     """Of every environment a table for each evaluation, and its figures."""
     blocks: list[Block] = []
     for environment in data.environments:
@@ -112,8 +114,7 @@ def environments(data: Data, captions: Mapping[str, str]) -> list[Block]:
         for period in data.periods(environment):
             for goals in ("naive", "adversary", "oracle"):
                 blocks += _table(data, Where(environment, goals, period))
-        names = [name for name in captions if f"-{environment}-" in f"{name}-"]
-        blocks += [Picture(name, captions[name]) for name in names]
+        blocks += pictures[environment]
     return blocks
 
 
@@ -139,14 +140,9 @@ def _table(data: Data, where: Where) -> list[Block]:
             "crashes per interaction": f"{np.median(rate):.4f}" if len(rate) else "-",
             "reward: IQM": _boot(reward, stats.iqm, ".4f"), "score: IQM": _boot(score, stats.iqm, ".3f"),
             f"P(more crashes than {data.style.reference})": more,
-            **{_part_name(part): _boot(data.sample(where, name, part), stats.iqm) for part in parts},
+            **{f"{what}: IQM": _boot(data.sample(where, name, part), stats.iqm) for part, what in parts.items()},
         })  # fmt: skip
     return [f"### {where}", rows] if rows else []
-
-
-def _part_name(part: str) -> str:
-    column, _, name = part.partition(":")
-    return f"tracking of goal group {name}: IQM" if column == "tracking" else f"{name}, median over goals: IQM"
 
 
 def _boot(x: Array, statistic: stats.Statistic, form: str = ".3g") -> str:

@@ -1,6 +1,7 @@
 """Statistics of populations of runs. The unit is one trained policy; robots and episodes are no replicates.
 
-Samples are float arrays, one value per policy. Every interval is two-sided; every bootstrap is seeded.
+Samples are float arrays of shape (n,), one value per policy, n at least 2, without NaN; ``ValueError`` otherwise. Every
+interval is two-sided, at ``LEVEL``; every bootstrap draws ``resamples`` (``None``: ``RESAMPLES``) by its ``seed``.
 """
 
 import math
@@ -58,11 +59,7 @@ def iqr(x: Array) -> Array:
 def cvar(x: Array, share: float = 0.2) -> Array:
     """Mean of the highest ``share`` of the values along the last axis; the boundary value counts by its fraction [1]_.
 
-    As an estimate of a population's tail it is too low in small samples.
-
-    Args:
-        x: Values, shape (..., n); higher is worse.
-        share: Share of the values that counts, in (0, 1].
+    As an estimate of a population's tail, ``share`` in (0, 1] of it, it is too low in small samples.
 
     References:
         .. [1] Rockafellar and Uryasev, *Conditional value-at-risk for general loss distributions*,
@@ -77,16 +74,9 @@ def cvar(x: Array, share: float = 0.2) -> Array:
 def distribution(
     samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0
 ) -> Array:
-    """A statistic of resamples that are drawn from every sample with replacement (the stratified bootstrap).
+    """A statistic of resamples that are drawn from every sample with replacement, shape (resamples,).
 
-    Args:
-        samples: One array per stratum (method or task).
-        statistic: Vectorised over leading axes.
-        resamples: Number of bootstrap resamples; ``None`` for ``RESAMPLES``.
-        seed: Of the resampling.
-
-    Returns:
-        Shape (resamples,).
+    This is the stratified bootstrap, with one sample per stratum (method or task).
     """
     with np.errstate(invalid="ignore"):  # scipy's own interval, which is not used, where a value is infinite
         return stats.bootstrap(
@@ -98,7 +88,7 @@ def distribution(
 def bootstrap(
     samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
-    """Percentile interval of a statistic by the stratified bootstrap; arguments as those of ``distribution``."""
+    """Percentile interval of a statistic by the stratified bootstrap; see ``distribution``."""
     values = distribution(samples, statistic, resamples=resamples, seed=seed)
     return Interval(float(statistic(*map(_checked, samples))), *_ends(values))
 
@@ -126,12 +116,7 @@ def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Int
 def probability_of_improvement(
     pairs: Sequence[tuple[Array, Array]], *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
-    """P(X > Y), ties counting half, averaged over tasks: U / (n m) of Mann and Whitney [1]_.
-
-    Args:
-        pairs: X and Y of every task.
-        resamples: Number of bootstrap resamples of all samples; ``None`` for ``RESAMPLES``.
-        seed: Of the resampling.
+    """P(X > Y), ties counting half, averaged over tasks, of which each has a pair: U / (n m) of Mann and Whitney [1]_.
 
     References:
         .. [1] Agarwal et al., arXiv:2108.13264, section 4.3.
@@ -152,14 +137,7 @@ def performance_profile(
 ) -> tuple[Array, Array, Array]:
     """Share of runs above each threshold, averaged over tasks, with its pointwise band [1]_.
 
-    Args:
-        samples: One array per task.
-        thresholds: Shape (k,).
-        resamples: Number of bootstrap resamples; ``None`` for ``RESAMPLES``.
-        seed: Of the resampling.
-
-    Returns:
-        Share, lower and upper end, each of shape (k,).
+    Thresholds, share, lower and upper end have shape (k,); there is a sample for each task.
 
     References:
         .. [1] Agarwal et al., arXiv:2108.13264, section 4.2.
