@@ -20,8 +20,7 @@ class Engine(Protocol):
     def run(self, cell: Cell) -> str | None:
         """Work on a cell, from wherever it stands, until it is finished, was stopped or has failed.
 
-        Returns:
-            ``None``, or in one line how the work has failed.
+        Returns ``None``, or in one line how the work has failed; a cell that has no result then has failed too.
         """
 
     def stop(self) -> None:
@@ -58,9 +57,7 @@ class LocalProcesses:
         with self._lock:
             self._running.remove(process)
             process.stdin.close()
-        if (code == 0 and self._study.finished([cell])) or (code == STOPPED and self._stopping):
-            return None
-        return last_words(code, path)
+        return None if code in (0, STOPPED) else last_words(code, path)
 
     def stop(self) -> None:
         """See ``Engine.stop``."""
@@ -83,5 +80,5 @@ def last_words(code: int, log: Path) -> str:
     if code < 0:
         name = signal.Signals(-code).name
         return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1] if code not in (0, STOPPED) and lines else f"exit code {code} without results"
+    said = log.read_text(errors="replace").strip()
+    return said.splitlines()[-1].strip() if said else f"exit code {code} without results"

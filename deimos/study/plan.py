@@ -195,7 +195,7 @@ def _training_preset(table: dict) -> dict:
 
 
 def _seeds(given: Any) -> list[int]:
-    if isinstance(given, int) and not isinstance(given, bool) and given >= 1:
+    if type(given) is int and given >= 1:
         return list(range(given))
     if not isinstance(given, list) or not given or not all(type(seed) is int for seed in given):
         raise RunError(f"seeds must be a number of seeds or a list of them, got {given!r}.")

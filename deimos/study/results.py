@@ -43,8 +43,6 @@ MEANS = ("reward", "crashes_per_1000", "selected_fraction")
 """Columns of ``progress.csv`` that a training curve has means of."""
 CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS), tuple)
 TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
-TIMED = ("fps",)
-"""Columns that two runs of the same cell may differ in."""
 FORMER_NAMES = {"selected_share": "selected_fraction"}
 """Columns of version 0.1.0 that have another name today."""
 
