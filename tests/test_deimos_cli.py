@@ -109,7 +109,7 @@ OTHER_ERRORS = {
     "evaluate there": "there is not a run folder: it holds no config.json",
     "bench": "There is no command 'bench'",
     "study walk": "There is no command 'study walk'; there are: run, show, merge, export, report",
-    "terrain walk": "There is no command 'terrain walk'; there are: shape, grid",
+    "terrain walk": "There is no command 'terrain walk'; there are: list, shape, grid",
 }
 
 

@@ -52,6 +52,21 @@ def test_every_shape_and_preset_is_named(capsys):
         assert name in said
 
 
+def test_list_names_everything(capsys):
+    """Every shape, every parameter with its default, and every preset is listed."""
+    assert run("list") == 0
+    said = capsys.readouterr().out
+    lines = said.splitlines()
+    for name in catalog.names():
+        shown = lines[next(i for i, line in enumerate(lines) if line.startswith(f"{name}: ")) + 1]
+        words = [word for word in shown.split() if word.startswith("--")]
+        assert words == [f"--{key}" for key in catalog.make(name).parameters()]
+    low, high = catalog.make("stairs-up").height
+    assert f"--height {low:g} {high:g} " in said
+    for name in presets.preset_names():
+        assert f"preset {name}: " in said
+
+
 @pytest.mark.parametrize("name", catalog.names())
 def test_every_parameter_is_explained(capsys, name):
     """The help of a shape shows its parameters with their defaults; its direction is in its name."""
@@ -200,7 +215,7 @@ def test_force_overwrites_and_nothing_else_does(folder, capsys):
         ("grid --file here.npz", "here.npz: "),
         ("grid --file a.toml --preset go1", "file excludes preset and shapes"),
         ("grid --shapes flat --preset go1", "shapes excludes preset"),
-        ("shapes", "There is no command 'terrain shapes'; there are: shape, grid"),
+        ("shapes", "There is no command 'terrain shapes'; there are: list, shape, grid"),
     ],
 )
 def test_mistakes_give_one_line(folder, capsys, arguments, message):

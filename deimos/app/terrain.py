@@ -99,6 +99,7 @@ class GridOptions(Outputs):
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos terrain``."""
     commands = {
+        "list": ("show the shapes with their parameters, and the presets", show_list),
         "shape": ("build one tile: deimos terrain shape stairs-up --out stairs.stl --preview stairs.png", build_shape),
         "grid": ("build a grid of tiles, from a preset, a TOML file or a list of shapes", build_grid),
     }
@@ -109,6 +110,28 @@ def main(arguments: list[str], program: str) -> None:
         raise RunError(str(error)) from error
     except MemoryError as error:
         raise RunError("There is not enough memory; enlarge cell, or ask for fewer levels or columns.") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class ListOptions:
+    """Show the shapes with their parameters, and the presets; ``deimos terrain shape NAME --help`` explains them."""
+
+
+def show_list(arguments: list[str], program: str) -> None:
+    """Print every shape with its parameters and their defaults, and the presets."""
+    console.parse(ListOptions, arguments, program)
+    for name in catalog.names():
+        shape = catalog.make(name)
+        print(f"{name}: {_about(shape)}")
+        print("   ", *[f"--{key} {_spelled(getattr(shape, key))}" for key in shape.parameters()])
+    for name in presets.preset_names():
+        grid = presets.preset(name)
+        parts = ", ".join(f"{part.share:g} {catalog.name_of(part.shape)}" for part in grid.shapes)
+        print(f"preset {name}: {grid.levels} x {grid.columns} tiles; {parts}")
+
+
+def _spelled(value: Any) -> str:
+    return " ".join(f"{number:g}" for number in value) if isinstance(value, tuple) else f"{value:g}"
 
 
 def build_shape(arguments: list[str], program: str) -> None:
