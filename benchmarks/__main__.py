@@ -12,9 +12,9 @@ import warp as wp
 
 from benchmarks import commits, director, particle, quad, terrain, training
 from benchmarks.timing import wide_console
-from deimos.checks import check_at_least
-from deimos.run.folder import RunError
-from deimos.run.training import TrainConfig, cores, provenance, resolve_device
+from deimos.checks import RunError, check_at_least
+from deimos.run.trainer import TrainConfig
+from deimos.run.training import cores, provenance, resolve_device
 from deimos.sim.envs.particle import Config
 from deimos.sim.shared import one_stream
 from reproduction.thesis import TABLE_4_1

@@ -16,7 +16,7 @@ from benchmarks.timing import in_turn, ratio, wide_console
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import vds
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 
 METHODS_TIMED: dict[str, SelectorConfig] = {
     name: method(name) for name in ("uniform", "p25", "rnd", "learnability", "plr", "grid", "vds", "vds-auxiliary")

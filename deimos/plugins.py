@@ -34,3 +34,10 @@ def load(package: ModuleType, name: str) -> ModuleType:
     if name in _own(package):
         return importlib.import_module(f"{package.__name__}.{name}")
     return next(iter(entry_points(group=_group(package), name=name))).load()
+
+
+def name_of(package: ModuleType, module: str) -> str | None:
+    """Name of the plugin of ``package`` that a module is, by its full name; ``None`` if it is none. Imports nothing."""
+    own = {f"{package.__name__}.{name}": name for name in _own(package)}
+    foreign = {entry.module: entry.name for entry in entry_points(group=_group(package))}
+    return (foreign | own).get(module)

@@ -8,8 +8,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from deimos.checks import check_at_least
-from deimos.run.folder import RunError
+from deimos.checks import RunError, check_at_least
 from deimos.study.cli import ReportOptions
 from reproduction import coverage
 from reproduction.report import write

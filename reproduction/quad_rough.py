@@ -17,8 +17,8 @@ from typing import cast
 
 import numpy as np
 
+from deimos.checks import RunError
 from deimos.run import training
-from deimos.run.folder import RunError
 from deimos.run.presets import preset
 from deimos.sim.legged.config import LocomotionConfig
 

@@ -14,7 +14,7 @@ from deimos.checks import RunError
 from deimos.goals.methods import method
 from deimos.goals.selectors import rnd, vds
 from deimos.learn.ppo import PPOConfig
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs.particle import Config
 
 CPU = torch.device("cpu")

@@ -22,7 +22,7 @@ from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.config import from_dict
 from deimos.run.folder import RunFolder
-from deimos.run.training import TrainConfig
+from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import particle
 
 HOME = Path(deimos.__file__).resolve().parent.parent

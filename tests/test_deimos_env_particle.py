@@ -10,12 +10,11 @@ import torch
 from deimos.kernels.episodes import RESUMED
 from deimos.kernels.particle import PARTICLES
 
-from deimos.checks import SimulationError
+from deimos.checks import RunError, SimulationError
 from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
-from deimos.run.folder import RunError
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.env import Step
 from deimos.sim.envs.particle import HALF_SIDE, Config
 

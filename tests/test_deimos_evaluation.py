@@ -6,17 +6,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from deimos.checks import SimulationError
+from deimos.checks import RunError, SimulationError
 from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Resolved
 from deimos.goals.selectors import uniform
 from deimos.nn.networks import mlp
 from deimos.run.audit import CANDIDATES, _next_contexts, audit_fear
 from deimos.run.evaluation import EvalConfig, _Collector, _quality, evaluate, play, train_adversary, weights_hash
-from deimos.run.folder import RunError
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")

@@ -2,9 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.stats import binomtest
 
 from deimos.app import figures
 from deimos.run.folder import RunFolder
@@ -37,3 +39,13 @@ def test_summary_is_drawn(tmp_path, rows):
     path = figures.draw_summary(RunFolder(tmp_path), "title", rows)
     with Image.open(path) as image:
         assert len(image.convert("RGB").getcolors(2**24)) > 10
+
+
+def test_intervals_of_rates_are_wilsons():
+    """The interval of every proportion is SciPy's, at 0 and 1 too."""
+    count = np.array([1, 7, 50, 50, 1000])
+    share = np.array([1, 2, 0, 50, 333]) / count
+    low, high = figures.wilson(share, count)
+    for k, n, found in zip(share * count, count, zip(low, high, strict=True), strict=True):
+        expected = binomtest(round(k), n).proportion_ci(method="wilson")
+        np.testing.assert_allclose(found, (expected.low, expected.high), atol=1e-7)

@@ -3,15 +3,15 @@
 import pytest
 import torch
 
+from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.selectors import director
 from deimos.learn.ppo import PPOConfig
 from deimos.run.audit import audit_calibration, audit_fear
 from deimos.run.evaluation import EvalConfig, evaluate, play
-from deimos.run.folder import RunError
 from deimos.run.loop import GoalLoop
 from deimos.run.oracle import Clones, Oracle
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")

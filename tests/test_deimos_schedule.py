@@ -10,7 +10,7 @@ from deimos.goals.methods import method
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces
 from deimos.goals.selectors import director, mix, plr, schedule, uniform
 from deimos.learn.ppo import PPOConfig
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")

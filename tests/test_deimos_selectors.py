@@ -23,7 +23,7 @@ from deimos.learn.ppo import PPOConfig
 from deimos.learn.rollout import Rollout
 from deimos.nn import fusion
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
 
 CPU = torch.device("cpu")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from deimos.run.folder import RunError
+from deimos.checks import RunError
 from deimos.study import cli, plan
 from deimos.study.results import RESULT_COLUMNS, Results, identity
 

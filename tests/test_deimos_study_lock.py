@@ -9,13 +9,13 @@ import sys
 
 import pytest
 
-from deimos.run.folder import RunError
+from deimos.checks import RunError
 from deimos.study import lock
 
 TAKER = """
 import sys, time
 from pathlib import Path
-from deimos.run.folder import RunError
+from deimos.checks import RunError
 from deimos.study.lock import hold
 folder = Path(sys.argv[1])
 while not (folder / "go").exists():

@@ -6,10 +6,10 @@ import re
 
 import pytest
 
+from deimos.checks import RunError
 from deimos.goals.methods import METHODS
-from deimos.run.folder import RunError
 from deimos.run.presets import preset as training_preset
-from deimos.run.training import TrainConfig
+from deimos.run.trainer import TrainConfig
 from deimos.study import plan
 
 TOML = """

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deimos.run.folder import RunError
+from deimos.checks import RunError
 from deimos.study import document, figures, report, stats
 from deimos.study.data import Data, Style
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results

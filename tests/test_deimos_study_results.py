@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from deimos.run.folder import RunError
+from deimos.checks import RunError
 from deimos.study import results
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results, merge, read_table, write_table
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from deimos.run.folder import RunError, RunFolder
+from deimos.checks import RunError
+from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.engine import LocalProcesses, last_words

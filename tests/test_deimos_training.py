@@ -32,7 +32,7 @@ from deimos.run import presets, training
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
-from deimos.run.training import TrainConfig
+from deimos.run.trainer import TrainConfig
 from deimos.sim import envs
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle

@@ -13,7 +13,7 @@ from deimos.goals import selectors
 from deimos.goals.methods import METHODS
 from deimos.learn.ppo import PPOConfig
 from deimos.run.loop import spaces
-from deimos.run.training import TrainConfig, Trainer
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs import particle
 
 HOME = Path(__file__).parent.parent

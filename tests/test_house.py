@@ -17,8 +17,9 @@ from deimos.app import cli
 from deimos.goals import selectors
 from deimos.run import config
 from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig
 from deimos.sim import envs
-from deimos.sim.envs import quad
+from deimos.sim.envs import particle, quad
 from deimos.sim.legged import robots
 
 HOME = Path(deimos.__file__).resolve().parent.parent
@@ -58,6 +59,19 @@ class Longest(GoalSelector):
         best = score.argmax(dim=1)
         every = torch.arange(len(rows), device=rows.device)
         return Proposal(candidates[every, best], score[every, best])
+'''
+
+ENVIRONMENT = '''
+"""Particle Gym under another name."""
+
+from dataclasses import dataclass
+
+from deimos.sim.envs import particle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(particle.Config):
+    """See ``particle.Config``."""
 '''
 
 ROBOT = '''
@@ -442,6 +456,22 @@ def test_entry_point_is_a_selector(install, tmp_path, capsys):
     install("deimos.selectors", "furthest", SELECTOR)
     assert plugins.names(selectors) == sorted([*before, "furthest"])
     assert_selector_works(tmp_path, "furthest", capsys)
+
+
+def test_entry_point_with_a_hyphen_is_an_environment(install, tmp_path):
+    """An environment of another distribution trains under its own name, hyphens and all."""
+    install("deimos.envs", "my-particle", ENVIRONMENT)
+    path = tmp_path / "run"
+    assert cli.main(["train", "env:my-particle", *FLAGS, "--out", str(path)]) == 0
+    assert RunFolder(path).read_json("config.json")["config"]["env"]["kind"] == "my-particle"
+    assert cli.main(["train", "--resume", str(path), "--env-steps", "48"]) == 0
+
+
+def test_a_broken_plugin_stops_no_other(install):
+    """What a configuration is called is found without importing the plug-ins of others."""
+    install("deimos.envs", "broken", "raise ImportError('it needs what is not there')")
+    assert config.kind(particle.Config()) == "particle"
+    assert config.to_dict(TrainConfig())["env"]["kind"] == "particle"
 
 
 def test_entry_point_is_a_robot(install):

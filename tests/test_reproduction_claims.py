@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from deimos.run.folder import RunError
+from deimos.checks import RunError
 from deimos.study import stats
 from deimos.study.data import Data, Where
 from deimos.study.results import RESULT_COLUMNS, Results

@@ -47,6 +47,13 @@ def draw_summary(folder: RunFolder, title: str, evaluated: list[dict]) -> Path:
     return _save(figure, folder.path / "summary.png")
 
 
+def wilson(share: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the 95 % intervals of proportions, by Wilson's score (1927), each of the arguments' shape."""
+    z = 1.959964  # of the normal distribution, two-sided
+    middle, spread = share + z * z / (2 * count), z * np.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
+    return (middle - spread) / (1 + z * z / count), (middle + spread) / (1 + z * z / count)
+
+
 def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor]]") -> Path:
     """Draw ``calibration.png``: predicted against observed crash rates, with the predictions' histogram below.
 
@@ -58,16 +65,13 @@ def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor
         RunError: If it cannot be written.
     """
     from matplotlib.figure import Figure
-    from scipy.stats import binomtest
 
     figure = Figure(figsize=(6, 7), layout="constrained")
     curves, histogram = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)
     curves.plot([0, 1], [0, 1], color="grey", linewidth=0.8, linestyle=":")
     for (name, (probability, crashed)), colour, marker in zip(audited.items(), (ORANGE, BLUE), "so", strict=False):
         bins = reliability(probability, crashed)
-        crashes = (bins.observed * bins.count).round().long().tolist()
-        tests = [binomtest(k, n) for k, n in zip(crashes, bins.count.tolist(), strict=True)]
-        low, high = np.array([test.proportion_ci(method="wilson") for test in tests]).reshape(-1, 2).T
+        low, high = wilson(bins.observed.numpy(), bins.count.numpy())
         observed = bins.observed.numpy()
         curves.errorbar(
             bins.predicted.numpy(), observed, np.clip([observed - low, high - observed], 0.0, None), color=colour,

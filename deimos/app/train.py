@@ -140,10 +140,9 @@ def _subcommands(package: Any, *more: Any) -> Any:
 def _preset(name: str | None, arguments: list[str]) -> TrainConfig:
     """What the options start from: the preset of a name, or that of the environment."""
     env = next((argument.removeprefix("env:") for argument in arguments if argument.startswith("env:")), None)
-    env = env and env.replace("-", "_")  # the name of its module
     name = name or env or "particle"
     try:
-        if env is not None and presets.environment(name) != env:
+        if env is not None and presets.spelled(presets.environment(name)) != presets.spelled(env):
             raise RunError(f"The preset '{name}' is for env:{presets.environment(name)}, not for env:{env}.")
         return presets.preset(name)
     except ValueError as error:

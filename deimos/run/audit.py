@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from deimos.checks import RunError
 from deimos.goals.calibration import evaluate
 from deimos.goals.fear import auroc
 from deimos.goals.fear_selector import FearSelector, fear_selector
@@ -20,12 +21,11 @@ from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
 from deimos.nn import seeds
-from deimos.run.folder import RunError
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
 
 if TYPE_CHECKING:
-    from deimos.run.training import Trainer
+    from deimos.run.trainer import Trainer
 
 CANDIDATES = 50  # goals tried in every context
 BATCH = 256  # contexts cloned at a time

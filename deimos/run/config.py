@@ -39,10 +39,10 @@ def kind(config: EnvConfig | SelectorConfig) -> str:
         ValueError: If it belongs to none.
     """
     package = next(package for base, package in _PLUGINS.items() if isinstance(config, base))
-    for name in plugins.names(package):
-        if plugins.load(package, name).Config is type(config):
-            return name
-    raise ValueError(f"{type(config)} is not the Config of a plugin of {package.__name__}.")
+    name = plugins.name_of(package, type(config).__module__)  # without importing the others, one of which may be broken
+    if name is None or plugins.load(package, name).Config is not type(config):
+        raise ValueError(f"{type(config)} is not the Config of a plugin of {package.__name__}.")
+    return name
 
 
 def from_dict(cls: type, data: dict) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 
 from deimos import plugins
 from deimos.run.config import from_dict
-from deimos.run.training import TrainConfig
+from deimos.run.trainer import TrainConfig
 from deimos.sim import envs
 
 
@@ -19,8 +19,8 @@ def _all() -> dict[str, tuple[str, dict[str, Any]]]:
     found: dict[str, tuple[str, dict[str, Any]]] = {}
     for env in plugins.names(envs):
         module = plugins.load(envs, env)
-        own = {_spelled(env): {}} | getattr(module, "PRESETS", {})
-        found |= {_spelled(name): (env, fields) for name, fields in own.items()}
+        own = {spelled(env): {}} | getattr(module, "PRESETS", {})
+        found |= {spelled(name): (env, fields) for name, fields in own.items()}
     return found
 
 
@@ -51,10 +51,11 @@ def preset(name: str) -> TrainConfig:
 
 def _get(name: str) -> tuple[str, dict[str, Any]]:
     found = _all()
-    if _spelled(name) not in found:
+    if spelled(name) not in found:
         raise ValueError(f"There is no preset '{name}'; there are: {', '.join(sorted(found))}.")
-    return found[_spelled(name)]
+    return found[spelled(name)]
 
 
-def _spelled(name: str) -> str:
+def spelled(name: str) -> str:
+    """A name as it is listed: hyphens and underscores are the same."""
     return name.replace("_", "-")

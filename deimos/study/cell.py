@@ -13,11 +13,11 @@ from pathlib import Path
 
 import torch
 
-from deimos.checks import SimulationError
+from deimos.checks import RunError, SimulationError
 from deimos.learn.policy import load_policy
 from deimos.run import training
 from deimos.run.evaluation import evaluate, weights_hash
-from deimos.run.folder import RunError, RunFolder
+from deimos.run.folder import RunFolder
 from deimos.sim.shared import one_stream
 from deimos.study.folder import StudyFolder
 from deimos.study.lock import hold

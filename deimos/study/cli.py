@@ -15,8 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from deimos.checks import check_at_least
-from deimos.run.folder import RunError
+from deimos.checks import RunError, check_at_least
 from deimos.study import plan
 from deimos.study.engine import LocalProcesses
 from deimos.study.folder import StudyFolder

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from deimos.run.folder import RunError, RunFolder
+from deimos.checks import RunError
+from deimos.run.folder import RunFolder
 from deimos.study.lock import hold
 from deimos.study.plan import Cell, read_cell
 from deimos.study.results import Results

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from deimos.run.folder import RunError
+from deimos.checks import RunError
 
 POLL_SECONDS = 0.1
 

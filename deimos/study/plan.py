@@ -11,12 +11,12 @@ from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
+from deimos.checks import RunError
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets
 from deimos.run.config import from_dict, to_dict
-from deimos.run.folder import RunError
-from deimos.run.training import TrainConfig
+from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
 
 SCHEMA = 1  # of cell.json

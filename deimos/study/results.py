@@ -15,8 +15,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from deimos.checks import RunError
 from deimos.files import write_whole
-from deimos.run.folder import RunError, RunFolder
+from deimos.run.folder import RunFolder
 from deimos.study.plan import Cell
 
 SCHEMA = 1  # of result.json
