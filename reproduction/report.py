@@ -54,7 +54,7 @@ def _verdicts(outcomes: Sequence[Outcome]) -> list[Block]:
 def _speed(data: Data) -> list[Block]:
     """That of every study, beside the thesis's Table 4.1."""
     blocks = report.speed(data)
-    for row in blocks[-1] if blocks else []:
+    for row in (row for block in blocks if isinstance(block, list) for row in block):
         theirs = RATIOS_4_1.get(row["environment"], {}).get(row["method"])
         row["published ratio"] = "-" if theirs is None else f"{theirs:.2f}"
     return blocks

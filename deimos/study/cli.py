@@ -7,6 +7,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal
@@ -228,6 +229,5 @@ def _summary(progress: Progress) -> str:
         parts.append(f"{len(progress.failed)} failed")
     parts += [f"{name} {share:.0%}" if share < 1 else f"{name} evaluating" for name, share in progress.running.items()]
     if progress.seconds_left:
-        hours, rest = divmod(int(progress.seconds_left), 3600)
-        parts.append(f"{hours}:{rest // 60:02d}:{rest % 60:02d} left")
+        parts.append(f"{timedelta(seconds=int(progress.seconds_left))} left")
     return ", ".join(parts)

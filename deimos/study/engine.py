@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from deimos.study.cell import STOPPED
 from deimos.study.folder import StudyFolder
@@ -36,7 +36,7 @@ class LocalProcesses:
     def __init__(self, study: StudyFolder) -> None:
         self._study = study
         self._lock = threading.Lock()
-        self._running: set[subprocess.Popen] = set()  # each listens to its standard input
+        self._running: dict[subprocess.Popen, Any] = {}  # processes, with the standard input that each listens to
         self._stopping = False
 
     def run(self, cell: Cell) -> str | None:
@@ -52,20 +52,19 @@ class LocalProcesses:
                 env=os.environ | {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads},
                 start_new_session=True,  # Ctrl-C reaches the runner alone, which passes it on once
             )  # fmt: skip
-            self._running.add(process)
+            self._running[process] = process.stdin
         code = process.wait()
         with self._lock:
-            self._running.remove(process)
-            process.stdin.close()
+            self._running.pop(process).close()
         return None if code in (0, STOPPED) else last_words(code, path)
 
     def stop(self) -> None:
         """See ``Engine.stop``."""
         with self._lock:
             self._stopping = True
-            for process in self._running:
+            for pipe in self._running.values():
                 with contextlib.suppress(BrokenPipeError):  # it has just ended
-                    process.stdin.write(b".")
+                    pipe.write(b".")
 
     def kill(self) -> None:
         """See ``Engine.kill``."""

@@ -120,20 +120,20 @@ def training(data: Data, environment: str) -> "Figure":
     """Crashes and rewards during training, a column for each panel of methods."""
     found = [name for name in data.methods(environment) if data.curves(environment, name)]
     figure, axes = _panels(data.style, sharey="row")
-    for column, title in enumerate(data.style.panels):
+    for top, bottom, title in zip(*axes, data.style.panels, strict=True):
         own = [name for name in found if data.style.panel(name) == title]
         names = [name for name in found if name == data.style.everywhere and name not in own] + own
-        axes[0, column].set_title(title)
+        top.set_title(title)
         for name in names:
-            _curve(axes[0, column], data, environment, name, "crashes_per_1000")
-            _curve(axes[1, column], data, environment, name, "reward")
-        axes[1, column].set_xlabel("parallel steps")
+            _curve(top, data, environment, name, "crashes_per_1000")
+            _curve(bottom, data, environment, name, "reward")
+        bottom.set_xlabel("parallel steps")
         if names:
-            axes[0, column].legend(frameon=False, ncols=2, fontsize=9)
-        for row in range(2):
-            axes[row, column].grid(alpha=0.3)
-        axes[0, column].set_yscale("symlog", linthresh=0.1)
-        axes[0, column].set_ylim(bottom=0)
+            top.legend(frameon=False, ncols=2, fontsize=9)
+        top.grid(alpha=0.3)
+        bottom.grid(alpha=0.3)
+        top.set_yscale("symlog", linthresh=0.1)
+        top.set_ylim(bottom=0)
     axes[0, 0].set_ylabel("crashes per 1000 transitions")
     axes[1, 0].set_ylabel("mean reward per transition")
     figure.suptitle(CAVEAT, fontsize=9)
@@ -144,7 +144,6 @@ def profiles(data: Data, environment: str, period: int) -> "Figure | None":
     """Performance profiles: share of the policies whose crashes per 1000 transitions exceed a threshold."""
     figure, axes = _panels(data.style, sharey="all")
     thresholds = np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 120)])
-    drawn = False
     for row, goals in enumerate(GOALS):
         for panel, title in zip(axes[row], data.style.panels, strict=True):
             for name in data.methods(environment):
@@ -152,17 +151,16 @@ def profiles(data: Data, environment: str, period: int) -> "Figure | None":
                 if data.style.panel(name) == title and len(values) >= 2:
                     share, *band = stats.performance_profile([values], thresholds, resamples=2000)
                     _line(panel, data.style, name, thresholds, share, band, every=12, alpha=0.1, step="post")
-                    drawn = True
             panel.set_xscale("symlog", linthresh=1e-3)
             panel.grid(alpha=0.3)
             panel.set_title(f"{title}, against the {goals.capitalize()}")
-            if panel.get_legend_handles_labels()[0]:
+            if panel.lines:
                 panel.legend(frameon=False, fontsize=8, ncols=2)
     for panel in axes[1]:
         panel.set_xlabel("crashes per 1000 transitions")
     for panel in axes[:, 0]:
         panel.set_ylabel("share of policies above")
-    return figure if drawn else None
+    return figure if any(panel.lines for panel in axes.flat) else None
 
 
 def _panels(style: Style, sharey: str) -> "tuple[Figure, Any]":
@@ -194,7 +192,8 @@ def _line(
         marker=style.marker(name), markersize=4.5, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
     )  # fmt: skip
     if band is not None:
-        axes.fill_between(x, *band, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
+        low, high = band
+        axes.fill_between(x, low, high, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
 
 
 def _rolling(x: Array, window: int) -> Array:

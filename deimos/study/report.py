@@ -120,7 +120,7 @@ def environments(data: Data, pictures: Pictures) -> list[Block]:
 
 def _table(data: Data, where: Where) -> list[Block]:
     samples = {name: data.sample(where, name, "crashes") for name in data.methods(where.environment)}
-    base, parts = samples.get(data.style.reference, ()), data.parts(where)
+    base, parts = samples.get(data.style.reference, np.array([])), data.parts(where)
     rows = []
     for name, crashes in samples.items():
         if len(crashes) < 2:
@@ -176,7 +176,7 @@ def speed(data: Data) -> list[Block]:
     for environment in data.environments:
         place = data.places(environment, "naive")[0]
         fps = {name: data.sample(place, name, "fps") for name in data.methods(environment)}
-        base = fps.get(data.style.reference, ())
+        base = fps.get(data.style.reference, np.array([]))
         for name, values in fps.items():
             if len(values) >= 2:
                 rows.append({
