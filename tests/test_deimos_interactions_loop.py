@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from deimos.goals.interactions import Resolved
 from deimos.goals.selectors import uniform
 from deimos.learn.rollout import Rollout
 from deimos.run.loop import GoalLoop, spaces
@@ -170,20 +169,3 @@ def test_loop_stores_the_moment_of_the_choice(torch_device, variant):
     if variant == "relative":
         torch.testing.assert_close(resolved.next_goal, drifted + gone, rtol=0, atol=2 * tolerance)
         assert bool((gone.abs().amax(dim=1) > 1e-3).all())
-
-
-def test_a_state_of_before_horizons_is_read(torch_device):
-    """A loop's state as version 0.1 wrote it, without horizons, resumes as what it says: T for every interaction."""
-    loops = [build_loop(torch_device), build_loop(torch_device)]
-    run(loops[0], 7, crash=[1])
-    state = loops[0].state_dict()
-    book = state["interactions"]
-    old = {name: book[name] for name in ("now", "active", "pending", "ring", "cursor")}
-    old |= {"issued": book["issued_at"], "marks": book["marks"][:, :, :3]}
-    loops[1].load_state_dict(state | {"interactions": old})
-    for loop in loops:
-        run(loop, 5)
-    first, second = (loop.interactions.resolved() for loop in loops)
-    assert len(first) == 2
-    for name in Resolved.__dataclass_fields__:
-        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=0, equal_nan=True)
