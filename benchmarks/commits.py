@@ -78,8 +78,8 @@ def _run(home: Path, options: list[str]) -> dict[str, float]:
             rows = list(csv.DictReader(file))[WARM:]
     return {
         "FPS": statistics.median(float(row["fps"]) for row in rows),
-        "env [ms/iteration]": 1000 * statistics.median(float(row["env"]) for row in rows),
-        "CPU [s]": after.children_user + after.children_system - before.children_user - before.children_system,
+        "env, ms per iteration": 1000 * statistics.median(float(row["env"]) for row in rows),
+        "CPU, s": after.children_user + after.children_system - before.children_user - before.children_system,
     }
 
 

@@ -168,7 +168,7 @@ def test_two_checkouts_are_compared(capsys):
     options = ["--num-envs", "16", "--env-steps", "120", "--ppo.hidden", "8"]
     results = commits.compare(commits.HOME, 1, 1, {"tiny": options})
     tiny = results["tiny"]
-    for key in ("FPS", "env [ms/iteration]", "CPU [s]"):
+    for key in ("FPS", "env, ms per iteration", "CPU, s"):
         assert tiny["ratio"][key] == pytest.approx(tiny["this"][key] / tiny["other"][key])
     commits.show(results, "HEAD")
     assert "this / other" in capsys.readouterr().out

@@ -75,7 +75,8 @@ class GoalCore(Stateful):
             return self._nothing
         # A known count spares the device another wait.
         changes = Changes(*(
-            torch.nonzero_static(mask, size=count).squeeze(1) for mask, count in zip(masks, counts, strict=True)
+            torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nothing.due
+            for mask, count in zip(masks, counts, strict=True)
         ))  # fmt: skip
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])

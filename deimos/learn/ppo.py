@@ -173,8 +173,11 @@ class PPO(Stateful):
             first_step: Steps that every world has taken before, below 2^32 - num_steps.
             env_offset: Global number of world 0.
         """
-        steps = torch.arange(first_step, first_step + len(noise), device=noise.device).unsqueeze(1)
-        noise.copy_(normals(self._seed, Purpose.EXPLORATION, self._worlds + env_offset, steps, noise.shape[2]))
+        size = max(1, 2**17 // len(self._worlds))  # steps at a time whose words stay within a core's caches
+        for start in range(0, len(noise), size):
+            part = noise[start : start + size]
+            steps = torch.arange(first_step + start, first_step + start + len(part), device=noise.device).unsqueeze(1)
+            part.copy_(normals(self._seed, Purpose.EXPLORATION, self._worlds + env_offset, steps, noise.shape[2]))
 
     @torch.no_grad()
     def act(self, obs: Tensor, noise: Tensor, action: Tensor, mean: Tensor) -> None:

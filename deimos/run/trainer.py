@@ -111,8 +111,8 @@ class Trainer:
     @torch.no_grad()
     def _collect(self) -> None:
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
-        ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
         clock = _Clock(self)
+        ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
         for t in range(rollout.num_steps):
             rollout.obs[t] = env.obs
             ppo.act(env.obs, rollout.noise[t], rollout.action[t], rollout.mean[t])
