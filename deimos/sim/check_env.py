@@ -124,19 +124,19 @@ def _check_views(env: Env, build: Build) -> Claims:
     """All tensors are views made once, and torch sees what the kernels write."""
     first_action, *actions, last_action = _actions(env, env.goal_period + 3)
 
-    def addresses(action: Tensor) -> dict[str, int]:
+    def views(action: Tensor) -> dict[str, Tensor]:
         step = env.step(action)
-        views = env.tensors | {name: getattr(step, name) for name in ("obs", "reward", *FLAGS)}
-        return {name: view.data_ptr() for name, view in views.items()}
+        return env.tensors | {name: getattr(step, name) for name in ("obs", "reward", *FLAGS)}
 
-    first = addresses(first_action)
+    first = views(first_action)  # kept alive, so that no other memory can come to lie at their addresses
     for action in actions:
         _advance(env, action)
-    for name, address in addresses(last_action).items():
-        yield address == first[name], f"{name} must stay where it is: write into it, never rebind it."
-    yield first["obs"] == env.obs.data_ptr(), "Step.obs and obs must be the same memory."
+    for name, view in views(last_action).items():
+        same = view.data_ptr() == first[name].data_ptr()
+        yield same, f"{name} must stay where it is: write into it, never rebind it."
+    yield first["obs"].data_ptr() == env.obs.data_ptr(), "Step.obs and obs must be the same memory."
     for name, copy in env.state_dict().items():
-        yield copy.data_ptr() != first[name], f"state_dict must give copies, but {name} is a view."
+        yield copy.data_ptr() != first[name].data_ptr(), f"state_dict must give copies, but {name} is a view."
 
 
 def _check_start(env: Env, build: Build) -> Claims:
