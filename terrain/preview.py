@@ -94,8 +94,8 @@ def _draw(terrain: Terrain, colours: Any, step: float, turn: float, tilt: float)
     half_height, half_width = (cell * (side - 1) / 2 for side in ground.shape)
     reach = half_width * math.cos(turn) + half_height * math.sin(turn)
     depth = half_width * math.sin(turn) + half_height * math.cos(turn)
-    across = np.arange(-reach + step / 2, reach, step, np.float32)[None, :]  # middles of the pixels
-    away = np.arange(-depth, depth + step, step, np.float32)[:, None]
+    across = np.arange(-reach + step / 2, reach, step, dtype=np.float32)[None, :]  # middles of the pixels
+    away = np.arange(-depth, depth + step, step, dtype=np.float32)[:, None]
     column = np.rint((half_width + across * math.cos(turn) - away * math.sin(turn)) / cell).astype(np.int32)
     row = np.rint((half_height - across * math.sin(turn) - away * math.cos(turn)) / cell).astype(np.int32)
     inside = (column >= 0) & (column < ground.shape[1]) & (row >= 0) & (row < ground.shape[0])
