@@ -41,6 +41,21 @@ def test_from_above_colours_are_heights():
     assert coloured(picture, 0.0)[-70:].all()
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_slopes_that_face_the_light_are_brighter(axis):
+    """Light comes from the upper left: sides of a roof that face it are brighter than flat ground, others darker."""
+    x = np.linspace(-1.0, 1.0, 201 if axis == 0 else 161)
+    roof = (0.8 * (1.0 - np.abs(x))).astype(np.float32)
+    ground = wall(0.0)
+    ground.heights[:] = roof[:, None] if axis == 0 else roof
+    picture, _ = preview._draw(ground, COLOURS, STEP, 0.0, math.pi / 2)
+    side = picture.sum(axis=-1)[80] if axis == 0 else picture.sum(axis=-1)[:, 100]
+    quarter = len(side) // 4
+    flat = sum(COLOURS.to_rgba(0.4)[:3])
+    assert side[quarter] > flat + 0.05
+    assert side[-quarter] < flat - 0.05
+
+
 @pytest.mark.parametrize("height", [0.0, 0.5, 1.5])
 def test_oblique_wall_hides_the_ground_behind(height):
     """Seen from 45 degrees, a wall hides as much ground behind it as it is high, and lengths shrink by sqrt(1/2)."""
