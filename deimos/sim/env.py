@@ -76,7 +76,7 @@ class EnvConfig(abc.ABC):
 
     @property
     def files(self) -> dict[str, Path]:
-        """Files that the worlds are built from, by the field that holds the path; a run works with copies of its own."""
+        """Files that the worlds are built from, by the field that holds the path; a run works with its own copies."""
         return {}
 
     @property
