@@ -6,6 +6,7 @@ policy, so that it knows this policy's weaknesses and not those of some training
 """
 
 import hashlib
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -19,12 +20,17 @@ from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.goals.selectors import director, uniform
+from deimos.learn.policy import load_policy
+from deimos.run.config import to_dict
+from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones, Oracle
 from deimos.sim.env import Env, EnvConfig
 
 Policy = Callable[[Tensor], Tensor]
 """Observations, shape (n, obs_dim), to actions, shape (n, action_dim)."""
+Progress = Callable[[str, float], None]
+"""Called now and then with the stage's name and the share of it that is done."""
 
 WEAK_CRASHES, WEAK_AUROC = 100, 0.6  # below either, resisting the Adversary proves nothing
 FITS = 15  # fits of the Adversary's network during its ``adversary_steps``
@@ -77,13 +83,55 @@ def weights_hash(module: nn.Module) -> str:
     return digest.hexdigest()[:16]
 
 
+def evaluate_run(
+    folder: RunFolder, env_config: EnvConfig, config: EvalConfig, device: torch.device,
+    progress: Progress = lambda stage, share: None, *, again: bool = True,
+) -> list[dict]:  # fmt: skip
+    """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
+
+    There they replace the rows of the same evaluation of the same weights. One of another T, size or seed, or of an
+    Adversary that was trained otherwise, is another evaluation, and stays beside them.
+
+    Args:
+        folder: The run.
+        env_config: See ``evaluate``; the others too.
+        config: Sizes and seed.
+        device: Where to simulate.
+        progress: Told how far it is.
+        again: Whether to make rows again that the folder has.
+
+    Returns:
+        The rows of this evaluation, those of ``evaluate`` with the policy's ``weights_hash``.
+    """
+    policy = load_policy(folder.path, str(device))
+    weights = {"weights": weights_hash(policy.actor)}
+    known = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+    identities = [(identity | weights).items() for identity in _identities(env_config, config)]
+    same = [row for row in known if any(row.items() >= identity for identity in identities)]
+    if len(same) == len(identities) and not again:
+        return same
+    fresh = [row | weights for row in evaluate(policy.scaled, env_config, config, device, progress)]
+    folder.write_json("evaluation.json", [row for row in known if row not in same] + fresh)
+    return fresh
+
+
+def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
+    """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
+    trained = {name: value for name, value in to_dict(config).items() if name not in ("steps", "oracle_worlds")}
+    setting = hashlib.sha256(json.dumps(trained, sort_keys=True).encode()).hexdigest()[:12]
+    identities = []
+    for goals, worlds in (("naive", config.worlds), ("adversary", config.worlds), ("oracle", config.oracle_worlds)):
+        if worlds:
+            own = {} if goals == "naive" else {"adversary_setting": setting}
+            shared = {"goal_period": env_config.goal_period, "seed": config.seed, "worlds": worlds}
+            identities.append({"goals": goals} | shared | {"steps": config.steps} | own)
+    return identities
+
+
 def evaluate(
-    policy: Policy,
-    env_config: EnvConfig,
-    config: EvalConfig,
-    device: torch.device,
-    progress: Callable[[str, float], None] = lambda stage, share: None,
-) -> list[dict]:
+    policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device,
+    progress: Progress = lambda stage, share: None,
+) -> list[dict]:  # fmt: skip
     """Evaluate a policy against Naive and against Adversary.
 
     Args:
@@ -91,7 +139,7 @@ def evaluate(
         env_config: The environment that it was trained in; randomisations are switched off.
         config: Sizes and seed.
         device: Where to simulate.
-        progress: Called now and then with the stage's name and the share of it that is done.
+        progress: Told how far it is.
 
     Returns:
         One row for ``naive`` and one for ``adversary``, and one for ``oracle`` if asked for. In each:
@@ -100,7 +148,8 @@ def evaluate(
         crashes under first goals apart, ``return_per_step`` (see ``play``) and ``score``: its place
         between the policy that does nothing (0) and the environment's reference policy (1), both
         under the Naive goals; and for the Adversary the size of its collection and its AUROC on
-        worlds that it did not learn from. ``tracking`` has the mean of every group of goal
+        worlds that it did not learn from; ``adversary_setting`` is a hash of all that fixed how it was trained, the
+        policy apart. ``tracking`` has the mean of every group of goal
         components, ``strata`` the same and more by kind of world, where there are kinds, and ``errors``
         the median of each of ``Env.errors`` over all goals that were survived, at the end of their period.
 
@@ -130,16 +179,14 @@ def evaluate(
         clones = Clones(lambda count: env_config.build(count, device, config.seed), policy)
         oracle = Oracle(env, clones, fear=fear)
         rows.append({"goals": "oracle"} | play(env, policy, oracle, config.steps, lambda x: progress("oracle", x)))
-    for row in rows:
+    for row, identity in zip(rows, _identities(env_config, config), strict=True):
         row["score"] = (row["return_per_step"] - scale[0]) / (scale[1] - scale[0]) if scale else math.nan
-        row |= {"goal_period": env_config.goal_period, "seed": config.seed}
-        worlds = config.oracle_worlds if row["goals"] == "oracle" else config.worlds
-        row |= {"worlds": worlds, "steps": config.steps}
+        row |= identity
     return rows
 
 
 def _scale(
-    env: Env, build: Callable[[], Env], naive: GoalSelector, steps: int, progress: Callable[[str, float], None]
+    env: Env, build: Callable[[], Env], naive: GoalSelector, steps: int, progress: Progress
 ) -> tuple[float, float] | None:
     """Return per step of the zero-action policy and of the reference policy, if there is one."""
     reference = env.reference_policy()
