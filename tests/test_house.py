@@ -3,6 +3,7 @@
 import ast
 import importlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import deimos
 from deimos import plugins
 from deimos.app import cli
 from deimos.goals import selectors
+from deimos.kernels.random import Purpose
 from deimos.run import config
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -303,6 +305,44 @@ print(deimos.kernels.__file__)
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()) == HOME / "kernels" / "__init__.py"
+
+
+def test_nothing_else_of_a_checkout_is_in_the_package():
+    """Of what lies beside the package only ``kernels`` and ``terrain`` are its modules: ``deimos.train`` is none."""
+    beside = {path.stem for path in HOME.glob("[!.]*") if path.suffix == ".py" or list(path.glob("*.py"))}
+    assert {"train", "tests", "benchmarks", "reproduction", "kernels", "terrain"} <= beside
+    code = f"""
+import importlib.util
+print(*[name for name in {sorted(beside)} if importlib.util.find_spec("deimos." + name)])
+"""
+    for folder in (HOME, HOME / "tests"):
+        done = python(code, cwd=folder)
+        assert (done.stdout.split(), done.stderr) == (["kernels", "terrain"], "")
+
+
+def test_no_file_is_loaded_twice():
+    """After all of the library was imported, no file of it has two names."""
+    modules = [name for name in module_names(*PACKAGES) if not name.endswith("__main__")]
+    code = f"""
+import importlib, sys
+for name in {modules}:
+    importlib.import_module(name)
+names = {{}}
+for name, module in sys.modules.items():
+    if (getattr(module, "__file__", None) or "").startswith({tuple(f"{HOME / name}{os.sep}" for name in PACKAGES)}):
+        names.setdefault(module.__file__, []).append(name)
+assert len(names) == {len(modules)}, names
+print([twice for twice in names.values() if len(twice) > 1])
+"""
+    done = python(code, cwd=HOME)
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
+def test_another_process_unpickles(tmp_path):
+    """A process that has imported nothing of Deimos yet finds what a pickle names, in ``kernels`` too."""
+    code = f"import pickle; print(repr(pickle.loads({pickle.dumps(Purpose.PUSH)})))"
+    done = python(code, cwd=tmp_path)
+    assert (done.stdout.strip(), done.stderr) == (repr(Purpose.PUSH), "")
 
 
 def test_terrain_of_a_checkout_runs_under_one_name():
