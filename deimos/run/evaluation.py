@@ -170,9 +170,7 @@ def evaluate(
 
     fear, collection = train_adversary(policy, build(config.seed + 1), config, lambda x: progress("collection", x))
     env = build(config.seed)
-    adversary = director.Config(rule="argmax", fear=config.fear).build(spaces(env), config.seed)
-    adversary.fear = fear
-    attacked = play(env, policy, adversary, config.steps, lambda x: progress("adversary", x))
+    attacked = play(env, policy, argmax_director(env, fear), config.steps, lambda x: progress("adversary", x))
     rows.append({"goals": "adversary"} | attacked | collection)
     if config.oracle_worlds:
         env = env_config.build(config.oracle_worlds, device, config.seed)
@@ -269,6 +267,13 @@ def _by_stratum(strata: list[str], crashes: Tensor, tracking: Tensor, done: Reso
     return rows
 
 
+def argmax_director(env: Env, fear: Fear) -> director.Director:
+    """A Director that asks for the candidate that a fear network, as it is at that time, fears most."""
+    selector = director.Config(rule="argmax", fear=fear.config).build(spaces(env), 0)
+    selector.fear = fear
+    return selector
+
+
 def train_adversary(
     policy: Policy, env: Env, config: EvalConfig, progress: Callable[[float], None] = lambda share: None
 ) -> tuple[Fear, dict]:
@@ -351,8 +356,7 @@ class _Collector(GoalSelector):
 
     def __init__(self, env: Env, fear: Fear) -> None:
         self._uniform = uniform.Config().build(spaces(env), 0)
-        self._argmax = director.Config(rule="argmax", fear=fear.config).build(spaces(env), 0)
-        self._argmax.fear = fear
+        self._argmax = argmax_director(env, fear)
         self.num_candidates = self._argmax.num_candidates
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
