@@ -173,12 +173,8 @@ class Trainer:
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
-        return {
-            "iteration": self.iteration,
-            "made_for": _identity(self.config),
-            "ppo": self.ppo.state_dict(),
-            "loop": self.loop.state_dict(),
-        }
+        made_for, ppo, loop = _identity(self.config), self.ppo.state_dict(), self.loop.state_dict()
+        return {"iteration": self.iteration, "made_for": made_for, "ppo": ppo, "loop": loop}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from ``state_dict()``.
