@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, SimulationError, check_at_least, check_choice
+from deimos.checks import RunError, SimulationError, check_at_least, check_choice, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.learn.ppo import PPO, PPOConfig
@@ -189,8 +189,8 @@ class Trainer:
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise RunError(f"The checkpoint is that of another environment or network size: {reason}") from error
+            text = "The checkpoint is that of another environment or network size: "
+            raise RunError(text + one_line(error)) from error
         self.iteration = state["iteration"]
 
 

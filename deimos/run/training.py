@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from deimos import __version__
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run.config import from_dict, kind, to_dict
@@ -125,8 +125,7 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
             raise ValueError(f"it observes {layout}, this one {trainer.env.layout}")
         trainer.ppo.load_weights(state["ppo"])
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise RunError(f"The networks of {origin.path} do not fit this run: {reason}") from error
+        raise RunError(f"The networks of {origin.path} do not fit this run: {one_line(error)}") from error
 
 
 def load_checkpoint(folder: RunFolder) -> dict:
