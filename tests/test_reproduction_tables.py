@@ -18,20 +18,6 @@ from deimos.study import plan
 from deimos.study.results import Results
 from reproduction import oracle_table, particle_population, quad_rough
 
-POPULATION = """
-seeds = 2
-methods = ["uniform"]
-[train]
-num_envs = 16
-env_steps = 48
-device = "cpu"
-ppo = { hidden = [8], epochs = 1 }
-eval = { worlds = 16, steps = 40, adversary_steps = 40, adversary_patience = 1 }
-[[environment]]
-name = "directional"
-env = { kind = "particle", variant = "directional", goal_period = 10, max_speed = 200.0, max_force = 200.0 }
-"""
-
 
 def row(environment, seed, goals="naive", **values):
     """A row of a study, with all that the tables show."""
@@ -69,19 +55,25 @@ def test_table_of_pilots_says_what_differs(capsys):
     assert lines[-1] == f"| absolute | `--env.reward reciprocal` | {eighths}"
 
 
-def test_population_is_a_study_with_audits(tmp_path, monkeypatch, capsys):
-    """The command trains what is missing, audits stage by stage, prints, and leaves its rows; again it only prints."""
-    (tmp_path / "population.toml").write_text(POPULATION)
-    root = tmp_path / "population"
-    monkeypatch.setattr(particle_population, "STUDIES", tmp_path)
-    monkeypatch.setattr("sys.argv", ["it", str(root), "--workers", "1"])
+def test_population_is_a_study(tmp_path, monkeypatch, capsys):
+    """The command has ``deimos study`` train what is missing of the population's file, and prints and keeps its rows."""
+    rows = [row("directional", seed, goals) for seed in range(2) for goals in ("naive", "adversary")]
+    asked = []
+
+    class Options:
+        def __init__(self, **options):
+            asked.append(options)
+
+        def run(self):
+            Results([each | {"hash": f"{each['seed']}"} for each in rows], []).write(tmp_path)
+
+    monkeypatch.setattr(particle_population, "RunOptions", Options)
+    monkeypatch.setattr("sys.argv", ["it", str(tmp_path), "--workers", "3"])
     particle_population.main()
-    first = capsys.readouterr().out
-    assert "| directional | uniform | adversary |" in first
-    assert len(RunFolder(root).read_json("population.json")["evaluations"]) == 4
-    monkeypatch.setattr(training, "train", lambda *arguments: pytest.fail("trained again"))
-    particle_population.main()
-    assert capsys.readouterr().out == first
+    assert asked == [{"folder": tmp_path, "file": particle_population.STUDIES / "population.toml", "workers": 3}]
+    assert "| directional | uniform | adversary | 0.005 (0.000-0.010) |" in capsys.readouterr().out
+    kept = RunFolder(tmp_path).read_json("population.json")
+    assert ([each["seed"] for each in kept["evaluations"]], kept["audits"]) == ([0, 0, 1, 1], [])
 
 
 def test_audits_follow_the_training(tmp_path, monkeypatch):
