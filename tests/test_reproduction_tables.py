@@ -56,7 +56,7 @@ def test_table_of_pilots_says_what_differs(capsys):
 
 
 def test_population_is_a_study(tmp_path, monkeypatch, capsys):
-    """The command has ``deimos study`` train what is missing of the population's file, and prints and keeps its rows."""
+    """The command has ``deimos study`` train what is missing of the population, and prints and keeps its rows."""
     rows = [row("directional", seed, goals) for seed in range(2) for goals in ("naive", "adversary")]
     asked = []
 
