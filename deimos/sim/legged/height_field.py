@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from deimos.checks import check_positive
+from deimos.terrain.grid import check_heights
 
 if TYPE_CHECKING:
     from mujoco import MjsGeom, MjSpec
@@ -46,10 +47,7 @@ def add_height_field(
     check_positive("cell", cell, finite=True)
     check_positive("base", base, finite=True)
     heights = np.asarray(heights, np.float64)
-    if heights.ndim != 2 or min(heights.shape) < 2:
-        raise ValueError(f"heights must have at least 2 x 2 samples, got the shape {heights.shape}.")
-    if not np.isfinite(heights).all():
-        raise ValueError("heights must be finite everywhere.")
+    check_heights(heights)
     nx, ny = heights.shape
     low, extent = float(heights.min()), float(np.ptp(heights))
     shares = (heights - low) / extent if extent > 0 else np.zeros_like(heights)
