@@ -177,7 +177,7 @@ def _make(grid: Grid, outputs: Outputs, title: str) -> None:
     _check_outputs(outputs)
     console.quiet_warp()
     start = time.perf_counter()
-    with console.stage_bar() as progress:
+    with console.progress("terrain") as progress:
         terrain, mesh = build_with_mesh(grid, progress=progress)
         seconds = time.perf_counter() - start
         jobs: dict[Path, Callable[[], None]] = {path: partial(export.save, path, terrain, mesh) for path in outputs.out}

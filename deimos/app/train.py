@@ -11,7 +11,7 @@ import tyro
 
 from deimos import plugins
 from deimos.app import console, figures
-from deimos.app.evaluate import evaluate_run, title
+from deimos.app.evaluate import show_evaluation, title
 from deimos.checks import RunError
 from deimos.goals import selectors
 from deimos.run import presets, training
@@ -85,13 +85,15 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
     """Train, evaluate, draw and say where everything is."""
     config = trainer.config
     with console.stop_on_interrupt() as stopped:
-        with _training_bar(trainer) as report:
+        with _training_progress(trainer) as report:
             finished = training.train(trainer, folder, report, stopped)
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(130)
-    rows = evaluate_run(folder, config.env, config.eval, trainer.env.device) if config.evaluation else []
-    figures.draw_summary(folder, title(config), rows)
+    if config.evaluation:
+        show_evaluation(folder, config, config.env, config.eval, trainer.env.device)
+    else:
+        figures.draw_summary(folder, title(config))
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
         print("time:", *[f"{name} {100 * seconds / total:.1f} % " for name, seconds in trainer.seconds.items()])
@@ -99,21 +101,14 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
 
 
 @contextlib.contextmanager
-def _training_bar(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
-    """Iteration, frames per second, reward, crashes per 1000 transitions, time left."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    numbers = "{task.fields[fps]:.0f} FPS  reward {task.fields[reward]:.3f}  crashes/1000 {task.fields[crashes]:.2f}"
-    columns = (
-        TextColumn("iteration {task.completed}/{task.total}"), BarColumn(), TextColumn(numbers), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(
-            "train", total=trainer.config.iterations, completed=trainer.iteration, fps=0.0, reward=0.0, crashes=0.0
-        )
-        yield lambda row, fps: progress.update(
-            task, completed=row["iteration"], fps=fps, reward=row["reward"], crashes=row["crashes_per_1000"]
+def _training_progress(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
+    """Iteration, frames per second, reward, crashes per 1000 transitions."""
+    total = trainer.config.iterations
+    with console.progress("training") as report:
+        yield lambda row, fps: report(
+            f"iteration {row['iteration']} of {total}, {fps:,.0f} FPS, reward {console.number(row['reward'])}, "
+            f"{console.number(row['crashes_per_1000'])} crashes per 1000 steps",
+            row["iteration"] / total,
         )
 
 

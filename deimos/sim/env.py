@@ -118,6 +118,8 @@ class Env(abc.ABC):
     """Whether the run continues where a world becomes invalid; else ``check`` stops it."""
     goal_groups: tuple[slice, ...] = (slice(None),)
     """Components of a goal that are met or missed together."""
+    goal_group_names: tuple[str, ...] = ("goal",)
+    """What each of them is called."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
     """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
     shape (num_envs,). Empty where ``Step.tracking`` says enough."""
