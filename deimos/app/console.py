@@ -3,7 +3,12 @@
 Importing it needs Python alone, so that ``deimos`` can say which packages are missing.
 """
 
+import ast
 import contextlib
+import dataclasses
+import inspect
+import io
+import itertools
 import os
 import shutil
 import signal
@@ -13,6 +18,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
+from types import MappingProxyType
 from typing import Any
 
 from deimos.checks import RunError
@@ -20,6 +26,7 @@ from deimos.checks import RunError
 Command = Callable[[list[str], str], None]
 """Runs on its arguments, under the name that a person calls it by, such as ``deimos study run``."""
 
+LEAST_WIDTH = 60  # columns of a terminal that help is wrapped at
 PLAIN_SECONDS = 20.0  # from line to line, where progress cannot be shown in place
 
 
@@ -36,7 +43,7 @@ def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments:
         RunError: If there is no such command.
     """
     if not arguments or arguments[0] in ("-h", "--help"):
-        width, screen = max(map(len, commands)), max(40, shutil.get_terminal_size().columns)
+        width, screen = max(map(len, commands)), max(LEAST_WIDTH, shutil.get_terminal_size().columns)
         listed = [
             textwrap.fill(f"  {name:{width}}  {text}", screen, subsequent_indent=" " * (width + 4))
             for name, (text, _) in commands.items()
@@ -68,8 +75,42 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
         hook: Any = contextlib.nullcontext()
     else:
         hook = on_parse_error(_refuse)
-    with hook:
+    if {"-h", "--help"} & set(arguments):
+        more["registry"] = registry = tyro.constructors.ConstructorRegistry()
+        registry.struct_rule(_explain)
+    with hook, _wrapped_help():
         return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
+
+
+def _explain(struct: Any) -> None:
+    """Tell tyro the docstrings below the fields of a dataclass, without the line breaks that it would keep."""
+    if not dataclasses.is_dataclass(struct.type):
+        return
+    texts: dict[str, str] = {}
+    for kind in reversed(struct.type.__mro__):
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
+        except (OSError, TypeError):  # it has no source
+            continue
+        for field, below in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                texts[ast.unparse(field.target)] = " ".join(ast.literal_eval(below.value).replace("``", "").split())
+    for known in dataclasses.fields(struct.type):
+        known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)  # type: ignore[assignment]
+
+
+@contextlib.contextmanager
+def _wrapped_help() -> Iterator[None]:
+    """Wrap what tyro prints without regard to the terminal's width: what a command is for."""
+    said, width = io.StringIO(), max(LEAST_WIDTH, shutil.get_terminal_size().columns)
+    said.isatty = sys.stdout.isatty  # type: ignore[method-assign]
+    os.environ["COLUMNS"] = str(width)  # in less, tyro leaves descriptions a column of one letter
+    try:
+        with contextlib.redirect_stdout(said):
+            yield
+    finally:
+        for line in said.getvalue().splitlines():
+            print(line.rstrip() if "\x1b" in line else textwrap.fill(line.rstrip(), width))
 
 
 def _at_home(argument: str) -> str:

@@ -34,37 +34,35 @@ class ResumeOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FolderOptions(TrainConfig):
-    """``TrainConfig`` and what belongs to the folder."""
+class FirstOptions:
+    """What decides which other options there are."""
+
+    preset: str | None = None
+    """Name of a ready configuration to start from; the others change it."""
+    resume: Path | None = None
+    """Resume the run in this folder from its last checkpoint; takes only --env-steps and --device."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderOptions(TrainConfig, FirstOptions):
+    """What people ask for first, ``TrainConfig``, and what belongs to the folder."""
 
     out: Path | None = None
     """Folder of the run, which must not exist. By default runs/ENV-METHOD-sSEED-TIME."""
-    resume: Path | None = None
-    """Resume the run in this folder from its last checkpoint; takes only --env-steps and --device."""
     init_from: Path | None = None
     """Start with the networks of the run in this folder."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FirstOptions:
-    """What decides which other options there are."""
-
-    resume: Path | None = None
-    """See ``ResumeOptions``."""
-    preset: str | None = None
-    """Name of a ready configuration to start from."""
-
-
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos train``."""
-    first, rest = console.parse(FirstOptions, arguments, program, add_help=False, return_unknown_args=True)
+    first, _ = console.parse(FirstOptions, arguments, program, add_help=False, return_unknown_args=True)
     if first.resume is not None:
         _resume(console.parse(ResumeOptions, arguments, program))
         return
-    _check_names(rest)
-    options, config = _train_options(), _preset(first.preset, rest)
+    _check_names(arguments)
+    options, config = _train_options(), _preset(first.preset, arguments)
     default = options(**vars(config))
-    _train(console.parse(options, rest, program, default=default))
+    _train(console.parse(options, arguments, program, default=default))
 
 
 def _train(options: Any) -> None:
