@@ -1,7 +1,9 @@
 """Quad: what an environment promises, shown on the Go1 without and with its arm, and the task of the thesis."""
 
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +16,15 @@ from deimos.kernels.legged.state import COLUMNS
 from deimos.kernels.legged.step import evaluate_step
 from deimos.kernels.random import Purpose
 from deimos.terrain import Grid, Share
+from deimos.terrain.shapes.flat import Shape as Flat
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
+import deimos
 from deimos import terrain
 from deimos.checks import SimulationError
 from deimos.goals.selectors import uniform
+from deimos.learn.ppo import PPOConfig
+from deimos.run import training
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import Step
 from deimos.sim.envs import quad_arm
@@ -711,6 +717,46 @@ def test_config_rejects_bad_values(config, message):
     """The message names the field, what it must be and what it was."""
     with pytest.raises(ValueError, match=message):
         Config(**config)
+
+
+def test_robots_start_on_the_terrain(torch_device, tmp_path):
+    """Ground that ends where robots start is refused with the border that it lacks; with it, none leaves at once."""
+
+    def tiles(border):
+        shape = Share(shape=Flat(tile=2.0, platform=1.0))
+        grid = Grid(shapes=(shape,), levels=3, columns=3, tile=2.0, border=border, cell=0.1)
+        terrain.build(grid).save(tmp_path / "tiles.npz")
+        return build(torch_device, num_envs=64, terrain=str(tmp_path / "tiles.npz"), stagger=False)
+
+    with pytest.raises(ValueError, match=r"terrain must reach 1.3 m .*, got 1 m; .* or its border wider by 0.3 m"):
+        tiles(border=0.0)
+    env = tiles(border=0.3)
+    step = env.step(torch.zeros(64, env.action_dim, device=torch_device))
+    assert not step.truncated.any()
+
+
+def test_a_run_keeps_its_terrain(tmp_path, monkeypatch, hills):
+    """A run resumes and is evaluated in any folder, with the terrain file gone and its own folder moved."""
+    (tmp_path / "before").mkdir()
+    (tmp_path / "after").mkdir()
+    monkeypatch.chdir(tmp_path / "before")
+    shutil.copy(hills, "mine.npz")
+    config = deimos.TrainConfig(
+        env=Config(goal_period=5, episode_steps=40, terrain="mine.npz"), method="uniform", num_envs=8, env_steps=192,
+        ppo=PPOConfig(hidden=(8,)), evaluation=False, device="cpu", threads=1,
+    )  # fmt: skip
+    run = deimos.train(config, "run")
+    run.rename(tmp_path / "after" / "run")
+    Path("mine.npz").unlink()
+    monkeypatch.chdir(tmp_path / "after")
+    trainer, folder = training.resume(Path("run"), env_steps=384)
+    assert np.array_equal(trainer.env.terrain.heights, terrain.load(hills).heights)
+    training.train(trainer, folder)
+    again, _ = training.resume(Path("run"), env_steps=576)  # once more: resuming wrote the configuration anew
+    assert again.env.terrain.shapes == ("stairs-up", "stairs-down")
+    monkeypatch.chdir(tmp_path)
+    naive, *_ = deimos.evaluate("after/run", worlds=4, steps=20)
+    assert naive["steps"] == 20
 
 
 def test_unknown_and_broken_terrains_are_refused(tmp_path):

@@ -285,3 +285,12 @@ class Shape(TileShape):
     assert isinstance(shape, TileShape)
     assert build(shape, 0.5).vertices[:, 2].max() == 0.5
     assert catalog.name_of(shape) == "one-bump"
+
+
+def test_broken_file_stops_no_other(tmp_path, monkeypatch):
+    """A file that is no shape is reported by its name, and all others are there."""
+    before = catalog.names()
+    (tmp_path / "crater.py").write_text("def")
+    monkeypatch.setattr(shapes, "__path__", [*shapes.__path__, str(tmp_path)])
+    with pytest.warns(UserWarning, match=r"The plug-in 'crater' of deimos.shapes, .* is broken \(SyntaxError"):
+        assert catalog.names() == before

@@ -17,8 +17,7 @@ from deimos.sim import envs
 def _all() -> dict[str, tuple[str, dict[str, Any]]]:
     """Environment and fields of every preset."""
     found: dict[str, tuple[str, dict[str, Any]]] = {}
-    for env in plugins.names(envs):
-        module = plugins.load(envs, env)
+    for env, module in plugins.load_all(envs).items():
         own = {spelled(env): {}} | getattr(module, "PRESETS", {})
         found |= {spelled(name): (env, fields) for name, fields in own.items()}
     return found

@@ -79,6 +79,11 @@ class LocomotionConfig(EnvConfig):
             raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
 
     @property
+    def files(self) -> dict[str, Path]:
+        """See ``EnvConfig.files``: the terrain, unless it has a name."""
+        return {} if self.terrain in ("flat", "rough") else {"terrain": Path(self.terrain).expanduser()}
+
+    @property
     def largest_reward(self) -> float:
         """See ``EnvConfig.largest_reward``: perfect tracking."""
         per_second = max(self.rewards.linear_tracking, 0.0) + max(self.rewards.yaw_tracking, 0.0)
@@ -109,7 +114,7 @@ class LocomotionConfig(EnvConfig):
             return None
         if self.terrain == "rough":
             return terrain.rough()
-        path = Path(self.terrain)
+        path = self.files["terrain"]
         if path.suffix.lower() in importing.OPTIONS.keys() - {".npz"}:
             advice = f"deimos terrain import {path} --out {path.with_suffix('.npz')}"
             raise ValueError(

@@ -95,6 +95,8 @@ class Locomotion(WarpEnv):
             action_bound=max(abs(end) for joint in robot.joints for end in joint.action_range),
         )  # fmt: skip
         ground = config.load_terrain()
+        if ground:
+            _require_room(ground)
         self.terrain = ground or terrain.flat()
         self.physics = self._build_physics(ground)
         self.tensors = self.physics.tensors | self.tensors
@@ -266,6 +268,17 @@ class Locomotion(WarpEnv):
         """See ``Env.goal_point``."""
         places = [part.points for part in self._launches if part.points]
         return places[0]()[world] if places else None
+
+
+def _require_room(ground: Terrain) -> None:
+    """Raise ``ValueError`` unless robots start on the terrain, wherever around a tile's middle they do."""
+    beyond_corner = ground.origins[..., :2] - ground.corner
+    room, need = np.minimum(beyond_corner, ground.size - beyond_corner).min(), SPAWN_RANGE + EDGE
+    if room < need - 1e-4:
+        raise ValueError(
+            f"terrain must reach {need:g} m beyond the middle of every tile, around which robots start, got "
+            f"{room:.3g} m; make its tiles larger, or its border wider by {need - room:.3g} m."
+        )
 
 
 def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:
