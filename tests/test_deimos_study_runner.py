@@ -116,7 +116,7 @@ def test_study_leaves_its_tables(whole):
 
 
 def test_a_cell_takes_its_own_evaluations_only(whole, tmp_path, monkeypatch):
-    """What somebody else evaluated in a cell's run is none of its results, and what it has evaluated is not repeated."""
+    """What somebody else evaluated in a cell's run is none of its results, and its own evaluations are not repeated."""
     folder = tmp_path / "copy"
     shutil.copytree(whole.path, folder)
     study = StudyFolder(folder)

@@ -11,12 +11,12 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from deimos.kernels.random import Purpose
 
 import deimos
 from deimos import plugins
 from deimos.app import cli
 from deimos.goals import selectors
-from deimos.kernels.random import Purpose
 from deimos.run import config
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig

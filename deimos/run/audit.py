@@ -20,7 +20,7 @@ from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
-from deimos.nn import seeds
+from deimos.nn.random import Purpose, normals, uniforms
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
 
@@ -52,16 +52,15 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
         RunError: If there is no fear network, or no context with both outcomes.
     """
     afraid = _learnt_fear(trainer)
-    generator = seeds.generator(trainer.config.seed, "audit", trainer.env.device)
-    config = trainer.config
+    config, act = trainer.config, _Explorer(trainer)
     clones = Clones(
         lambda count: config.env.build(count, trainer.env.device, config.seed),
-        lambda obs: _act(trainer, obs, generator), limit=BATCH * CANDIDATES,
+        _Explorer(trainer, first_world=config.num_envs), limit=BATCH * CANDIDATES,
     )  # fmt: skip
     ranks: list[float] = []
     crashes = tried = 0
     while len(ranks) < contexts and tried < PATIENCE * contexts:
-        state, goal, candidates, survived = _next_contexts(trainer, clones, generator)
+        state, goal, candidates, survived = _next_contexts(trainer, act, clones)
         logit = afraid.score(state, goal, candidates)
         crashed = survived < trainer.env.goal_period
         tried += len(logit)
@@ -106,11 +105,11 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
         RunError: If there is no fear network.
     """
     afraid = _learnt_fear(trainer)
-    generator = seeds.generator(trainer.config.seed, "calibration", trainer.env.device)
+    act = _Explorer(trainer)
     choosers = {"selected": trainer.loop.selector, "uniform": uniform.Config().build(spaces(trainer.env), 0)}
     results = {}
     for name, chooser in choosers.items():
-        done = _watch(trainer, chooser, interactions, generator)
+        done = _watch(trainer, act, chooser, interactions)
         score = afraid.score(done.state, done.goal, done.next_goal.unsqueeze(1)).squeeze(1)
         probability = afraid.calibration.probability(score)
         counts = {"interactions": float(len(done)), "crash_rate": done.crashed.float().mean().item()}
@@ -127,28 +126,38 @@ def _learnt_fear(trainer: "Trainer") -> FearSelector:
 
 
 @torch.no_grad()
-def _watch(trainer: "Trainer", chooser: GoalSelector, count: int, generator: torch.Generator) -> Resolved:
+def _watch(trainer: "Trainer", act: "_Explorer", chooser: GoalSelector, count: int) -> Resolved:
     """Let the policy go on under a selector's goals until ``count`` interactions have ended, in whole periods."""
     env = trainer.env
     periods = -(-count // env.num_envs)
     loop = GoalLoop(env, chooser, window=(periods + 1) * env.goal_period)
     begin = periods * env.goal_period
     for _ in range((periods + 1) * env.goal_period):
-        loop.advance(env.step(_act(trainer, env.obs, generator)))
+        loop.advance(env.step(act(env.obs)))
     done = loop.interactions.resolved()
     return done.where(done.issued <= begin)  # of the later ones only the crashes are known yet
 
 
-def _act(trainer: "Trainer", obs: Tensor, generator: torch.Generator) -> Tensor:
-    """Actions as in training: drawn, not the mean."""
-    mean = trainer.ppo.actor(obs)
-    return mean + trainer.ppo.actor.std * torch.randn(mean.shape, generator=generator, device=mean.device)
+class _Explorer:
+    """The policy with actions drawn as in training, by an audit's own numbers.
+
+    They are addressed by the seed, the number of the world, of which the first row's is given, and how often it acted.
+    """
+
+    def __init__(self, trainer: "Trainer", first_world: int = 0) -> None:
+        self._actor, self._seed, self._first = trainer.ppo.actor, trainer.config.seed, first_world
+        self.steps = 0
+
+    def __call__(self, obs: Tensor) -> Tensor:
+        mean = self._actor(obs)
+        world = torch.arange(len(obs), device=obs.device)
+        noise = normals(self._seed, Purpose.AUDIT, world + self._first, world.new_tensor(self.steps), mean.shape[1])
+        self.steps += 1
+        return mean + self._actor.std * noise
 
 
 @torch.no_grad()
-def _next_contexts(
-    trainer: "Trainer", clones: Clones, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _next_contexts(trainer: "Trainer", act: _Explorer, clones: Clones) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Go on until goals are due, and try candidates in up to ``BATCH`` of those worlds.
 
     Returns:
@@ -157,12 +166,13 @@ def _next_contexts(
     """
     env = trainer.env
     while True:
-        step = env.step(clones.act(env.obs))
+        step = env.step(act(env.obs))
         rows = (step.goal_due & ~step.terminated & ~step.truncated).nonzero().squeeze(1)
         if len(rows) == 0:
             trainer.loop.advance(step)
             continue
-        rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)[:BATCH]]
+        order = uniforms(trainer.config.seed, Purpose.AUDIT_CONTEXT, rows, rows.new_tensor(act.steps))[:, 0].argsort()
+        rows = rows[order[:BATCH]]
         obs = env.obs[rows]
         candidates = env.sample_goals(rows, CANDIDATES).clone()
         survived = clones.try_out(env, rows, candidates)

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -160,39 +161,39 @@ def evaluate(
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
 
-    def build(seed: int) -> Env:
-        return env_config.build(config.worlds, device, seed)
+    def build(worlds: int = config.worlds, seed: int = config.seed) -> Env:
+        return env_config.build(worlds, device, seed)
 
-    env = build(config.seed)
-    naive = uniform.Config().build(spaces(env), config.seed)
-    scale = _scale(env, lambda: build(config.seed), naive, config.steps, progress)
-    rows = [{"goals": "naive"} | play(env, policy, naive, config.steps, lambda x: progress("naive", x))]
-
-    fear, collection = train_adversary(policy, build(config.seed + 1), config, lambda x: progress("collection", x))
-    env = build(config.seed)
-    attacked = play(env, policy, argmax_director(env, fear), config.steps, lambda x: progress("adversary", x))
-    rows.append({"goals": "adversary"} | attacked | collection)
-    if config.oracle_worlds:
-        env = env_config.build(config.oracle_worlds, device, config.seed)
-        clones = Clones(lambda count: env_config.build(count, device, config.seed), policy)
-        oracle = Oracle(env, clones, fear=fear)
-        rows.append({"goals": "oracle"} | play(env, policy, oracle, config.steps, lambda x: progress("oracle", x)))
-    for row, identity in zip(rows, _identities(env_config, config), strict=True):
+    scale = _scale(build, config.steps, progress)
+    fear, collection = train_adversary(policy, build(seed=config.seed + 1), config, partial(progress, "collection"))
+    choosers: dict[str, Callable[[Env], GoalSelector]] = {
+        "naive": _naive,
+        "adversary": lambda env: argmax_director(env, fear),
+        "oracle": lambda env: Oracle(env, Clones(build, policy), fear=fear),
+    }
+    rows = []
+    for identity in _identities(env_config, config):
+        goals, env = identity["goals"], build(identity["worlds"])
+        row = {"goals": goals} | play(env, policy, choosers[goals](env), config.steps, partial(progress, goals))
+        row |= collection if goals == "adversary" else {}
         row["score"] = (row["return_per_step"] - scale[0]) / (scale[1] - scale[0]) if scale else math.nan
-        row |= identity
+        rows.append(row | identity)
     return rows
 
 
-def _scale(
-    env: Env, build: Callable[[], Env], naive: GoalSelector, steps: int, progress: Progress
-) -> tuple[float, float] | None:
+def _naive(env: Env) -> GoalSelector:
+    return uniform.Config().build(spaces(env), 0)
+
+
+def _scale(build: Callable[[], Env], steps: int, progress: Progress) -> tuple[float, float] | None:
     """Return per step of the zero-action policy and of the reference policy, if there is one."""
+    env = build()
+    nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
     reference = env.reference_policy()
     if reference is None:
         return None
-    nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
-    low = play(build(), lambda obs: nothing, naive, steps, lambda x: progress("zero action", x))
-    high = play(build(), reference, naive, steps, lambda x: progress("reference", x))
+    low = play(env, lambda obs: nothing, _naive(env), steps, partial(progress, "zero action"))
+    high = play(build(), reference, _naive(env), steps, partial(progress, "reference"))
     return low["return_per_step"], high["return_per_step"]
 
 
@@ -356,7 +357,7 @@ class _Collector(GoalSelector):
     """Half uniform goals, which are marked as probes, half the argmax of a fear network that is being trained."""
 
     def __init__(self, env: Env, fear: Fear) -> None:
-        self._uniform = uniform.Config().build(spaces(env), 0)
+        self._uniform = _naive(env)
         self._argmax = argmax_director(env, fear)
         self.num_candidates = self._argmax.num_candidates
 
