@@ -11,6 +11,7 @@ import io
 import os
 import sys
 import threading
+import warnings
 
 from deimos import __version__
 from deimos.app import console
@@ -20,7 +21,7 @@ COMMANDS = {
     "train": ("deimos.app.train", "train a policy and evaluate it (also: python train.py)"),
     "evaluate": ("deimos.app.evaluate", "evaluate the policy of a run folder"),
     "study": ("deimos.app.study", "train and compare populations of policies"),
-    "play": ("deimos.app.playback", "render a trained robot as a video"),
+    "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }
 """By name: the module whose ``main`` is the command, imported when it is asked for, and a line about it."""
@@ -43,6 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     _prepare_process()
     hook, threading.excepthook = threading.excepthook, _skip_file_errors
+    spell, warnings.formatwarning = warnings.formatwarning, _spell_warning
     try:
         _run(arguments)
         sys.stdout.flush()  # what cannot be written is said here, and not by Python when it ends
@@ -64,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0
     finally:
-        threading.excepthook = hook
+        threading.excepthook, warnings.formatwarning = hook, spell
         _drop_broken_streams()
     return 0
 
@@ -111,6 +113,13 @@ def _run(arguments: list[str]) -> None:
 
 def _command(module: str) -> console.Command:
     return lambda arguments, program: importlib.import_module(module).main(arguments, program)
+
+
+def _spell_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """A warning in one line: whoever runs a command need not know which line of the program says it."""
+    return f"deimos: {' '.join(str(message).split())}\n"
 
 
 def _skip_file_errors(thread: threading.ExceptHookArgs) -> None:

@@ -87,7 +87,7 @@ def _explain(struct: Any) -> None:
     if not dataclasses.is_dataclass(struct.type):
         return
     texts: dict[str, str] = {}
-    for kind in reversed(struct.type.__mro__):
+    for kind in reversed(inspect.getmro(struct.type)):
         try:
             body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
         except (OSError, TypeError):  # it has no source
@@ -96,7 +96,7 @@ def _explain(struct: Any) -> None:
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
                 texts[ast.unparse(field.target)] = " ".join(ast.literal_eval(below.value).replace("``", "").split())
     for known in dataclasses.fields(struct.type):
-        known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)  # type: ignore[assignment]
+        known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
 
 
 @contextlib.contextmanager

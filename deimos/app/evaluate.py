@@ -109,15 +109,13 @@ def _evaluate_fear(trainer: Trainer, folder: RunFolder, options: EvaluateOptions
     if options.contexts:
         found = audit.audit_fear(trainer, options.contexts)
         folder.write_json("audit.json", found)
-        lines = [(label, known(found[key])) for label, key in _AUDIT]
-        print("Fear network against exact outcomes", table(("", ""), lines), sep="\n")
+        audited_lines = [(label, known(found[key])) for label, key in _AUDIT]
+        print("Fear network against exact outcomes", table(("", ""), audited_lines), sep="\n")
         return
     audited = audit.audit_calibration(trainer, options.calibration)
     qualities = {name: quality for name, (_, _, quality) in audited.items()}
     folder.write_json("calibration.json", qualities)
     path = figures.draw_calibration(folder, {name: (p, crashed) for name, (p, crashed, _) in audited.items()})
-    lines = [
-        (name.replace("_", " "), *[known(quality[name]) for quality in qualities.values()])
-        for name in next(iter(qualities.values()))
-    ]
+    names = next(iter(qualities.values()))
+    lines = [[name.replace("_", " "), *[known(quality[name]) for quality in qualities.values()]] for name in names]
     print("Fear network's probabilities", table(("", *qualities), lines), path, sep="\n")

@@ -53,17 +53,16 @@ def draw_summary(folder: RunFolder, title: str) -> None:
     curves = [curve for curve in CURVES if any(row.get(curve[0]) for row in rows)]
     if curves[-1:] == [FEAR]:
         curves.remove(VALUES)
-    places = [[column for column, _, _ in curves]] if curves else []
-    if evaluated:
-        places.append([EVALUATION] * max(1, len(curves)))
+    panels = [curve[0] for curve in curves]
+    places = [*([panels] if panels else []), *([[EVALUATION] * max(1, len(panels))] if evaluated else [])]
     if not places:
         return
     figure = Figure(figsize=(11, 3.3 * len(places) + 0.3), layout="constrained")
-    panels = figure.subplot_mosaic(places)
+    axes: dict[str, Axes] = figure.subplot_mosaic(places)  # type: ignore[arg-type]
     for column, label, colour in curves:
-        _curve(panels[column], rows, column, label, colour)
+        _curve(axes[column], rows, column, label, colour)
     if evaluated:
-        _bars(panels[EVALUATION], evaluated)
+        _bars(axes[EVALUATION], evaluated)
     figure.suptitle(title)
     _save(figure, folder.path / "summary.png")
 
