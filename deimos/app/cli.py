@@ -101,6 +101,10 @@ def _drop_broken_streams() -> None:
 
 
 def _run(arguments: list[str]) -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:  # torch's libraries would end the process
+        raise RunError("The working folder does not exist any more; change to one that does.") from error
     if arguments[:1] == ["--version"]:
         print(__version__)
         return

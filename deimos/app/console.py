@@ -217,6 +217,11 @@ def quiet_warp() -> None:
         os.dup2(file.fileno(), 2)  # the warning is printed from C
         try:
             wp.init()
+        except OSError as error:
+            way_out = "set WARP_CACHE_PATH to a folder that can be written."
+            raise RunError(
+                f"Compiled kernels cannot be kept in {error.filename} ({error.strerror}); {way_out}"
+            ) from error
         finally:
             os.dup2(kept, 2)
             os.close(kept)
