@@ -87,7 +87,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", type=Path)
     wp.config.quiet = True
-    found = [measure(path) for path in sorted(parser.parse_args().root.glob("directional-uniform-s*"))]
+    found = [measure(path) for path in sorted(parser.parse_args().root.glob("cells/directional-uniform-s*/run"))]
     same, closed = (np.array(part) for part in zip(*found, strict=True))
     print(f"Crashes per chosen goal on the same decisions, median over {len(found)} policies (min-max):\n")
     print("| rule | learnt fear | the truth |\n|---|---|---|")

@@ -1,8 +1,8 @@
 """How good and how safe a policy is: against uniform goals (Naive) and against the worst ones (Adversary).
 
-Every policy meets the same goals: the i-th goal of a world depends on the evaluation's seed, the world
-and i alone. The Adversary is the argmax Director with a fear network of its own, trained after the
-policy, so that it knows this policy's weaknesses and not those of some training run.
+Every policy meets the same goals: the i-th goal of a world depends on the evaluation's seed, the world and i alone. The
+Adversary is the argmax Director with a fear network of its own, trained after the policy, so that it knows this
+policy's weaknesses and not those of some training run.
 """
 
 import hashlib
@@ -91,15 +91,8 @@ def evaluate_run(
     """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
 
     There they replace the rows of the same evaluation of the same weights. One of another T, size or seed, or of an
-    Adversary that was trained otherwise, is another evaluation, and stays beside them.
-
-    Args:
-        folder: The run.
-        env_config: See ``evaluate``; the others too.
-        config: Sizes and seed.
-        device: Where to simulate.
-        progress: Told how far it is.
-        again: Whether to make rows again that the folder has.
+    Adversary that was trained otherwise, is another evaluation, and stays beside them. Rows that the folder has are
+    made ``again`` or given back as they are; for the other arguments see ``evaluate``.
 
     Returns:
         The rows of this evaluation, those of ``evaluate`` with the policy's ``weights_hash``.
@@ -120,13 +113,12 @@ def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
     """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
     trained = {name: value for name, value in to_dict(config).items() if name not in ("steps", "oracle_worlds")}
     setting = hashlib.sha256(json.dumps(trained, sort_keys=True).encode()).hexdigest()[:12]
-    identities = []
-    for goals, worlds in (("naive", config.worlds), ("adversary", config.worlds), ("oracle", config.oracle_worlds)):
-        if worlds:
-            own = {} if goals == "naive" else {"adversary_setting": setting}
-            shared = {"goal_period": env_config.goal_period, "seed": config.seed, "worlds": worlds}
-            identities.append({"goals": goals} | shared | {"steps": config.steps} | own)
-    return identities
+    sizes = {"naive": config.worlds, "adversary": config.worlds, "oracle": config.oracle_worlds}
+    return [
+        {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed, "worlds": worlds,
+         "steps": config.steps} | ({} if goals == "naive" else {"adversary_setting": setting})
+        for goals, worlds in sizes.items() if worlds
+    ]  # fmt: skip
 
 
 def evaluate(
@@ -143,16 +135,10 @@ def evaluate(
         progress: Told how far it is.
 
     Returns:
-        One row for ``naive`` and one for ``adversary``, and one for ``oracle`` if asked for. In each:
-        ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions``
-        (issued early enough to end in time), ``crash_rate`` (share of those that crashed), steps and
-        crashes under first goals apart, ``return_per_step`` (see ``play``) and ``score``: its place
-        between the policy that does nothing (0) and the environment's reference policy (1), both
-        under the Naive goals; and for the Adversary the size of its collection and its AUROC on
-        worlds that it did not learn from; ``adversary_setting`` is a hash of all that fixed how it was trained, the
-        policy apart. ``tracking`` has the mean of every group of goal
-        components, ``strata`` the same and more by kind of world, where there are kinds, and ``errors``
-        the median of each of ``Env.errors`` over all goals that were survived, at the end of their period.
+        One row for ``naive`` and one for ``adversary``, and one for ``oracle`` if asked for: what ``play`` gives, and
+        ``score``: the place of its ``return_per_step`` between that of the policy that does nothing (0) and that of the
+        environment's reference policy (1), both under Naive goals; NaN where there is none. For the Adversary also
+        what ``train_adversary`` gives, and ``adversary_setting``, a hash of all that fixed its training but the policy.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -203,18 +189,19 @@ def play(
 ) -> dict:
     """Let a policy act under a selector's goals and count.
 
-    ``return_per_step`` is the mean over interactions of (sum of the rewards over the T steps, 0
-    from a crash on) / T. Unlike the mean reward per transition it cannot be raised by crashing,
-    which puts a particle back to the origin, far from every wall.
-
     Returns:
-        See ``evaluate``.
+        ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions`` (issued early enough
+        to end in time), ``crash_rate`` (share of those that crashed), steps and crashes under first goals apart.
+        ``return_per_step``, the mean over interactions of (sum of the rewards over the T steps, 0 from a crash on) / T,
+        cannot be raised by crashing, unlike the reward per transition: a crash puts a particle back to the origin, far
+        from every wall. ``tracking`` has the mean of every group of goal components, ``strata`` the same and more by
+        kind of world, where there are kinds, and ``errors`` the median of each of ``Env.errors`` over all goals that
+        were survived, at the end of their period.
     """
     loop = GoalLoop(env, selector, window=steps)
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)
-    strata = env.strata()
     errors = {name: torch.empty(steps, env.num_envs, device=env.device) for name in env.errors}
     for t in range(steps):
         step = env.step(policy(env.obs))
@@ -231,8 +218,7 @@ def play(
         if t % 100 == 0:
             progress(t / steps)
     env.check()
-    done = loop.interactions.resolved()
-    done = done.where(done.issued <= steps - env.goal_period)  # a later one ends in time only by a crash
+    done = loop.outcomes()
     reward_sum, crash_count, first_count, first_crash_count = totals.sum(1).tolist()
     transitions = steps * env.num_envs
     crashed = int(done.crashed.sum())
@@ -249,7 +235,7 @@ def play(
         "goal_groups": list(env.goal_group_names),
         "tracking": (tracking.mean(0) / steps).tolist(),
         "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
-        "strata": _by_stratum(strata, crashes, tracking / steps, done),
+        "strata": _by_stratum(env.strata(), crashes, tracking / steps, done),
         "errors": {name: values.nanmedian().item() for name, values in errors.items()},
     }
 
@@ -259,13 +245,11 @@ def _by_stratum(strata: list[str], crashes: Tensor, tracking: Tensor, done: Reso
     rows = {}
     for name in sorted(set(strata)):
         own = torch.tensor([stratum == name for stratum in strata], device=crashes.device)
-        ended = done.crashed[own[done.env]]
+        success = 1.0 - done.crashed[own[done.env]].float().mean().item()  # NaN where no interaction has ended
         rows[name] = {
-            "worlds": int(own.sum()),
-            "crashes": int(crashes[own].sum()),
-            "tracking": tracking[own].mean(0).tolist(),
-            "success": 1.0 - ended.float().mean().item() if len(ended) else math.nan,
-        }
+            "worlds": int(own.sum()), "crashes": int(crashes[own].sum()),
+            "tracking": tracking[own].mean(0).tolist(), "success": success,
+        }  # fmt: skip
     return rows
 
 
@@ -281,13 +265,13 @@ def train_adversary(
 ) -> tuple[Fear, dict]:
     """Train a fear network on a finished policy.
 
-    Half of the goals of the collection are uniform and half are the network's own argmax: uniform
-    goals alone would show few crashes of a safe policy, its own choices alone no survivals.
+    Half of the goals of the collection are uniform and half are the network's own argmax: uniform goals alone would
+    show few crashes of a safe policy, its own choices alone no survivals.
 
     Returns:
-        The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``,
-        ``adversary_auroc`` (on every fifth world, which it did not learn from; NaN where they hold no pair to rank) and
-        ``weak_adversary``: whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
+        The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``, ``adversary_auroc`` (on
+        every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``weak_adversary``:
+        whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
     """
     fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed)
     collector = _Collector(env, fear)
@@ -300,13 +284,13 @@ def train_adversary(
         loop.advance(step)
         if t % pause == 0 or t == limit:
             progress(min(1.0, t / config.adversary_steps))
-            data = _whole(loop)
-            fear.fit(_training_part(data), epochs=1)
+            data = loop.outcomes()
+            learnt_from = data.where(data.env % HELD_OUT != 0)
+            fear.fit(learnt_from, epochs=1)
             if _enough(config, len(data), int(data.crashed.sum()), t):
                 break
     env.check()
-    data = _whole(loop)
-    fear.fit(_training_part(data))
+    fear.fit(learnt_from)
     fear.check()
     quality = _quality(fear, data.where(data.env % HELD_OUT == 0))
     crashes = int(data.crashed.sum())
@@ -341,16 +325,6 @@ def _enough(config: EvalConfig, interactions: int, crashes: int, steps: int) -> 
     """Whether the Adversary has seen enough."""
     counts = (interactions >= config.adversary_interactions, crashes >= config.adversary_crashes)
     return any(counts) if config.adversary_enough == "any" else all(counts) and steps >= config.adversary_steps
-
-
-def _whole(loop: GoalLoop) -> Resolved:
-    """What was issued at least T steps ago: of the later ones only the crashes are known yet."""
-    data = loop.interactions.resolved()
-    return data.where(data.issued <= loop.interactions.now - loop.env.goal_period)
-
-
-def _training_part(data: Resolved) -> Resolved:
-    return data.where(data.env % HELD_OUT != 0)
 
 
 class _Collector(GoalSelector):

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from deimos import __version__
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run.config import from_dict, kind, to_dict
@@ -66,15 +66,10 @@ def _commit() -> str:
 
 
 def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tuple[Trainer, RunFolder]:
-    """Begin a run.
-
-    Args:
-        config: What to train.
-        path: Its folder; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
-        init_from: An earlier run whose networks this one starts with.
+    """Begin a run, in ``path`` or in ``runs/ENV-METHOD-sSEED-TIME``, with the networks of ``init_from`` if it is given.
 
     Raises:
-        RunError: If the folder exists, or ``init_from`` does not fit.
+        RunError: If the folder exists, or the networks do not fit.
     """
     device = resolve_device(config.device)
     config = replace(config, threads=config.threads or cores(), device="cuda" if device.type == "cuda" else "cpu")
@@ -150,25 +145,16 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
             raise ValueError(f"it observes {layout}, this one {trainer.env.layout}")
         trainer.ppo.load_weights(state["ppo"])
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise RunError(f"The networks of {origin.path} do not fit this run: {reason}") from error
+        raise RunError(f"The networks of {origin.path} do not fit this run: {one_line(error)}") from error
 
 
 def load_checkpoint(folder: RunFolder) -> dict:
-    """What a run's checkpoint holds, of this version or of the one before.
-
-    Raises:
-        RunError: If there is none, or it is broken or foreign.
-    """
+    """What a run's checkpoint holds, of this version or of the one before; ``RunError`` as ``load_tensors`` has it."""
     return load_tensors(folder.path / "checkpoint.pt", "checkpoint", CHECKPOINT_SCHEMA, oldest=1)
 
 
 def load(folder: RunFolder, config: TrainConfig) -> Trainer:
     """Rebuild a run as it was at its last checkpoint; writes nothing.
-
-    Args:
-        folder: Its folder.
-        config: Its configuration.
 
     Raises:
         RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
@@ -186,12 +172,7 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
 
 
 def resume(path: Path, env_steps: int | None = None, device: str | None = None) -> tuple[Trainer, RunFolder]:
-    """Resume a run from its last checkpoint.
-
-    Args:
-        path: Its folder.
-        env_steps: A larger budget; ``None`` for the one that it had.
-        device: Where to resume; ``None`` for where it was.
+    """Resume a run from its last checkpoint, with a larger budget ``env_steps`` or on another device if they are given.
 
     Raises:
         RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.
@@ -241,21 +222,13 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
 
 
 def train(
-    trainer: Trainer,
-    folder: RunFolder,
-    report: Callable[[dict[str, float], float], None] = lambda row, fps: None,
+    trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None] = lambda row, fps: None,
     stopped: Callable[[], bool] = lambda: False,
-) -> bool:
-    """Run all iterations that are left.
+) -> bool:  # fmt: skip
+    """Run all iterations that are left, and return whether the budget was used up.
 
-    Args:
-        trainer: New or resumed.
-        folder: Where its files go.
-        report: Called after every iteration with its row and the frames per second.
-        stopped: Asked after every iteration; true ends the run early, with a checkpoint.
-
-    Returns:
-        Whether the budget was used up.
+    After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true
+    ends the run early, with a checkpoint.
 
     Raises:
         SimulationError: If a number is not finite; the last checkpoint is intact.

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
 
-from deimos.checks import RunError, SimulationError
+from deimos.checks import RunError, SimulationError, one_line
 from deimos.run import training
 from deimos.run.evaluation import evaluate_run
 from deimos.run.folder import RunFolder
@@ -72,7 +72,7 @@ def main(arguments: list[str], stopped: Callable[[], bool] = lambda: False) -> i
     try:
         return 0 if run(study, study.cell(name), stopped) else STOPPED
     except (RunError, SimulationError) as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
+        print(one_line(error), file=sys.stderr)
         return 2
 
 
