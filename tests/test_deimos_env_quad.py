@@ -215,7 +215,7 @@ def test_warp_and_torch_see_one_allocation_and_views_stay(task, torch_device):
         loop.advance(last)
     assert last is first
     assert addresses == [t.data_ptr() for t in (*env.tensors.values(), *vars(last).values())]
-    assert env.tensors["qpos"].data_ptr() == env.physics.qpos.ptr
+    assert env.tensors["qpos"].data_ptr() == env.physics.arrays.qpos.ptr
 
 
 @both
@@ -663,7 +663,7 @@ def test_actions_are_what_the_joints_can_do(torch_device):
     assert env.action_bound == pytest.approx(np.abs(ends).max())
     np.testing.assert_allclose(torch.stack(env.action_range), ends.T, rtol=1e-6)
     step = env.step(torch.tensor([[1e6], [-1e6]], device=torch_device).expand(2, 12))
-    np.testing.assert_allclose(env.physics.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(env.physics.arrays.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
     np.testing.assert_allclose(step.obs[:, 36:48].cpu(), ends.T[::-1], rtol=1e-6)
 
 

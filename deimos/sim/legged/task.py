@@ -139,28 +139,21 @@ class Locomotion(WarpEnv):
         numbers: dict[str, Any] = {name: size for name, size in sizes.items() if name != "num_envs"}
         low, high = np.array([joint.range for joint in joints]).T
         action_low, action_high = np.array([joint.action_range for joint in joints]).T
-        scale, device = [joint.action_scale for joint in joints], warp_device(self.device)
-        simulation = {name: getattr(self.physics, name) for name in tables.SIMULATION.names}
+        device = warp_device(self.device)
         return LeggedWorlds(
             sizes=sizes,
             params=self._make_params(ground),
             worlds=self.worlds,
             joints=tables.build(
-                tables.JOINTS,
-                device,
-                pose=self.robot.pose,
-                action_scale=scale,
-                low=low,
-                high=high,
-                action_low=action_low,
-                action_high=action_high,
+                tables.JOINTS, device, pose=self.robot.pose, action_scale=[joint.action_scale for joint in joints],
+                low=low, high=high, action_low=action_low, action_high=action_high,
             ),
             ground=tables.build(tables.GROUND, device, heights=land.heights, origin=land.origins),
             sensing=tables.build(tables.SENSING, device, noise=_noise(self.layout, self.parts), point=self.points),
             state=self.allocate(tables.STATE, **numbers),
             out=self.allocate(tables.STEP, resume=False, **numbers),
-            sim=tables.build(tables.SIMULATION, device, **simulation),
-        )
+            sim=self.physics.arrays,
+        )  # fmt: skip
 
     def _make_params(self, ground: Terrain | None) -> LocomotionParams:
         """What the kernels need to know."""
