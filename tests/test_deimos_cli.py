@@ -375,7 +375,7 @@ def test_true_process_says_one_line(copied, arguments):
     ("arguments", "package"),
     [
         (["terrain", "shape", "flat"], "trimesh"),
-        (["play", "run", "--video", "x.mp4"], "mujoco"),
+        (["play", str(HOME / "docs" / "results" / "quad_flat"), "--video", "x.mp4"], "mujoco"),
         (["train", "env:quad", "--num-envs", "1"], "mujoco"),
     ],
 )
@@ -509,7 +509,9 @@ def test_run_leaves_its_files(finished):
         "config.json", "progress.csv", "timing.csv", "checkpoint.pt", "policy.pt", "evaluation.json", "summary.png",
     }  # fmt: skip
     assert out.splitlines()[-1] == str(path)
-    assert re.search(r"Naive .*Adversary", out)
+    assert re.search(r"uniform goals +feared goals\n +\(Naive\) +\(Adversary\)\n", out)
+    assert re.search(r"\n\nUnder uniform goals .* of the goals end in a crash; the Adversary, .*\n", out)
+    assert re.search(r"\nTraining took \d+\.\d s: env \d+%, policy ", out)
     assert (path / "summary.png").read_bytes().startswith(b"\x89PNG")
     folder = RunFolder(path)
     assert [row["iteration"] for row in folder.read_csv("progress.csv")] == ["1", "2"]

@@ -1,5 +1,6 @@
 """Where commands run: other people's environments, streams and folders."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -204,13 +205,16 @@ def test_a_tilde_is_the_home_folder(monkeypatch, tmp_path, place):
 
 
 def test_progress_without_a_terminal_is_a_plain_line(monkeypatch, capfd):
-    """Where there is no terminal, now and then a line says how far it is; it is whole and has no control characters."""
-    clock = iter([0.0, 1.0, 25.0, 25.0, 30.0, 50.0, 50.0])
+    """Where there is no terminal, now and then a whole line says how far it is, and more seldom in a long job."""
+    clock = iter([0.0, 1.0, 25.0, 30.0, 50.0, 10_000.0, 10_400.0, 10_600.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     with console.progress("training") as report:
-        for i in range(4):
-            report(f"iteration {i}", i / 4)
-    assert capfd.readouterr().err == "training: iteration 1, 25%\ntraining: iteration 3, 75%\n"
+        for i in range(1, 8):
+            report(f"iteration {i}", i / 8)
+    said = capfd.readouterr().err.splitlines()
+    assert said == [
+        f"training: iteration {i}, {share}" for i, share in ((2, "25%"), (4, "50%"), (5, "62%"), (7, "88%"))
+    ]
 
 
 def test_progress_of_a_short_run_is_silent(tmp_path, capfd):
@@ -264,3 +268,25 @@ def test_a_broken_plugin_is_named_and_breaks_nothing(tmp_path):
         lines = done.stderr.splitlines()
         assert lines
         assert all(re.match("deimos: The plug-in 'broken' of deimos.*broken_module, is broken", line) for line in lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class Described:
+    """What a stranger's plug-in holds."""
+
+    plain: int = 3
+    long: int = 4
+    """A text that goes on
+    over two lines, with ``code``."""
+    other: int = 5
+    ...
+
+
+def test_help_takes_plugins_as_they_are(monkeypatch, capsys):
+    """A field without a docstring is listed without one, and a docstring of several lines is one text."""
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        console.parse(Described, ["--help"], "program")
+    out = capsys.readouterr().out
+    assert "A text that goes on over two lines, with code. (default: 4)" in out
+    assert all(flag in out for flag in ("--plain", "--other"))

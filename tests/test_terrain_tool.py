@@ -44,8 +44,8 @@ def test_every_shape_and_preset_is_named(capsys):
     assert run("shape") == 0
     said = capsys.readouterr().out
     for name in catalog.names():
-        assert f"  {name} " in said
-        assert (type(catalog.make(name)).__doc__ or "").splitlines()[0] in said
+        assert f"\n  {name} " in said
+        assert (type(catalog.make(name)).__doc__ or "").splitlines()[0] in " ".join(said.split())
     assert run("grid", "--help") == 0
     said = capsys.readouterr().out
     for name in presets.preset_names():

@@ -79,14 +79,9 @@ def _prepare_process() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
         if stream is None:  # closed: the next file that is opened would take its number, and all that is said to it
-            with contextlib.suppress(OSError):
-                os.fstat(number)
-                continue
-            null = os.open(os.devnull, os.O_RDWR)
-            if null != number:
-                os.dup2(null, number)
-                os.close(null)
-            setattr(sys, name, open(number, "w" if number else "r", closefd=False))
+            null = open(os.devnull, "w" if number else "r")
+            os.dup2(null.fileno(), number)
+            setattr(sys, name, null)
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path that this terminal cannot spell
 

@@ -27,7 +27,8 @@ Command = Callable[[list[str], str], None]
 """Runs on its arguments, under the name that a person calls it by, such as ``deimos study run``."""
 
 LEAST_WIDTH = 60  # columns of a terminal that help is wrapped at
-PLAIN_SECONDS = 20.0  # from line to line, where progress cannot be shown in place
+# From line to line where progress cannot be shown in place: seconds at least, and a share of what has passed.
+PLAIN_SECONDS, PLAIN_SHARE = 20.0, 0.05
 
 
 def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments: list[str], program: str) -> None:
@@ -69,16 +70,15 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
     import tyro
 
     arguments = [_at_home(argument) for argument in arguments]
-    try:
-        from tyro._errors import on_parse_error  # since 1.0.17, and not promised
-    except ImportError:  # then tyro's own, framed words stay, with exit code 2
-        hook: Any = contextlib.nullcontext()
-    else:
-        hook = on_parse_error(_refuse)
-    if {"-h", "--help"} & set(arguments):
-        more["registry"] = registry = tyro.constructors.ConstructorRegistry()
-        registry.struct_rule(_explain)
-    with hook, _wrapped_help():
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(ImportError):  # then tyro's own, framed words stay, with exit code 2
+            from tyro._errors import on_parse_error  # since 1.0.17, and not promised
+
+            stack.enter_context(on_parse_error(_refuse))
+        if {"-h", "--help"} & set(arguments):
+            more["registry"] = registry = tyro.constructors.ConstructorRegistry()
+            registry.struct_rule(_explain)
+            stack.enter_context(_wrapped_help())
         return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
 
 
@@ -90,13 +90,15 @@ def _explain(struct: Any) -> None:
     for kind in reversed(inspect.getmro(struct.type)):
         try:
             body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
-        except (OSError, TypeError):  # it has no source
+        except (OSError, TypeError, SyntaxError):  # it has no source, or none that stands by itself
             continue
         for field, below in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
-                texts[ast.unparse(field.target)] = " ".join(ast.literal_eval(below.value).replace("``", "").split())
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
+                    texts[name] = " ".join(text.replace("``", "").split())
     for known in dataclasses.fields(struct.type):
-        known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+        if known.name in texts:
+            known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
 
 
 @contextlib.contextmanager
@@ -145,7 +147,7 @@ def _refuse(event: Any) -> None:
 def progress(title: str) -> Iterator[Callable[[str, float], None]]:
     """Show how far something is: gives the function that reports (what is done, fraction of the whole that is done).
 
-    On a terminal a bar; elsewhere, such as in the log of a job, a plain line every ``PLAIN_SECONDS``.
+    On a terminal a bar; elsewhere, such as in the log of a job, a plain line now and then, more seldom in a long job.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -163,12 +165,13 @@ def progress(title: str) -> Iterator[Callable[[str, float], None]]:
 
 
 def _plain_progress(title: str) -> Callable[[str, float], None]:
-    last = time.monotonic()
+    begin = last = time.monotonic()
 
     def report(stage: str, fraction: float) -> None:
         nonlocal last
-        if time.monotonic() - last >= PLAIN_SECONDS:
-            last = time.monotonic()
+        now = time.monotonic()
+        if now - last >= max(PLAIN_SECONDS, PLAIN_SHARE * (last - begin)):
+            last = now
             print(f"{title}: {stage}, {fraction:.0%}", file=sys.stderr, flush=True)
 
     return report

@@ -94,7 +94,8 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
         figures.draw_summary(folder, title(config))
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
-        print("time:", *[f"{name} {100 * seconds / total:.1f} % " for name, seconds in trainer.seconds.items()])
+        parts = [f"{name} {seconds / total:.0%}" for name, seconds in trainer.seconds.items()]
+        print(f"Training took {total:.1f} s: {', '.join(parts)}.")
     print(folder.path)
 
 
