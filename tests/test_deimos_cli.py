@@ -342,6 +342,13 @@ def test_evaluation_of_a_run_without_policy_is_refused(copied, capfd):
     assert f"There is no policy at {copied / 'policy.pt'}." in refused(["evaluate", copied], capfd)
 
 
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(copied, capfd, monkeypatch):
+    """An evaluation that could not be kept is not begun."""
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert refused(["evaluate", copied], capfd) == f"deimos: {copied} cannot be written to; evaluate a copy of it.\n"
+
+
 def test_broken_evaluation_is_refused_before_the_work(copied, capfd, monkeypatch):
     """An evaluation.json that cannot be added to is refused before anything is computed, and stays as it is."""
     monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))

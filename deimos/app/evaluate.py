@@ -1,5 +1,6 @@
 """``deimos evaluate``: the policy of a run under Naive and the Adversary, or its fear network against what happened."""
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,7 @@ import tyro
 from deimos.app import console, figures
 from deimos.app.console import table
 from deimos.app.findings import describe, known
-from deimos.checks import check_at_least
+from deimos.checks import RunError, check_at_least
 from deimos.run import api, audit, training
 from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig, evaluate_run
@@ -73,6 +74,8 @@ def main(arguments: list[str], program: str) -> None:
     """Run ``deimos evaluate``."""
     options: EvaluateOptions = console.parse(EvaluateOptions, arguments, program)
     folder = RunFolder.open(options.run)
+    if not os.access(folder.path, os.W_OK):  # it is said before the work, which would be lost
+        raise RunError(f"{folder.path} cannot be written to; evaluate a copy of it.")
     config = training.read_config(folder)
     torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
     console.quiet_warp()
