@@ -158,7 +158,7 @@ def progress(title: str) -> Iterator[Callable[[str, float], None]]:
         return
     text = TextColumn(title + ": {task.description}", markup=False)
     with Progress(
-        text, BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=screen, transient=True
+        text, BarColumn(bar_width=12), TaskProgressColumn(), TimeRemainingColumn(), console=screen, transient=True
     ) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)

@@ -31,6 +31,7 @@ _AUDIT = (
     ("crash rate", "crash_rate"),
     ("after iteration", "iteration"),
 )
+_QUALITIES = {"auroc": "AUROC (0.5: chance, 1: perfect)", "brier": "Brier score", "ece": "expected calibration error"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,5 +121,8 @@ def _evaluate_fear(trainer: Trainer, folder: RunFolder, options: EvaluateOptions
     folder.write_json("calibration.json", qualities)
     path = figures.draw_calibration(folder, {name: (p, crashed) for name, (p, crashed, _) in audited.items()})
     names = next(iter(qualities.values()))
-    lines = [[name.replace("_", " "), *[known(quality[name]) for quality in qualities.values()]] for name in names]
+    lines = [
+        [_QUALITIES.get(name, name.replace("_", " ")), *[known(quality[name]) for quality in qualities.values()]]
+        for name in names
+    ]
     print("Fear network's probabilities", table(("", *qualities), lines), path, sep="\n")

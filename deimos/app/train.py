@@ -101,12 +101,12 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
 
 @contextlib.contextmanager
 def _training_progress(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
-    """Iteration, frames per second, reward, crashes per 1000 transitions."""
+    """Frames per second, reward and crashes per 1000 transitions, short enough for 80 columns."""
     total = trainer.config.iterations
     with console.progress("training") as report:
         yield lambda row, fps: report(
-            f"iteration {row['iteration']} of {total}, {fps:,.0f} FPS, reward {console.number(row['reward'])}, "
-            f"{console.number(row['crashes_per_1000'])} crashes per 1000 steps",
+            f"{fps:,.0f} FPS, reward {console.number(row['reward'])}, "
+            f"crashes/1000 {console.number(row['crashes_per_1000'])}",
             row["iteration"] / total,
         )
 
