@@ -17,14 +17,14 @@ SMALL = Path(__file__).parent.parent / "examples" / "study.toml"
 )
 def test_seeds_are_a_number_a_range_or_a_list(text, seeds):
     """A plain number is how many seeds; a range and a list say which."""
-    assert cli.parse_seeds(text) == seeds
+    assert plan.parse_seeds(text) == seeds
 
 
 @pytest.mark.parametrize("text", ["", "-3", "a", "3-", "5-3", "1;2", "1.5"])
 def test_other_seeds_are_refused(text):
     """Anything else is refused with what it was."""
     with pytest.raises(RunError, match=f"seeds must be .*got '{text}'"):
-        cli.parse_seeds(text)
+        plan.parse_seeds(text)
 
 
 @pytest.mark.parametrize(

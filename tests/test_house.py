@@ -307,6 +307,23 @@ print(deimos.kernels.__file__)
     assert Path(done.stdout.strip()) == HOME / "kernels" / "__init__.py"
 
 
+def test_checkout_is_used_beside_an_editable_install_of_another(tmp_path):
+    """The import hook of another checkout's editable install gives this one none of its kernels."""
+    (tmp_path / "kernels.py").write_text("raise AssertionError('the other one')")
+    code = f"""
+import importlib.util, sys
+class Hook:
+    def find_spec(name, path=None, target=None):
+        if name == "deimos.kernels":
+            return importlib.util.spec_from_file_location(name, {str(tmp_path / "kernels.py")!r})
+sys.meta_path.append(Hook)  # where setuptools puts its own
+import deimos.kernels
+print(deimos.kernels.__file__)
+"""
+    done = python(code, cwd=tmp_path)
+    assert (done.stdout.strip(), done.stderr) == (str(HOME / "kernels" / "__init__.py"), "")
+
+
 def test_nothing_else_of_a_checkout_is_in_the_package():
     """Of what lies beside the package only ``kernels`` and ``terrain`` are its modules: ``deimos.train`` is none."""
     beside = {path.stem for path in HOME.glob("[!.]*") if path.suffix == ".py" or list(path.glob("*.py"))}

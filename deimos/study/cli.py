@@ -1,7 +1,6 @@
 """The commands of ``deimos study``: the options of each, and ``run``, which does what it is for."""
 
 import math
-import re
 import sys
 from collections import defaultdict
 from collections.abc import Callable
@@ -108,24 +107,9 @@ class RunOptions(_FolderOptions):
     def _described(self, file: Path) -> list[plan.Cell]:
         train = {name: getattr(self, name) for name in ("num_envs", "env_steps", "device", "threads")}
         return plan.expand(
-            plan.read(file), seeds=None if self.seeds is None else parse_seeds(self.seeds), methods=self.methods,
-            environments=self.environments, train={name: x for name, x in train.items() if x is not None},
+            plan.read(file), seeds=self.seeds, methods=self.methods, environments=self.environments,
+            train={name: x for name, x in train.items() if x is not None},
         )  # fmt: skip
-
-
-def parse_seeds(text: str) -> list[int]:
-    """Seeds of ``10`` (the first ten), ``10-19`` or ``0,3,5``; raises ``RunError`` for anything else."""
-    if re.fullmatch(r"[1-9]\d*", text):
-        return list(range(int(text)))
-    seeds: list[int] = []
-    for part in text.split(","):
-        found = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
-        span = range(int(found[1]), int(found[2] or found[1]) + 1) if found else ()
-        if not span:
-            example = "a number of seeds, a range that rises like 10-19 or a list like 0,3,5"
-            raise RunError(f"seeds must be {example}, got '{text}'.")
-        seeds += span
-    return seeds
 
 
 @dataclass(frozen=True, kw_only=True)

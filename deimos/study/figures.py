@@ -183,7 +183,8 @@ def _line(
         x, y, drawstyle=step and f"steps-{step}", color=style.colours[name], linewidth=1.6, label=name,
         marker=style.marker(name), markersize=4.5, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
     )  # fmt: skip
-    axes.fill_between(x, *band, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
+    low, high = band
+    axes.fill_between(x, low, high, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
 
 
 def _rolling(x: Array, window: int) -> Array:

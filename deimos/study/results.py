@@ -240,7 +240,7 @@ def _value(kind: type, given: Any) -> Any:
     if kind is tuple:
         return tuple(map(float, given.split() if isinstance(given, str) else given or ()))
     if kind in (dict, list):
-        found = json.loads(given) if given and isinstance(given, str) else given or kind()
+        found: Any = json.loads(given) if given and isinstance(given, str) else given or kind()
         return found if kind is list else {name: math.nan if value is None else value for name, value in found.items()}
     if given is None or given == "":
         return math.nan if kind in (int, float) else None
