@@ -91,15 +91,8 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
     """
     check_positive("size", size, finite=True)
     samples = cells("size", size, cell) + 1
-    return Terrain(
-        heights=np.zeros((samples, samples), np.float32),
-        cell=cell,
-        corner=(-size / 2, -size / 2),
-        origins=np.zeros((1, 1, 3), np.float32),
-        shapes=("flat",),
-        tile=size,
-        difficulty=np.zeros(1, np.float32),
-    )
+    corner, origins, difficulty = (-size / 2, -size / 2), np.zeros((1, 1, 3), np.float32), np.zeros(1, np.float32)
+    return Terrain(np.zeros((samples, samples), np.float32), cell, corner, origins, ("flat",), size, difficulty)
 
 
 def check_heights(heights: np.ndarray) -> None:
