@@ -84,7 +84,7 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
 
 def _explain(struct: Any) -> None:
     """Tell tyro the docstrings below the fields of a dataclass, without the line breaks that it would keep."""
-    if not dataclasses.is_dataclass(struct.type):
+    if not (isinstance(struct.type, type) and dataclasses.is_dataclass(struct.type)):
         return
     texts: dict[str, str] = {}
     for kind in reversed(inspect.getmro(struct.type)):
