@@ -6,6 +6,7 @@ Importing it needs Python alone, so that ``deimos`` can say which packages are m
 import ast
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
 import itertools
@@ -88,17 +89,26 @@ def _explain(struct: Any) -> None:
         return
     texts: dict[str, str] = {}
     for kind in reversed(inspect.getmro(struct.type)):
-        try:
-            body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
-        except (OSError, TypeError, SyntaxError):  # it has no source, or none that stands by itself
-            continue
-        for field, below in itertools.pairwise(body):
-            match field, below:
-                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
-                    texts[name] = " ".join(text.replace("``", "").split())
+        texts |= _docstrings(kind.__module__).get(kind.__name__, {})
     for known in dataclasses.fields(struct.type):
         if known.name in texts:
             known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+
+
+@functools.cache
+def _docstrings(module: str) -> dict[str, dict[str, str]]:
+    """The docstrings below the fields of a module's classes, by class and field."""
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+    except (OSError, TypeError):  # it has no source
+        return {}
+    found: dict[str, dict[str, str]] = {}
+    for node in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
+        for field, below in itertools.pairwise(node.body):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
+                    found.setdefault(node.name, {})[name] = " ".join(text.replace("``", "").split())
+    return found
 
 
 @contextlib.contextmanager
