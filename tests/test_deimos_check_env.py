@@ -109,6 +109,10 @@ FORGOTTEN = {
         '    """Carts; see ``Config``."""\n', "    goal_groups = (slice(0, 1), slice(0, 1))\n",
         "goal_groups must name every component of a goal once",
     ),
+    "a name": (
+        '    """Carts; see ``Config``."""\n', '    goal_group_names = ("place", "speed")\n',
+        "goal_group_names must name every group once",
+    ),
 }  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import pytest
 from deimos.checks import RunError
 from deimos.study import cli, plan
 from deimos.study.results import RESULT_COLUMNS, Results, identity
+from deimos.study.runner import Progress
 
 SMALL = Path(__file__).parent.parent / "examples" / "study.toml"
 
@@ -98,6 +99,13 @@ def test_empty_folder_is_refused(tmp_path, name):
     """There is nothing to show, export or report in an empty folder, and the line says so."""
     with pytest.raises(RunError, match="holds no "):
         cli.COMMANDS[name](folder=tmp_path).run()
+
+
+def test_progress_counts_what_is_done():
+    """The share of a study that is done counts finished and failed cells in full and running ones by their training."""
+    progress = Progress(5, 1, {"a": "it failed"}, {"b": 0.5, "c": 1.0}, seconds_left=90.0)
+    assert cli._share(progress) == pytest.approx(0.7)
+    assert cli._summary(progress) == "1 of 5 cells finished, 1 failed, b 50%, c evaluating, 0:01:30 left"
 
 
 def test_every_command_explains_itself():

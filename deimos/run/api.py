@@ -19,6 +19,9 @@ from deimos.sim.shared import one_stream
 def train(config: TrainConfig | None = None, out: Path | str | None = None) -> Path:
     """Train a policy and evaluate it.
 
+    The environment of the process is left alone. Where other programs use the cores too, set OMP_WAIT_POLICY=passive
+    before torch is loaded, as the ``deimos`` command does: threads that spin while they wait are slow there.
+
     Args:
         config: What to train; ``None`` for the main job, Particle Gym under the Director.
         out: Folder of the run, which must not exist; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.

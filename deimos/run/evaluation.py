@@ -232,6 +232,7 @@ def play(
         "first_goal_steps": int(first_count),
         "first_goal_crashes": int(first_crash_count),
         "return_per_step": done.reward.double().mean().item() / env.goal_period,
+        "goal_groups": list(env.goal_group_names),
         "tracking": (tracking.mean(0) / steps).tolist(),
         "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
         "strata": _by_stratum(env.strata(), crashes, tracking / steps, done),

@@ -18,6 +18,7 @@ from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run.config import from_dict, kind, to_dict
+from deimos.run.cores import cores
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 
@@ -42,25 +43,26 @@ def resolve_device(name: str) -> torch.device:
     return torch.device("cuda", 0) if name != "cpu" and torch.cuda.is_available() else torch.device("cpu")
 
 
-def cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def provenance() -> dict[str, str]:
     """Versions, commit and platform that a run's numbers belong to."""
     packages = ("torch", "warp-lang", "numpy")
-    home = Path(__file__).resolve().parent
-    git = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=home, capture_output=True, text=True, check=False
-    )
     return {
         "deimos": __version__,
-        "commit": git.stdout.strip() if git.returncode == 0 else "unknown",
+        "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
         **{name: version(name) for name in packages},
     }
+
+
+def _commit() -> str:
+    """The commit of the checkout that this file is in; unknown where it is installed, or without git."""
+    home = Path(__file__).resolve().parents[2]
+    describe = ["git", "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]  # no repository around it
+    try:
+        return subprocess.run(describe, cwd=home, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tuple[Trainer, RunFolder]:
@@ -75,8 +77,7 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
     trainer = build(config, device)
     if init_from is not None:
         _load_weights(trainer, RunFolder.open(init_from))
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    folder = RunFolder.create(path or Path("runs") / f"{kind(config.env)}-{config.label}-s{config.seed}-{stamp}")
+    folder = RunFolder.create(path) if path else _new_folder(config)
     try:
         folder.write_json("config.json", {
             "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
@@ -87,6 +88,20 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
         shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
         raise
     return trainer, folder
+
+
+def _new_folder(config: TrainConfig) -> RunFolder:
+    """A folder named after the run; the second of the same second ends in -2."""
+    name = f"{kind(config.env)}-{config.label}-s{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    path, number = Path("runs") / name, 1
+    while True:
+        try:
+            return RunFolder.create(path)
+        except RunError:
+            if not path.exists():  # it is not the name
+                raise
+        number += 1
+        path = path.with_name(f"{name}-{number}")
 
 
 def build(config: TrainConfig, device: torch.device) -> Trainer:

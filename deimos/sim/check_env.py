@@ -120,6 +120,7 @@ def _check_layout(env: Env, build: Build) -> Claims:
     for group in env.goal_groups:
         covered[group] += 1
     yield covered == 1, "goal_groups must name every component of a goal once."
+    yield len(env.goal_group_names) == len(env.goal_groups), "goal_group_names must name every group once."
     yield len(env.strata()) in (0, WORLDS), "strata must name every world's kind, or be empty."
 
 
