@@ -23,10 +23,8 @@ def read() -> dict[str, np.ndarray]:
     variants = sorted({row["environment"] for row in rows})
 
     def values(method: str, goals: str, column: str) -> np.ndarray:
-        return np.array([
-            [float(row[column]) for row in rows if (row["environment"], row["method"], row["goals"]) == (variant, method, goals)]
-            for variant in variants
-        ])  # fmt: skip
+        own = [row for row in rows if (row["method"], row["goals"]) == (method, goals)]
+        return np.array([[float(row[column]) for row in own if row["environment"] == name] for name in variants])
 
     unit = values("uniform", "naive", "score").mean(axis=1, keepdims=True)
     return {
@@ -51,8 +49,8 @@ def table() -> str:
         digits = (2, 1, 2)
         cells = [f"{m:.{d}f} [{a:.{d}f}, {b:.{d}f}]" for m, a, b, d in zip(mean, low, high, digits, strict=True)]
         lines.append((mean[1], f"| `{method}` | " + " | ".join(cells) + " |"))
-    head = "| method | uniform goals that crash [%] | Adversary's goals that crash [%] | score, Uniform = 1 |\n|---|---|---|---|\n"
-    return head + "\n".join(line for _, line in sorted(lines))
+    head = "| method | uniform goals that crash [%] | Adversary's goals that crash [%] | score, Uniform = 1 |"
+    return "\n".join([head, "|---|---|---|---|", *(line for _, line in sorted(lines))])
 
 
 if __name__ == "__main__":
