@@ -28,7 +28,7 @@ myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True}
 napoleon_google_docstring = True
 python_maximum_signature_line_length = 90
 
@@ -52,10 +52,16 @@ class DarkPictures(SphinxTransform):
 
 
 def prepare_docstring(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Give sources a number of their own on the page, and keep Napoleon from taking a field's words for its type."""
-    lines[:] = [re.sub(r"\[(\d+)\](?=_|\s)", rf"[#{name.lower()}.\1]", line) for line in lines]
+    """Print sources as the docstring does, and keep Napoleon from taking words in front of a colon for a type.
+
+    It looks for one in the first line of a field and of what is returned; a line with nothing to print comes first.
+    """
+    lines[:] = [re.sub(r"^(\s*)\.\. (?=\[\d+\])", r"\1", re.sub(r"(\[\d+\])_", r"\1", line)) for line in lines]
     if what in ("attribute", "property"):
-        lines.insert(0, "")  # Napoleon reads "TYPE: text" in the first line
+        lines.insert(0, "\\ ")
+    for i, line in reversed(list(enumerate(lines))):
+        if line.strip() in ("Returns:", "Yields:"):
+            lines.insert(i + 1, line[: len(line) - len(line.lstrip())] + "    \\ ")
 
 
 def setup(app: Sphinx) -> None:
