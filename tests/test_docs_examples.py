@@ -57,10 +57,11 @@ STUDY_EVAL = "eval = { worlds = 8, steps = 200, adversary_steps = 20, adversary_
 
 ELSEWHERE = {
     r"python3 -m venv |\. \.venv/|pip install .*pre-commit": "README's lines and lint are what .ci/run runs",
+    r"pip install torch==": "it fetches from another host; no test does",
     r"python examples/\w+\.py$": "tests/test_examples.py",
     r"deimos study run docs/results/particle ": "tests/test_reproduction_studies.py plans it",
 }
-"""Commands that another test runs."""
+"""Commands that are run elsewhere, and where."""
 
 
 @dataclass
