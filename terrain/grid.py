@@ -33,6 +33,7 @@ class Terrain:
     """Difficulty of each level, in [0, 1], float32, shape (levels,)."""
 
     def __post_init__(self) -> None:
+        check_heights(self.heights)
         check_positive("cell", self.cell, finite=True)
         check_positive("tile", self.tile, finite=True)
         levels, columns = len(self.difficulty), len(self.shapes)
@@ -42,8 +43,6 @@ class Terrain:
                 raise ValueError(f"{name} must be float32 of shape {shape}, got {array.dtype} of shape {array.shape}.")
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite everywhere.")
-        if self.heights.ndim != 2 or min(self.heights.shape) < 2:
-            raise ValueError(f"heights must have at least 2 x 2 samples, got the shape {self.heights.shape}.")
 
     @property
     def size(self) -> tuple[float, float]:
@@ -101,6 +100,20 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
         tile=size,
         difficulty=np.zeros(1, np.float32),
     )
+
+
+def check_heights(heights: np.ndarray) -> None:
+    """Raise ``ValueError`` unless ``heights`` are a grid of at least 2 x 2 finite numbers."""
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise ValueError(f"heights must have at least 2 x 2 samples, got the shape {heights.shape}.")
+    if not np.isfinite(heights).all():
+        raise ValueError("heights must be finite everywhere.")
+
+
+def on_ground(middles: np.ndarray, heights: np.ndarray, cell: float, corner: tuple[float, float]) -> np.ndarray:
+    """Points on the samples' ground, float32, shape (..., 3), above each x and y [m] of ``middles``, shape (..., 2)."""
+    i, j = np.moveaxis(np.rint((middles - corner) / cell).astype(int), -1, 0)
+    return np.concatenate([middles, heights[i, j][..., None]], axis=-1).astype(np.float32)
 
 
 def cells(name: str, length: float, cell: float) -> int:

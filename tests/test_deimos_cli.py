@@ -416,7 +416,7 @@ def described_fields(config, prefix=""):
     classes = [kind for kind in type(config).__mro__ if dataclasses.is_dataclass(kind)]
     trees = [ast.parse(inspect.getsource(kind)).body[0] for kind in classes]
     texts = {
-        field.target.id: " ".join(doc.value.value.split())
+        field.target.id: " ".join(doc.value.value.replace("``", "").split())
         for tree in reversed(trees)
         for field, doc in zip(tree.body, tree.body[1:], strict=False)
         if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr)

@@ -85,7 +85,7 @@ def test_results_of_another_schema_stop_the_run(tmp_path):
 def test_cells_that_do_not_compare_with_the_results_stop_the_run(tmp_path, change, message):
     """A study of another setting, or of another selector of the same name, is refused before its cells are made."""
     (cell,) = plan.expand(plan.read(SMALL), seeds=[7], methods=["p25"])
-    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
+    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
     row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | identity(cell) | change
     Results([row]).write(tmp_path)
     with pytest.raises(RunError, match=message):

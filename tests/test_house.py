@@ -3,6 +3,7 @@
 import ast
 import importlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from deimos.kernels.random import Purpose
 
 import deimos
 from deimos import plugins
@@ -305,6 +307,44 @@ print(deimos.kernels.__file__)
     assert Path(done.stdout.strip()) == HOME / "kernels" / "__init__.py"
 
 
+def test_nothing_else_of_a_checkout_is_in_the_package():
+    """Of what lies beside the package only ``kernels`` and ``terrain`` are its modules: ``deimos.train`` is none."""
+    beside = {path.stem for path in HOME.glob("[!.]*") if path.suffix == ".py" or list(path.glob("*.py"))}
+    assert {"train", "tests", "benchmarks", "reproduction", "kernels", "terrain"} <= beside
+    code = f"""
+import importlib.util
+print(*[name for name in {sorted(beside)} if importlib.util.find_spec("deimos." + name)])
+"""
+    for folder in (HOME, HOME / "tests"):
+        done = python(code, cwd=folder)
+        assert (done.stdout.split(), done.stderr) == (["kernels", "terrain"], "")
+
+
+def test_no_file_is_loaded_twice():
+    """After all of the library was imported, no file of it has two names."""
+    modules = [name for name in module_names(*PACKAGES) if not name.endswith("__main__")]
+    code = f"""
+import importlib, sys
+for name in {modules}:
+    importlib.import_module(name)
+names = {{}}
+for name, module in sys.modules.items():
+    if (getattr(module, "__file__", None) or "").startswith({tuple(f"{HOME / name}{os.sep}" for name in PACKAGES)}):
+        names.setdefault(module.__file__, []).append(name)
+assert len(names) == {len(modules)}, names
+print([twice for twice in names.values() if len(twice) > 1])
+"""
+    done = python(code, cwd=HOME)
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
+def test_another_process_unpickles(tmp_path):
+    """A process that has imported nothing of Deimos yet finds what a pickle names, in ``kernels`` too."""
+    code = f"import pickle; print(repr(pickle.loads({pickle.dumps(Purpose.PUSH)})))"
+    done = python(code, cwd=tmp_path)
+    assert (done.stdout.strip(), done.stderr) == (repr(Purpose.PUSH), "")
+
+
 def test_terrain_of_a_checkout_runs_under_one_name():
     """``python -m terrain`` loads no file twice but the package's own ``__init__``, which defines nothing itself."""
     code = """
@@ -467,11 +507,28 @@ def test_entry_point_with_a_hyphen_is_an_environment(install, tmp_path):
     assert cli.main(["train", "--resume", str(path), "--env-steps", "48"]) == 0
 
 
-def test_a_broken_plugin_stops_no_other(install):
-    """What a configuration is called is found without importing the plug-ins of others."""
-    install("deimos.envs", "broken", "raise ImportError('it needs what is not there')")
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("raise ImportError('it needs what is not there')", "ImportError: it needs what is not there"),
+        ("def", "SyntaxError: invalid syntax (other_module.py, line 1)"),
+        ("class Config: ...", "TypeError: it holds no dataclass Config"),
+    ],
+)
+@pytest.mark.parametrize(("group", "kind"), [("deimos.envs", "env"), ("deimos.selectors", "selector")])
+def test_a_broken_plugin_stops_no_other(install, tmp_path, capsys, group, kind, source, reason):
+    """It is reported by name wherever all are listed; who asks for it is told why, and all else works."""
+    install(group, "broken", source)
     assert config.kind(particle.Config()) == "particle"
     assert config.to_dict(TrainConfig())["env"]["kind"] == "particle"
+    message = f"The plug-in 'broken' of {group}, other_module, is broken ({reason})."
+    with pytest.warns(UserWarning, match=re.escape(message)):
+        assert cli.main(["train", "env:particle", *FLAGS, "--out", str(tmp_path / "run")]) == 0
+    with pytest.warns(UserWarning, match=re.escape(message)):
+        assert cli.main(["train", "--help"]) == 0
+    capsys.readouterr()
+    assert cli.main(["train", f"{kind}:broken"]) == 2
+    assert capsys.readouterr().err == f"deimos: {message}\n"
 
 
 def test_entry_point_is_a_robot(install):

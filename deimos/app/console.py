@@ -3,18 +3,31 @@
 Importing it needs Python alone, so that ``deimos`` can say which packages are missing.
 """
 
+import ast
 import contextlib
+import dataclasses
+import inspect
+import io
+import itertools
 import os
+import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import textwrap
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from decimal import Decimal
+from types import MappingProxyType
 from typing import Any
 
 from deimos.checks import RunError
 
 Command = Callable[[list[str], str], None]
 """Runs on its arguments, under the name that a person calls it by, such as ``deimos study run``."""
+
+LEAST_WIDTH = 60  # columns of a terminal that help is wrapped at
+PLAIN_SECONDS = 20.0  # from line to line, where progress cannot be shown in place
 
 
 def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments: list[str], program: str) -> None:
@@ -30,10 +43,14 @@ def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments:
         RunError: If there is no such command.
     """
     if not arguments or arguments[0] in ("-h", "--help"):
-        width = max(map(len, commands))
-        listed = [f"  {name:{width}}  {text}" for name, (text, _) in commands.items()]
-        print(about, f"usage: {program} COMMAND [OPTIONS]", "\n".join(["commands:", *listed]),
-              "Every command explains its options with --help.", sep="\n\n")  # fmt: skip
+        width, screen = max(map(len, commands)), max(LEAST_WIDTH, shutil.get_terminal_size().columns)
+        listed = [
+            textwrap.fill(f"  {name:{width}}  {text}", screen, subsequent_indent=" " * (width + 4))
+            for name, (text, _) in commands.items()
+        ]
+        parts = (about, f"usage: {program} COMMAND [OPTIONS]", "Every command explains its options with --help.")
+        first, usage, last = (textwrap.fill(part, screen) for part in parts)
+        print(first, usage, "\n".join(["commands:", *listed]), last, sep="\n\n")
         return
     name, rest = arguments[0], arguments[1:]
     if name not in commands:
@@ -51,14 +68,57 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
     """
     import tyro
 
+    arguments = [_at_home(argument) for argument in arguments]
     try:
         from tyro._errors import on_parse_error  # since 1.0.17, and not promised
     except ImportError:  # then tyro's own, framed words stay, with exit code 2
         hook: Any = contextlib.nullcontext()
     else:
         hook = on_parse_error(_refuse)
-    with hook:
+    if {"-h", "--help"} & set(arguments):
+        more["registry"] = registry = tyro.constructors.ConstructorRegistry()
+        registry.struct_rule(_explain)
+    with hook, _wrapped_help():
         return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
+
+
+def _explain(struct: Any) -> None:
+    """Tell tyro the docstrings below the fields of a dataclass, without the line breaks that it would keep."""
+    if not dataclasses.is_dataclass(struct.type):
+        return
+    texts: dict[str, str] = {}
+    for kind in reversed(inspect.getmro(struct.type)):
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
+        except (OSError, TypeError):  # it has no source
+            continue
+        for field, below in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                texts[ast.unparse(field.target)] = " ".join(ast.literal_eval(below.value).replace("``", "").split())
+    for known in dataclasses.fields(struct.type):
+        known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+
+
+@contextlib.contextmanager
+def _wrapped_help() -> Iterator[None]:
+    """Wrap what tyro prints without regard to the terminal's width: what a command is for."""
+    said, width = io.StringIO(), max(LEAST_WIDTH, shutil.get_terminal_size().columns)
+    said.isatty = sys.stdout.isatty  # type: ignore[method-assign]
+    os.environ["COLUMNS"] = str(width)  # in less, tyro leaves descriptions a column of one letter
+    try:
+        with contextlib.redirect_stdout(said):
+            yield
+    finally:
+        for line in said.getvalue().splitlines():
+            print(line.rstrip() if "\x1b" in line else textwrap.fill(line.rstrip(), width))
+
+
+def _at_home(argument: str) -> str:
+    """An argument with its ``~`` expanded as by a shell, which leaves that of ``--out=~/x`` alone."""
+    flag, is_given, value = argument.partition("=")
+    if argument.startswith("--") and is_given:
+        return f"{flag}={os.path.expanduser(value)}"
+    return os.path.expanduser(argument)
 
 
 def _refuse(event: Any) -> None:
@@ -82,16 +142,53 @@ def _refuse(event: Any) -> None:
 
 
 @contextlib.contextmanager
-def stage_bar(title: str = "") -> Iterator[Callable[[str, float], None]]:
-    """A bar over named stages that vanishes at the end; gives the function that reports (stage, fraction done)."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+def progress(title: str) -> Iterator[Callable[[str, float], None]]:
+    """Show how far something is: gives the function that reports (what is done, fraction of the whole that is done).
 
-    columns = (TextColumn(title + "{task.description}"), BarColumn(), TaskProgressColumn())
+    On a terminal a bar; elsewhere, such as in the log of a job, a plain line every ``PLAIN_SECONDS``.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
     screen = Console(stderr=True)
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
-        task = progress.add_task("", total=1.0)
-        yield lambda stage, fraction: progress.update(task, description=stage, completed=fraction)
+    if not screen.is_terminal:
+        yield _plain_progress(title)
+        return
+    text = TextColumn(title + ": {task.description}", markup=False)
+    with Progress(
+        text, BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=screen, transient=True
+    ) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+
+
+def _plain_progress(title: str) -> Callable[[str, float], None]:
+    last = time.monotonic()
+
+    def report(stage: str, fraction: float) -> None:
+        nonlocal last
+        if time.monotonic() - last >= PLAIN_SECONDS:
+            last = time.monotonic()
+            print(f"{title}: {stage}, {fraction:.0%}", file=sys.stderr, flush=True)
+
+    return report
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lines of a table, labels to the left and values to the right; as wide as it must be, on any terminal."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = []
+    for label, *values in (header, *rows):
+        aligned = [value.rjust(width) for value, width in zip(values, widths[1:], strict=True)]
+        lines.append("  ".join([label.ljust(widths[0]), *aligned]).rstrip())
+    return "\n".join(lines)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with as many significant digits, in full: never in powers of ten, and 0 for nothing but zero."""
+    if abs(value) >= 10.0**digits:
+        return f"{value:,.0f}"
+    return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
 @contextlib.contextmanager
@@ -120,6 +217,11 @@ def quiet_warp() -> None:
         os.dup2(file.fileno(), 2)  # the warning is printed from C
         try:
             wp.init()
+        except OSError as error:
+            way_out = "set WARP_CACHE_PATH to a folder that can be written."
+            raise RunError(
+                f"Compiled kernels cannot be kept in {error.filename} ({error.strerror}); {way_out}"
+            ) from error
         finally:
             os.dup2(kept, 2)
             os.close(kept)

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, SimulationError, check_at_least, check_choice
+from deimos.checks import RunError, SimulationError, check_at_least, check_choice, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.learn.ppo import PPO, PPOConfig
@@ -173,12 +173,8 @@ class Trainer:
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
-        return {
-            "iteration": self.iteration,
-            "made_for": _identity(self.config),
-            "ppo": self.ppo.state_dict(),
-            "loop": self.loop.state_dict(),
-        }
+        made_for, ppo, loop = _identity(self.config), self.ppo.state_dict(), self.loop.state_dict()
+        return {"iteration": self.iteration, "made_for": made_for, "ppo": ppo, "loop": loop}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from ``state_dict()``.
@@ -193,14 +189,15 @@ class Trainer:
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise RunError(f"The checkpoint is that of another environment or network size: {reason}") from error
+            text = "The checkpoint is that of another environment or network size: "
+            raise RunError(text + one_line(error)) from error
         self.iteration = state["iteration"]
 
 
 def _identity(config: TrainConfig) -> dict:
     """What a checkpoint must have in common with the run that resumes from it."""
-    return {"env": to_dict(config.env), "selector": to_dict(config.goals), "num_envs": config.num_envs}
+    env = to_dict(config.env) | dict.fromkeys(config.env.files, "")  # wherever the run's copies lie
+    return {"env": env, "selector": to_dict(config.goals), "num_envs": config.num_envs}
 
 
 def _completed(identity: dict) -> dict:

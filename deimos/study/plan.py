@@ -11,11 +11,12 @@ from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets
 from deimos.run.config import from_dict, to_dict
+from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
 
@@ -87,12 +88,12 @@ def _digest(**data: Any) -> str:
 
 def read_cell(path: Path) -> Cell:
     """Read a ``cell.json``; raises ``RunError`` if it is broken or of another version."""
+    data = RunFolder(path.parent).read_json(path.name)
     try:
-        data = json.loads(path.read_text())
         if (found := data.pop("schema")) != SCHEMA:
             raise ValueError(f"its schema is {found}, not {SCHEMA}")
         return from_dict(Cell, data)
-    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
 
 
@@ -117,19 +118,15 @@ def read(path: Path) -> dict:
 
 
 def expand(
-    description: dict,
-    *,
-    seeds: Sequence[int] | None = None,
-    methods: Sequence[str] | None = None,
-    environments: Sequence[str] | None = None,
-    train: dict | None = None,
-) -> list[Cell]:
+    description: dict, *, seeds: Sequence[int] | None = None, methods: Sequence[str] | None = None,
+    environments: Sequence[str] | None = None, train: dict | None = None,
+) -> list[Cell]:  # fmt: skip
     """All cells of a study, seed by seed, so that a study cut short has the same seeds of every method.
 
     Args:
         description: See ``read``.
-        seeds: In place of its own.
-        methods: In place of its own, in every environment.
+        seeds: In place of its own, as ``methods`` are, in every environment.
+        methods: Names.
         environments: Names of those to take; ``None`` for all.
         train: Fields of ``TrainConfig`` that come before its own.
 
@@ -153,7 +150,7 @@ def expand(
         ]  # fmt: skip
         return [replace(cell, config=replace(cell.config, seed=seed)) for seed in numbers for cell in grid]
     except (AttributeError, TypeError, ValueError) as error:  # what from_dict and the configurations raise
-        raise RunError(" ".join(str(error).split())) from error
+        raise RunError(one_line(error)) from error
 
 
 def _environment(table: dict, study: dict, methods: Sequence[str] | None, train: dict) -> list[Cell]:
