@@ -23,7 +23,7 @@ import deimos
 from deimos.goals import picks
 from deimos.goals.fear_selector import fear_selector
 from deimos.goals.selector import GoalSelector
-from deimos.goals.selectors import director, uniform
+from deimos.goals.selectors import uniform
 from deimos.run import evaluation, training
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
@@ -84,8 +84,7 @@ class Scene:
         self.director = fear_selector(trainer.loop.selector)
         eval_config = evaluation.EvalConfig(worlds=500)
         env = config.env.build(500, CPU, 1)
-        self.adversary = director.Config(rule="argmax").build(spaces(env), 0)
-        self.adversary.fear, _ = evaluation.train_adversary(self.policy, env, eval_config)
+        self.adversary = evaluation.argmax_director(env, evaluation.train_adversary(self.policy, env, eval_config)[0])
         self.naive = uniform.Config().build(spaces(env), 0)
         self.films = {"naive": self.film(self.naive), "adversary": self.film(self.adversary)}
 
