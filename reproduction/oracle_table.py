@@ -1,4 +1,4 @@
-"""How much of what can be feared does a learnt fear network find? Prints the tables of docs/selectors.md.
+"""How much of what can be feared does a learnt fear network find? Prints the tables of docs/lab/selectors.md.
 
     python -m reproduction.oracle_table runs/population    # after reproduction.particle_population runs/population
 

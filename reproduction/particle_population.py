@@ -1,4 +1,4 @@
-"""Train and evaluate the populations of docs/particle.md, and print its tables.
+"""Train and evaluate the populations of docs/lab/particle.md, and print its tables.
 
     python -m reproduction.particle_population runs/population            # trains what is missing, then prints
     python -m reproduction.particle_population runs/population --audit    # adds the audit of the fear network

@@ -1,4 +1,4 @@
-"""Train a committed flat policy on rough ground and print the table of docs/quad.md or docs/quad_arm.md.
+"""Train a committed flat policy on rough ground and print the table of docs/lab/quad.md or docs/lab/quad_arm.md.
 
     python -m reproduction.quad_rough runs/rough    # 20 minutes of one core; again to continue
     python -m reproduction.quad_rough runs/rough --figure curve.png

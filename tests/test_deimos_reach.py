@@ -26,7 +26,7 @@ def reached():
 
 
 def test_it_reaches_its_goals(reached):
-    """The median error stays near what docs/quad_arm.md says of 256 robots; an arm that rests misses by 28 cm."""
+    """The median error stays near what docs/lab/quad_arm.md says of 256 robots; an arm that rests misses by 28 cm."""
     assert reached["errors"]["end effector [m]"] < 0.04
 
 

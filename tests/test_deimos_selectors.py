@@ -17,7 +17,7 @@ from deimos.goals.fear import FearConfig
 from deimos.goals.fear_selector import fear_selector
 from deimos.goals.interactions import Interactions
 from deimos.goals.methods import METHODS, method
-from deimos.goals.selector import Spaces
+from deimos.goals.selector import GoalSelector, Spaces
 from deimos.goals.selectors import boltzmann, cl, director, grid, learnability, mix, plr, rnd, schedule, uniform, vds
 from deimos.learn.ppo import PPOConfig
 from deimos.learn.rollout import Rollout
@@ -195,7 +195,18 @@ def test_it_has_begun_to_choose(env_name, name):
     assert all(row.keys() == rows[0].keys() for row in rows)
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if name not in ("uniform", "cl", "grid", "plr", "plr-robust")])
+def has_weights(name):
+    """Whether a selector, or the first of its parts, has weights: it checks them then."""
+    selector = small(ALL[name]).build(SPACES, 0)
+    return type((selector.parts or (selector,))[0]).check is not GoalSelector.check
+
+
+def test_who_has_weights():
+    """All of ours have, but those that only draw or count."""
+    assert {name for name in METHODS if not has_weights(name)} == {"uniform", "cl", "grid", "plr", "plr-robust"}
+
+
+@pytest.mark.parametrize("name", list(filter(has_weights, ALL)))
 def test_another_seed_is_another_selector(env_name, name):
     """What draws weights draws others from another seed."""
     first, second = (small(ALL[name]).build(spaces(trained(env_name, name)[0].env, 96), seed) for seed in (0, 1))
@@ -203,7 +214,7 @@ def test_another_seed_is_another_selector(env_name, name):
         assert_same(first.state_dict(), second.state_dict())
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if name not in ("uniform", "cl", "grid", "plr", "plr-robust")])
+@pytest.mark.parametrize("name", list(filter(has_weights, ALL)))
 def test_a_weight_that_is_not_finite_stops_the_run(env_name, name):
     """Whatever selector has weights finds a NaN among them."""
     selector = small(ALL[name]).build(spaces(trained(env_name, name)[0].env, 96), 0)

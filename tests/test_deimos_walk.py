@@ -24,7 +24,7 @@ def walked():
 
 
 def test_it_follows_its_goals(walked):
-    """Mean linear and yaw tracking stay near what docs/quad.md says of 256 robots; standing still would reach 0.19."""
+    """Mean linear and yaw tracking stay near what docs/lab/quad.md says of 256 robots; standing still reaches 0.19."""
     linear, yaw = walked["tracking"]
     assert linear > 0.7
     assert yaw > 0.7

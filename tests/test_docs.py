@@ -1,6 +1,7 @@
 """What the documentation shows works as it is shown."""
 
 import importlib
+import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -18,14 +19,18 @@ from deimos.sim.envs import particle
 
 HOME = Path(__file__).parent.parent
 DOCS = HOME / "docs"
-PAGES = [HOME / "README.md", HOME / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("lab/*.md"))]
+USER_PAGES = [*sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("how_to/*.md"))]
+PAGES = [
+    HOME / "README.md", HOME / "CONTRIBUTING.md", *USER_PAGES, *sorted(DOCS.glob("reference/*.md")),
+    *sorted(DOCS.glob("lab/*.md")),
+]  # fmt: skip
 SUFFIXES = {".py", ".md", ".toml", ".json", ".csv", ".png", ".svg"}
 
 
 @pytest.fixture
 def farthest(tmp_path, monkeypatch):
-    """The worked example of docs/selectors.md, as a file in the folder of the selectors."""
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "selectors.md").read_text(), re.DOTALL)
+    """The worked example of docs/how_to/selector.md, as a file in the folder of the selectors."""
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "how_to" / "selector.md").read_text(), re.DOTALL)
     (text,) = [block for block in blocks if "class Farthest" in block]
     assert text.count("\n") <= 60
     (tmp_path / "farthest.py").write_text(text)
@@ -60,8 +65,8 @@ def test_worked_example_chooses_the_farthest_candidate(farthest):
 
 
 def test_every_method_is_explained():
-    """docs/selectors.md names every method and every selector's file."""
-    text = (DOCS / "selectors.md").read_text()
+    """docs/reference/selectors.md names every method and every selector's file."""
+    text = (DOCS / "reference" / "selectors.md").read_text()
     for name in [*METHODS, *plugins.names(selectors)]:
         assert f"`{name}`" in text or f"selector:{name}`" in text, name
 
@@ -104,3 +109,68 @@ def test_the_check_of_paths_finds_what_it_looks_for(tmp_path):
         "```sh\n`g/h.py`\n```\n"
     )
     assert [name for name, _ in named_paths(page)] == ["a/b.py", "images/c.png", "d.md"]
+
+
+def words(page):
+    """Words of a page outside its blocks of code."""
+    return len(re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL).split())
+
+
+def test_user_pages_are_short():
+    """What users read has at most 6000 words in all, 700 a page, and the README 900."""
+    assert len(USER_PAGES) > 10
+    assert sum(map(words, USER_PAGES)) <= 6000
+    assert [page.name for page in USER_PAGES if words(page) > 700] == []
+    assert words(HOME / "README.md") <= 900
+
+
+def test_every_picture_for_dark_pages_has_its_light_one():
+    """A picture ``NAME-dark.svg`` stands beside ``NAME.svg``, is another one, and the concepts have nine pairs."""
+    dark = sorted((DOCS / "images").rglob("*-dark.svg"))
+    for path in dark:
+        light = path.with_name(path.name.replace("-dark", ""))
+        assert light.is_file()
+        assert light.read_bytes() != path.read_bytes()
+    assert sum(path.parent.name == "concepts" for path in dark) == 9
+
+
+def load(path):
+    """A program of the repository as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_table_of_results_is_that_of_the_rows():
+    """docs/lab/results.md shows what docs/pooled_results.py makes of all 330 policies, and the README its numbers."""
+    table = load(DOCS / "pooled_results.py").table()
+    assert table.count("\n") == 12
+    assert table in (DOCS / "lab" / "results.md").read_text(encoding="utf-8")
+    cells = {line.split("`")[1]: re.findall(r"[\d.]+(?= \[)", line) for line in table.splitlines()[2:]}
+    readme = (HOME / "README.md").read_text(encoding="utf-8")
+    naive, attacked, _ = map(float, cells["uniform"])
+    assert f"{naive:.1f} % of these, but in {attacked:.0f} % of the Adversary's" in readme
+    assert f"at {cells['p75'][2]} of the score" in readme
+    assert f"{float(cells['rnd'][1]):.0f} % under the Adversary at {cells['rnd'][2]} of the score" in readme
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('<script src="_static/a.js"></script><a href="https://e.org">e</a><link href="b.css">', 0),
+        ('<script src="https://e.org/a.js"></script>', 1),
+        ('<link rel="stylesheet" href="//e.org/a.css"><img src="http://e.org/a.png">', 2),
+        ("<style>@font-face { src: url('https://e.org/a.woff2') } p { background: url(b.png) }</style>", 1),
+        ('<p style="background: url(https://e.org/a.png)">', 1),
+    ],
+)
+def test_what_a_site_fetches_elsewhere_is_found(tmp_path, text, found, capsys):
+    """Scripts, styles, fonts and pictures of other hosts fail the check of the built site; links of readers do not."""
+    check = load(HOME / ".ci" / "check_site.py")
+    (tmp_path / "index.html").write_text(text, encoding="utf-8")
+    assert check.main(tmp_path) == bool(found)
+    assert len(check.fetched(tmp_path / "index.html")) == found
+    (tmp_path / "index.html").unlink()
+    assert check.main(tmp_path) == 1
+    capsys.readouterr()

@@ -52,7 +52,7 @@ def test_the_check_passes(cart, tmp_path):
 def test_it_trains_is_evaluated_and_resumes(cart, tmp_path, monkeypatch):
     """The page's commands work, on fewer worlds and steps: it trains under p25, is evaluated, and resumes exactly."""
     monkeypatch.chdir(tmp_path)
-    train, evaluate, resume = (shlex.split(line)[1:] for line in blocks("bash")[0].splitlines())
+    train, evaluate, resume = (shlex.split(line)[1:] for line in blocks("sh")[0].splitlines())
     assert "p25" in train
     steps = train.index("--env-steps") + 1
     train[steps] = "48"

@@ -1,5 +1,6 @@
 """The examples: small enough to be read, and run as they stand."""
 
+import json
 import os
 import re
 import subprocess
@@ -14,10 +15,14 @@ BUDGETS = {
     "rsl_rl_director": ["--iterations", "8", "--num-envs", "256"],
 }
 
+NOTEBOOK = HOME / "examples" / "first_hour.ipynb"
+PARAMETERS = "NUM_ENVS, ENV_STEPS, WORLDS, ATTACK_STEPS = 64, 240, 32, 400\n"
+
 
 def test_every_example_is_run():
-    """No example is left out of the test below."""
+    """No example is left out of the tests below."""
     assert {path.stem for path in (HOME / "examples").glob("*.py")} == set(BUDGETS)
+    assert set((HOME / "examples").glob("*.ipynb")) == {NOTEBOOK}
 
 
 @pytest.mark.parametrize("name", BUDGETS)
@@ -33,3 +38,37 @@ def test_example(name, tmp_path):
     fears = [float(fear) for fear in re.findall(r"^[+-]?\d\.\d (?:rad|m/s)  (\d\.\d\d)$", done.stdout, re.MULTILINE)]
     assert len(fears) == 5
     assert 0.0 <= min(fears) < max(fears) <= 1.0
+
+
+def cells():
+    """The notebook's cells of code."""
+    return [cell for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+
+
+def test_the_notebook_runs(tmp_path):
+    """All cells run one after the other in a fresh process, with smaller numbers in the cell of parameters."""
+    parameters, *others = cells()
+    assert parameters["metadata"]["tags"] == ["parameters"]
+    code = "".join(parameters["source"])
+    exec(code, known := {})
+    small = {}
+    exec(PARAMETERS, small)
+    assert known.keys() == small.keys()
+    script = tmp_path / "notebook.py"
+    script.write_text(PARAMETERS + "\n".join("".join(cell["source"]) for cell in others), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error::DeprecationWarning", script], cwd=tmp_path,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg", "TMPDIR": str(tmp_path)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall(r"of goals crash", done.stdout)) == 4
+
+
+def test_the_notebooks_outputs_are_its_own():
+    """Every cell was executed in order, none failed, four drew a picture, and it is small enough to be kept."""
+    assert [cell["execution_count"] for cell in cells()] == list(range(1, len(cells()) + 1))
+    outputs = [output for cell in cells() for output in cell["outputs"]]
+    assert not [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 4
+    assert NOTEBOOK.stat().st_size < 300_000

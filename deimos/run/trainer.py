@@ -26,7 +26,7 @@ class TrainConfig:
     env: EnvConfig = field(default_factory=particle.Config)
     """The environment."""
     method: str | None = None
-    """Who chooses the goals, by name (docs/selectors.md explains them all): uniform, coop, p10, p25, p50, p75, p90,
+    """Who chooses the goals, by name (docs/reference/selectors.md): uniform, coop, p10, p25, p50, p75, p90,
     antagonist, rnd, vds, cl, vds+p75, ... By default p25; or leave it out and set up a selector."""
     selector: SelectorConfig | None = None
     """Who chooses the goals, in detail."""

@@ -36,7 +36,7 @@ class RunOptions(_FolderOptions):
     """
 
     file: Path | None = None
-    """The study, in a TOML file (docs/study.md). By default the one that was begun in the folder."""
+    """The study, in a TOML file (docs/how_to/study.md). By default the one that was begun in the folder."""
     seeds: str | None = None
     """Seeds in place of the file's: a number of them (10), a range (10-19) or a list (0,3,5)."""
     methods: list[str] | None = None
