@@ -54,7 +54,14 @@ def test_every_format_that_help_names_works(particle, tmp_path, ending, capsys):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_particle_is_drawn_where_it_is(tmp_path):
+def test_the_shortest_video_has_a_picture(particle, tmp_path, capsys):
+    """However short a video is asked for, it holds the first picture."""
+    path = tmp_path / "x.gif"
+    assert cli.main(["play", str(particle), "--video", str(path), "--seconds", "0.001"]) == 0
+    assert path.read_bytes().startswith(b"GIF")
+
+
+def test_a_particle_is_drawn_where_it_is():
     """The particle, its goal and the wall are where they should be in both views, and an episode's end is marked."""
     env = Config(variant="absolute").build(1, torch.device("cpu"), seed=0)
     env.tensors["position"][0] = torch.tensor([500.0, -500.0, 900.0])
@@ -149,8 +156,10 @@ def test_an_unknown_back_end_is_one_line(tmp_path, backend):
         ({"video": Path("x.mp4"), "frames": Path("x")}, "Give one of --video FILE and --frames FOLDER"),
         ({"video": Path("x.mp4"), "seconds": 0.0}, "seconds must be finite and positive, got 0.0"),
         ({"video": Path("x.mp4"), "fps": float("inf")}, "fps must be finite and positive, got inf"),
-        ({"video": Path("x.mp4"), "width": 8}, "width must be at least 16, got 8"),
+        ({"video": Path("x.mp4"), "width": 8}, r"width must be in \[16, 8192\], got 8"),
         ({"video": Path("x.mp4"), "world": -1}, "world must be at least 0, got -1"),
+        ({"video": Path("x.mp4"), "seed": -1}, r"seed must be in \[0, .*\], got -1"),
+        ({"video": Path("x.mp4"), "goal_period": 0}, "goal_period must be at least 1, got 0"),
     ],
 )
 def test_options_are_checked(options, message):

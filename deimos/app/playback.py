@@ -15,10 +15,10 @@ from deimos.app import console
 from deimos.app.drawing import Drawing, with_caption
 from deimos.app.findings import percent
 from deimos.app.video import pictures, video
-from deimos.checks import RunError, check_at_least, check_positive
+from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.selectors import uniform
-from deimos.learn.policy import load_policy
+from deimos.learn.policy import Policy, load_policy
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig
@@ -26,6 +26,7 @@ from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
 from deimos.sim.legged.config import LocomotionConfig
 
+LARGEST = 8192  # [pixels] along a side of a picture
 PACE = 50.0  # steps per second of video, in worlds that have no seconds
 RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)
 
@@ -49,9 +50,9 @@ class PlayOptions:
     fps: float = 25.0
     """Pictures per second, positive."""
     width: int = 640
-    """Width of a picture [pixels], at least 16."""
+    """Width of a picture [pixels], in [16, 8192]."""
     height: int = 480
-    """Height of a picture [pixels], at least 16."""
+    """Height of a picture [pixels], in [16, 8192]."""
     world: int = 0
     """Global number of the world, at least 0: where it stands, and which goals it gets."""
     goal_period: int | None = None
@@ -63,8 +64,11 @@ class PlayOptions:
         for name in ("seconds", "fps"):
             check_positive(name, getattr(self, name), finite=True)
         for name in ("width", "height"):
-            check_at_least(name, getattr(self, name), 16)
+            check_range(name, getattr(self, name), 16, LARGEST)
         check_at_least("world", self.world, 0)
+        check_range("seed", self.seed, 0, 2**32 - 1)
+        if self.goal_period is not None:
+            check_at_least("goal_period", self.goal_period, 1)
         if (self.video is None) == (self.frames is None):
             raise ValueError("Give one of --video FILE and --frames FOLDER.")
 
@@ -88,18 +92,21 @@ def main(arguments: list[str], program: str) -> None:
         with _rendering():
             import mujoco  # noqa: F401 (it decides now how it will render)
     policy = load_policy(folder.path)
-    env_config = config.env.for_evaluation()
-    if options.goal_period is not None:
-        env_config = env_config.with_goal_period(options.goal_period)
     try:
+        env_config = config.env.for_evaluation().with_goal_period(options.goal_period or config.env.goal_period)
         env = env_config.build(1, torch.device("cpu"), options.seed, options.world)
     except ValueError as error:
         raise RunError(str(error)) from error
+    _render(env, policy, _fear(folder, config, env), options)
+    print(options.target)
+
+
+def _render(env: Env, policy: Policy, afraid: FearSelector | None, options: PlayOptions) -> None:
+    """Let the policy act under uniform goals, and write the pictures."""
     loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
-    afraid = _fear(folder, config, env)
     seconds = env.dt if env.has_seconds else 1.0 / PACE  # of a step
-    every, count, crashes = max(1, round(1.0 / (options.fps * seconds))), round(options.seconds / seconds), 0
-    size, fps = (options.width, options.height), 1.0 / (every * seconds)
+    every, count = (max(1, round(time / seconds)) for time in (1.0 / options.fps, options.seconds))
+    size, fps, crashes = (options.width, options.height), 1.0 / (every * seconds), 0
     writer = video(options.video, size, fps) if options.video else pictures(options.target)
     with _view(env, *size) as picture, writer as write, console.progress("rendering") as report:
         for t in range(count):
@@ -110,7 +117,6 @@ def main(arguments: list[str], program: str) -> None:
             crashes += int(step.terminated[0])
             loop.advance(step)
     env.check()
-    print(options.target)
 
 
 @contextmanager

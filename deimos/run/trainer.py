@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, SimulationError, check_at_least, check_choice, one_line
+from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_range, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.learn.ppo import PPO, PPOConfig
@@ -17,6 +17,8 @@ from deimos.run.evaluation import EvalConfig
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
+
+MOST_THREADS = 4096  # far more than that, and libraries of threads crash
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,7 @@ class TrainConfig:
         check_at_least("num_envs", self.num_envs, 1)
         check_at_least("env_steps", self.env_steps, 1)
         check_at_least("threads", self.threads, 0)
+        check_range("threads", self.threads, 0, MOST_THREADS)
         check_choice("device", self.device, ["auto", "cpu", "cuda"])
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
