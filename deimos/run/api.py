@@ -9,7 +9,7 @@ import torch
 
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy
-from deimos.nn.matmul import on_threads
+from deimos.nn.threads import on_threads
 from deimos.run import evaluation, training
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
