@@ -285,9 +285,9 @@ for (int row = 0; row < b.rows; row += 16) {
     const Vector v = at(value + row), w = at(weight + row), error = v - at(target + row), step = v - at(old + row);
     const Vector held = step < -clip ? Vector{} - clip : step > clip ? Vector{} + clip : step;
     const Vector kept = at(old + row) + held - at(target + row), plain = error * error, clipped = kept * kept;
-    const auto moves = (step == held) | ~(plain < clipped);
-    loss += w * (moves ? plain : clipped);
-    at(value + row) = moves ? 2.0f * w * error : Vector{};
+    const Vector slope = 2.0f * w * error;
+    loss += w * (plain >= clipped ? plain : clipped);
+    at(value + row) = (step == held) | (plain >= clipped) ? slope : slope * 0.0f;  // 0 times NaN is NaN
 }
 ((float*)b.gradient)[shape.parameters] += total(loss);
 """  # fmt: skip
@@ -322,11 +322,12 @@ for (int row = 0; row < b.rows; row += 16) {
         squares += z * z;
     }
     const Vector ratio = expm1(-0.5f * squares - normaliser - at(log_prob + row)) + 1.0f, gain = -at(advantage + row);
-    const Vector held = ratio < 1.0f - clip ? Vector{} + (1.0f - clip) : ratio > 1.0f + clip ? Vector{} + (1.0f + clip) : ratio;
+    const Vector least = Vector{} + (1.0f - clip), most = Vector{} + (1.0f + clip);
+    const Vector held = ratio < least ? least : ratio > most ? most : ratio;
     const Vector plain = gain * ratio, clipped = gain * held;
-    const auto moves = ~(plain < clipped);
-    loss += at(weight + row) * (moves ? plain : clipped);
-    at(slope + row) = moves ? at(weight + row) * plain : Vector{};
+    const Vector by_ratio = at(weight + row) * plain;
+    loss += at(weight + row) * (plain >= clipped ? plain : clipped);
+    at(slope + row) = plain >= clipped ? by_ratio : by_ratio * 0.0f;
 }
 sums[0] += total(loss);
 for (int a = 0; a < actions; ++a) {

@@ -42,9 +42,8 @@ class ValueLoss:
         error, step = value - target, value - old
         held = step.clamp(-self.clip, self.clip)
         plain, clipped = error.square(), (old + held - target).square()
-        moves = (step == held) | ~(plain < clipped)
-        loss = (weight * torch.where(moves, plain, clipped)).sum(1, keepdim=True)
-        slope = torch.where(moves, 2.0 * weight * error, 0.0)
+        loss = (weight * torch.maximum(plain, clipped)).sum(1, keepdim=True)
+        slope = 2.0 * weight * error * ((step == held) | (plain >= clipped))  # 0 times NaN is NaN
         return loss, slope.unsqueeze(2), torch.zeros_like(free)
 
 
@@ -78,9 +77,8 @@ class Surrogate:
         z = (action - mean) / std
         ratio = (log_prob(z, std) - old_log_prob).exp()
         plain, clipped = -advantage * ratio, -advantage * ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
-        moves = ~(plain < clipped)
-        slope = torch.where(moves, weight * plain, 0.0)  # by log r
-        loss = weight @ torch.where(moves, plain, clipped)
+        slope = weight * plain * (plain >= clipped)  # by log r
+        loss = weight @ torch.maximum(plain, clipped)
         sums = torch.cat([loss.unsqueeze(0), (mean - old_mean).square() @ weight])
         by_mean, by_std = z / std * slope, (z.square() - 1.0) @ slope / std[:, 0]
         return sums.unsqueeze(0), by_mean.t().unsqueeze(0), by_std.unsqueeze(0)

@@ -100,12 +100,12 @@ class MLPs:
         start = torch.baddbmm(bias, context.expand(len(self), -1, -1), weight[..., :known].mT)
         if self._kernel is not None:
             y = self._kernel.forward(candidates.reshape(rows * count, size), start, count)
-            return y.view(len(self), rows, count, -1)
+            return y.view(len(self), rows, count, self.units[-1])
         parts = []
         for few in self._parts(rows, count):
             hidden = torch.matmul(candidates[few], weight[:, None, :, known:].mT) + start[:, few, None]
             parts.append(self._layers(hidden.flatten(1, 2), first=1)[-1])
-        return torch.cat(parts, dim=1).view(len(self), rows, count, -1)
+        return torch.cat(parts, dim=1).view(len(self), rows, count, self.units[-1])
 
     @torch.no_grad()
     def gradient(self, x: Tensor, loss: Loss) -> Tensor:
@@ -161,7 +161,9 @@ class MLPs:
         self.grad *= (max_norm / (norm + 1e-6)).clamp(max=1.0)
 
     def _check(self, x: Tensor) -> None:
-        inputs = self.units[0]
+        inputs, like = self.units[0], self.parameters
+        if (x.dtype, x.device) != (like.dtype, like.device):
+            raise ValueError(f"x must be {_kind(like)}, got {_kind(x)}.")
         if x.dim() not in (2, 3) or x.shape[-1] != inputs or (x.dim() == 3 and len(x) not in (1, len(self))):
             raise ValueError(
                 f"x must have the shape (n, {inputs}) or ({len(self)}, n, {inputs}), got {tuple(x.shape)}."
@@ -177,6 +179,10 @@ def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
 
         return cpu.gradients([(nets._kernel, x, loss) for nets, x, loss in work])
     return [nets._gradient(x, loss) for nets, x, loss in work]
+
+
+def _kind(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
 
 
 def _move(module: nn.Module, parameters: Tensor, grad: Tensor) -> None:
