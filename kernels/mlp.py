@@ -126,7 +126,8 @@ auto expm1 = [](Vector x) __attribute__((always_inline)) {
 
 def _by_height(line: str) -> str:
     """A switch over the heights of a tile, which the compiler must know."""
-    return "\n".join(["switch (height) {", *(f"case {n}: {line.replace('N', str(n))} break;" for n in range(1, 9)), "}"])
+    cases = (f"case {n}: {line.replace('N', str(n))} break;" for n in range(1, 9))
+    return "\n".join(["switch (height) {", *cases, "}"])
 
 
 _PRODUCT = """
@@ -347,7 +348,7 @@ for (int a = 0; a < actions; ++a) {
 
 @wp.func_native(_SURROGATE)
 def _surrogate(shape: Shape, b: Block, clip: float):
-    """Replace the outputs by the gradients of ``losses.Surrogate`` by them; add those of the deviations, and its sums."""
+    """Replace the outputs by the gradients of ``losses.Surrogate`` by them; add those by deviations, and its sums."""
     ...
 
 
@@ -371,7 +372,8 @@ def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row:
 
 @wp.func_native("""
 const float* y = (const float*)b.memory + unit * b.room;
-for (int row = 0; row < rows; ++row) for (int i = 0; i < units; ++i) ((float*)to)[row * units + i] = y[i * b.room + row];
+for (int row = 0; row < rows; ++row)
+    for (int i = 0; i < units; ++i) ((float*)to)[row * units + i] = y[i * b.room + row];
 """)
 def _write(b: Block, unit: int, units: int, rows: int, to: wp.uint64):
     """Copy units of rows out of a block, row by row."""

@@ -14,8 +14,7 @@ ACTIONS, ROWS = 3, 1000
 
 
 def transitions(rows=ROWS, seed=0):
-    """The data of a surrogate, and behind them value before and target, float64: ratios and values within the clip,
-    at its ends and beyond, advantages of both signs, some rows of weight 0."""
+    """The data of a surrogate, and behind them value before and target, float64; some rows of weight 0."""
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):

@@ -44,7 +44,8 @@ def exact(nets, x, slopes):
     outputs, grads = [], []
     for k, net in enumerate(copy.deepcopy(nets)):
         y = net.double()(x[k if x.dim() == 3 else ...].double())
-        grads.append(torch.cat([g.flatten() for g in torch.autograd.grad((y * slopes[k]).sum(), list(net.parameters()))]))
+        found = torch.autograd.grad((y * slopes[k]).sum(), list(net.parameters()))
+        grads.append(torch.cat([grad.flatten() for grad in found]))
         outputs.append(y.detach())
     return torch.stack(outputs), torch.stack(grads)
 
@@ -103,7 +104,7 @@ def test_scores_are_outputs(backend, count, contexts, candidates):
 
 
 def test_a_small_workspace_is_kept_to():
-    """torch's products take parts of rows whose activations fit, and give the same."""
+    """Products of torch's take parts of rows whose activations fit, and give the same."""
     nets = networks((6, 64, 1), 2)
     small, large = build(nets, "torch", workspace=1), build(nets, "torch", workspace=64)
     assert len(list(small._parts(5000))) > 1 == len(list(large._parts(5000)))
@@ -156,7 +157,8 @@ def test_threads_change_no_bit(threads):
         found = []
         for own, ensemble in built:
             sums = gradients((own, x, given(slopes)), (ensemble, x, data))
-            found.append([own.forward(x), *sums, own.grad, ensemble.grad, ensemble.score(x[:90, :9], x.view(-1, 20, 3)[:90])])
+            score = ensemble.score(x[:90, :9], x.view(-1, 20, 3)[:90])
+            found.append([own.forward(x), *sums, own.grad, ensemble.grad, score])
         assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
         assert all(tensor.isfinite().all() and tensor.any() for tensor in found[0])
         for own, ensemble in built:
@@ -220,7 +222,7 @@ def test_the_hosts_default_dtype_does_not_matter():
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_modules_are_views(backend):
-    """Modules keep their outputs, see what changes in the vector, and change it; so do gradients, free ones included."""
+    """Modules keep their outputs, see what changes in the vector, and change it; so do gradients, free ones too."""
     actor = Actor(5, (9, 8), 2, "relu", 0.5, torch.Generator().manual_seed(0))
     x = torch.randn(20, 5)
     before = actor(x).detach()
@@ -253,10 +255,11 @@ def test_every_gradient_is_clipped_by_itself(backend):
 def test_what_was_given_is_not_overwritten():
     """Results of earlier calls keep their numbers."""
     built = build(networks((9, 16, 1), 2))
-    results = [(built.forward(torch.randn(n, 9)), built.score(torch.randn(n, 6), torch.randn(n, 4, 3))) for n in (3, 9)]
-    copies = [[value.clone() for value in result] for result in results]
+    results = [built.forward(torch.randn(n, 9)) for n in (3, 9)]
+    results += [built.score(torch.randn(n, 6), torch.randn(n, 4, 3)) for n in (3, 9)]
+    copies = [result.clone() for result in results]
     built.forward(torch.randn(50, 9))
-    assert all(torch.equal(a, b) for kept, copied in zip(results, copies, strict=True) for a, b in zip(kept, copied, strict=True))
+    assert all(torch.equal(kept, copied) for kept, copied in zip(results, copies, strict=True))
 
 
 def test_begun_without_gradients_it_continues_with_them():
@@ -294,7 +297,7 @@ def test_scores_check_their_shapes(backend):
     built = build(networks((9, 16, 1), 1), backend)
     assert built.score(torch.zeros(0, 6), torch.zeros(0, 100, 3)).shape == (1, 0, 100, 1)
     for context, candidates in (((4, 6), (2, 100, 3)), ((4, 5), (4, 100, 3)), ((4, 6), (4, 100, 2))):
-        with pytest.raises(ValueError, match=r"context and candidates must have the shapes \(B, [67]\) and \(B, N, [32]\)"):
+        with pytest.raises(ValueError, match=r"must have the shapes \(B, [67]\) and \(B, N, [32]\)"):
             built.score(torch.zeros(*context), torch.zeros(*candidates))
 
 

@@ -2,7 +2,8 @@
 
 import ctypes
 import itertools
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 import warp as wp
@@ -12,9 +13,6 @@ from deimos.kernels.mlp import ACTIVATIONS, STEP, Job, Mode, Shape, record
 from deimos.nn.losses import Loss, Surrogate, ValueLoss
 from deimos.nn.threads import CREW
 
-if TYPE_CHECKING:
-    from deimos.nn.mlps import MLPs
-
 ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
 BLOCK = 3 * 2**16  # numbers in a block, 768 KiB: what a core's second cache holds
 PARTS = 16  # of the rows of all networks together, each with a gradient of its own
@@ -22,21 +20,33 @@ LEAST = 2e6  # operations that are worth waking a thread for, about 20 us
 
 
 class Kernel:
-    """The kernel for some networks. What it computes depends on their shape and the rows, never on the threads."""
+    """The kernel for some networks. What it computes depends on their shape and the rows, never on the threads.
+
+    Args:
+        units: Inputs, and outputs of every layer.
+        activation: One of ``ACTIVATIONS``.
+        weights: Where every layer's weights start among a network's parameters.
+        free: Where the parameters that belong to no layer lie.
+        parameters: Shape (K, numbers), float32.
+        grad: The same of the gradient, which ``gradients`` writes.
+    """
 
     @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
-    def __init__(self, nets: "MLPs") -> None:
+    def __init__(
+        self, units: Sequence[int], activation: str, weights: Sequence[int], free: slice,
+        parameters: Tensor, grad: Tensor,
+    ) -> None:  # fmt: skip
         wp.init()
-        self._nets = nets
+        self._parameters, self._grad, self._free, self._outputs = parameters, grad, free, units[-1]
         self._threads = torch.get_num_threads()
-        units, size = nets.units, nets.parameters.shape[1]
+        count, self._size = parameters.shape
         shape = Shape()
-        shape.layers, shape.activation = len(units) - 1, ACTIVATIONS.index(nets.activation)
-        shape.parameters, shape.free = size, nets.free.start
-        places = {"units": units, "weight": nets.weights, "unit": [0, *itertools.accumulate(units)]}
+        shape.layers, shape.activation = len(units) - 1, ACTIVATIONS.index(activation)
+        shape.parameters, shape.free = self._size, free.start
+        places = {"units": units, "weight": weights, "unit": [0, *itertools.accumulate(units)]}
         for name, values in places.items():
             setattr(shape, name, wp.array(values, dtype=int, device="cpu"))
-        self._operations = 2 * len(nets) * sum(a * b for a, b in itertools.pairwise(units))
+        self._operations = 2 * count * sum(a * b for a, b in itertools.pairwise(units))
         columns = 2 * units[-1] + 3  # of the largest loss
         self._room = max(STEP, min(ROOM, BLOCK // (sum(units) + columns)) // STEP * STEP)
         self._memory = torch.zeros(self._threads, (sum(units) + columns) * self._room, dtype=torch.float32)
@@ -45,8 +55,8 @@ class Kernel:
         jobs = wp.zeros(1, dtype=Job, device="cpu")
         self._job: Any = jobs.numpy()
         self._fill(
-            count=len(nets), room=self._room, counter=ctypes.addressof(self._counter), memory=self._memory.data_ptr(),
-            memory_size=self._memory.shape[1], parameters=nets.parameters.data_ptr(),
+            count=count, room=self._room, counter=ctypes.addressof(self._counter), memory=self._memory.data_ptr(),
+            memory_size=self._memory.shape[1], parameters=parameters.data_ptr(),
         )  # fmt: skip
         self._launches = [record(shape, jobs, thread) for thread in range(self._threads)]
 
@@ -62,8 +72,8 @@ class Kernel:
             start: What the first layer's sums start from instead of its biases, shape (K, n / shared, units).
             shared: Consecutive rows that start from the same.
         """
-        nets, rows = self._nets, x.shape[-2]
-        y = torch.empty(len(nets), rows, nets.units[-1], dtype=torch.float32)
+        rows = x.shape[-2]
+        y = torch.empty(len(self._parameters), rows, self._outputs, dtype=torch.float32)
         start = None if start is None else start.contiguous()
         with CREW.lock:
             self._prepare(Mode.FORWARD, x, y)
@@ -84,9 +94,9 @@ class Kernel:
 
     def prepare_gradient(self, mode: Mode, x: Tensor, sums: int, data: Tensor, clip: float = 0.0) -> float:
         """Fill in a job that adds up gradients; ``data`` are the loss's, or gradients by outputs. Gives operations."""
-        rows, count = x.shape[-2], len(self._nets)
+        rows, count = x.shape[-2], len(self._parameters)
         parts = min(-(-rows // self._room), max(4, PARTS // count))
-        shape = (count, max(1, parts), self._nets.parameters.shape[1] + sums)
+        shape = (count, max(1, parts), self._size + sums)
         if self._gradient.shape != shape:
             with torch.inference_mode(False):
                 self._gradient = torch.zeros(shape, dtype=torch.float32)
@@ -101,10 +111,9 @@ class Kernel:
 
     def collect(self) -> Tensor:
         """Write the gradient of what has been run, added up in the order of the parts; gives the loss's sums."""
-        size = self._nets.parameters.shape[1]
         total = self._gradient.sum(1)
-        self._nets.grad.copy_(total[:, :size])
-        return total[:, size:]
+        self._grad.copy_(total[:, : self._size])
+        return total[:, self._size :]
 
 
 def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
@@ -124,13 +133,12 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
 
 def _by_outputs(kernel: Kernel, x: Tensor, loss: Loss) -> Tensor:
     """The gradient of a loss that torch computes between two passes."""
-    nets = kernel._nets
-    sums, delta, free = loss(kernel.forward(x), nets.parameters[:, nets.free])
+    sums, delta, free = loss(kernel.forward(x), kernel._parameters[:, kernel._free])
     delta = delta.contiguous()
     with CREW.lock:
         _run([kernel], kernel.prepare_gradient(Mode.BACKWARD, x, 0, delta))
         kernel.collect()
-    nets.grad[:, nets.free] = free
+    kernel._grad[:, kernel._free] = free
     return sums
 
 

@@ -57,7 +57,7 @@ class Surrogate:
     """
 
     data: Tensor
-    """Actions, means of the policy that acted, log-probability under it, advantage and weight, (1, 2 actions + 3, n)."""
+    """Actions, means of the policy that acted, log-probability, advantage and weight, shape (1, 2 actions + 3, n)."""
     clip: float
     """How far the ratio of probabilities may move, positive."""
 

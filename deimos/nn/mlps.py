@@ -144,7 +144,7 @@ class MLPs:
         return outputs
 
     def _layer(self, layer: int, of: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Views of a layer's weights, shape (K, outputs, inputs), and biases, (K, 1, outputs); or ``of`` their gradients."""
+        """Views of a layer's weights, shape (K, outputs, inputs), and biases, (K, 1, outputs), in a vector of them."""
         inputs, outputs = self.units[layer : layer + 2]
         numbers = (self.parameters if of is None else of)[:, self.weights[layer] :]
         weight, bias = numbers.split([inputs * outputs, outputs, numbers.shape[1] - (inputs + 1) * outputs], dim=1)[:2]
@@ -216,4 +216,4 @@ def _kernel(nets: MLPs) -> "Kernel | None":
         return None
     from deimos.nn.cpu import Kernel
 
-    return Kernel(nets)
+    return Kernel(nets.units, nets.activation, nets.weights, nets.free, nets.parameters, nets.grad)

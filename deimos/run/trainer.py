@@ -45,7 +45,7 @@ class TrainConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate and learn; auto takes the GPU where there is one."""
     threads: int = 0
-    """CPU threads, at least 0; 0 takes one per core that this process may use. Part of what fixes a run's numbers."""
+    """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
 
     def __post_init__(self) -> None:
         check_at_least("num_envs", self.num_envs, 1)

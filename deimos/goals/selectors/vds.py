@@ -160,7 +160,7 @@ class VDS(GoalSelector):
         )
         step, world, obs = rollout.cut_off()
         if len(step):
-            final = torch.zeros(*rollout.truncated.shape, len(worlds), device=value.device)
+            final = torch.zeros(*rollout.truncated.shape, len(worlds), dtype=value.dtype, device=value.device)
             final[step, world] = self.values(obs).t()
             member = torch.arange(len(worlds), device=value.device).unsqueeze(1)
             next_value = torch.where(truncated, final[:, worlds, member], next_value)
@@ -190,7 +190,7 @@ class VDS(GoalSelector):
         weight = weight.unflatten(1, (minibatches, size))
         weight = (weight / weight.sum(2, keepdim=True).clamp(min=1.0)).flatten(1)
         data = [weight, *(values.flatten(1).gather(1, order) for values in (old, returns))]
-        loss, losses = ValueLoss(torch.stack(data, dim=1), self.config.clip), torch.zeros(len(worlds), device=old.device)
+        loss, losses = ValueLoss(torch.stack(data, dim=1), self.config.clip), torch.zeros_like(old[:, 0, 0])
         for _ in range(self.config.epochs):
             for start in range(0, minibatches * size, size):
                 part = slice(start, start + size)
