@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from deimos.kernels.episodes import make_worlds, set_goals
 from deimos.kernels.goals import draw_candidates
+from deimos.kernels.lanes import WIDE, lanes, threads
 from deimos.kernels.random import Purpose
 
 U = 2.0**-24  # relative error of one float32 operation
@@ -170,3 +171,12 @@ def test_draw_candidates_rejects(device, wrong, message):
     arrays = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in (right | wrong).items()}
     with pytest.raises(ValueError, match=message):
         draw_candidates(**arrays, worlds=make(np.zeros(5), device, goal_scale=[1.0] * 3))
+
+
+def test_threads_cover_every_number(device):
+    """A thread takes one number on a GPU and where there are few, else as many as its lanes."""
+    device, cpu = wp.get_device(device), device == "cpu"
+    assert lanes(WIDE // 4 - 1, device) == 1
+    assert lanes(100, device) == (WIDE if cpu else 1)
+    assert threads(7, 100, device) == (7, -(-100 // WIDE) if cpu else 100)
+    assert threads(7, 3, device) == (7, 3)

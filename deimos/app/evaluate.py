@@ -12,6 +12,7 @@ from deimos.app import console, figures
 from deimos.app.console import table
 from deimos.app.findings import describe, known
 from deimos.checks import RunError, check_at_least
+from deimos.nn.threads import on_threads
 from deimos.run import api, audit, training
 from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig, evaluate_run
@@ -78,12 +79,13 @@ def main(arguments: list[str], program: str) -> None:
     if not os.access(folder.path, os.W_OK):  # it is said before the work, which would be lost
         raise RunError(f"{folder.path} cannot be written to; evaluate a copy of it.")
     config = training.read_config(folder)
-    torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
     console.quiet_warp()
     device = training.resolve_device(options.device)
     if options.contexts or options.calibration:
         with one_stream(device):
-            _evaluate_fear(training.load(folder, replace(config, device=options.device)), folder, options)
+            trainer = training.load(folder, replace(config, device=options.device))
+            with on_threads(1):  # sums of torch's depend on its threads
+                _evaluate_fear(trainer, folder, options)
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
     env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes)

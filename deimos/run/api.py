@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from deimos.checks import RunError
-from deimos.nn.matmul import on_threads
+from deimos.nn.threads import on_threads
 from deimos.run import training
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
@@ -62,7 +62,7 @@ def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "
     config = training.read_config(folder)
     env_config, eval_config = configure_evaluation(config, goal_period, changes)
     found = training.resolve_device(device)
-    with on_threads(config.threads or training.cores()), one_stream(found):  # the same numbers as at the run's end
+    with one_stream(found):
         return evaluate_run(folder, env_config, eval_config, found)
 
 

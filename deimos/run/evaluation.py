@@ -22,6 +22,7 @@ from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.goals.selectors import director, uniform
 from deimos.learn.policy import load_policy
+from deimos.nn.threads import on_threads
 from deimos.run.config import to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
@@ -104,7 +105,8 @@ def evaluate_run(
     same = [row for row in known if any(row.items() >= identity for identity in identities)]
     if len(same) == len(identities) and not again:
         return same
-    fresh = [row | weights for row in evaluate(policy.scaled, env_config, config, device, progress)]
+    with on_threads(1):  # sums of torch's depend on its threads
+        fresh = [row | weights for row in evaluate(policy.scaled, env_config, config, device, progress)]
     folder.write_json("evaluation.json", [row for row in known if row not in same] + fresh)
     return fresh
 
