@@ -104,7 +104,7 @@ def test_everything_is_written_at_once(folder, small, capsys):
 
 @pytest.mark.parametrize("ending", [".stl", ".obj", ".ply", ".glb", ".npz", ".png"])
 def test_what_was_written_is_imported(folder, small, capsys, ending):
-    """``import`` gives back the terrain of what ``grid`` has written; by default into NAME.npz of the working folder."""
+    """``import`` gives back the terrain that ``grid`` has written; by default as NAME.npz in the current folder."""
     (folder / "elsewhere").mkdir()
     assert run("grid", *SMALL, "--out", f"elsewhere/ground{ending}") == 0
     resolution = ["--resolution", "0.2"] if ending in (".stl", ".obj", ".ply", ".glb") else []
