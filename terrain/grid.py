@@ -76,7 +76,10 @@ class Terrain:
             data["corner"] = tuple(float(value) for value in data["corner"])
             return Terrain(**data | {name: float(data[name]) for name in ("cell", "tile")})
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({error}).") from error
+            raise ValueError(
+                f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({str(error).rstrip('.')}); "
+                "files of other programs are imported first: deimos terrain import."
+            ) from error
 
 
 def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:

@@ -166,10 +166,9 @@ class Interactions(Stateful):
         """
         self._pending[rows, self._next_goal] = goal
 
-    def resolved(self) -> Resolved:
-        """The interactions resolved within the window, ordered by world."""
-        at = self._marks[:, :, 2]
-        env, slot = torch.nonzero((at > 0) & (at > self.now - self.window), as_tuple=True)
+    def resolved(self, since: int = 0) -> Resolved:
+        """The interactions resolved within the window, and after step ``since``, ordered by world."""
+        env, slot = torch.nonzero(self._marks[:, :, 2] > max(since, self.now - self.window, 0), as_tuple=True)
         state, goal, next_goal, score, probe, note, reward, tracking = self._ring[env, slot].split(self._sizes, dim=1)
         crashed, issued, resolved, horizon = self._marks[env, slot].unbind(1)
         met = tracking if self._sizes[-1] else reward

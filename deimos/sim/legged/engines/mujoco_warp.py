@@ -108,7 +108,8 @@ class Physics:
         if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
             raise ValueError(
                 f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
-                f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}."
+                f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}, or import it with "
+                f"--resolution {FINEST_CELL}."
             )
         self.config = config
         self.num_envs = num_envs
