@@ -181,7 +181,7 @@ class Session:
             self.process(sys.executable, "-m", "deimos", *shortened(arguments, BUDGETS[name]))
             return
         budget = BUDGETS.get(name, {})
-        if name == "train" and not {"--preset", "--init-from"} & set(arguments) and "env:" not in " ".join(arguments):
+        if name == "train" and "--preset" not in arguments and "env:" not in " ".join(arguments):
             budget = budget | CRASHING
         arguments = shortened(arguments, budget, add=name != "evaluate")
         try:
