@@ -120,13 +120,13 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
     """See ``mlps.gradients``."""
     if not all(isinstance(loss, ValueLoss | Surrogate) for _, _, loss in work):
         return [_by_outputs(*item) for item in work]
+    kernels, operations, kept = [kernel for kernel, _, _ in work], 0.0, []
     with CREW.lock:
-        operations = 0.0
         for kernel, x, loss in work:
             assert isinstance(loss, ValueLoss | Surrogate)
             mode = Mode.VALUE if isinstance(loss, ValueLoss) else Mode.SURROGATE
-            operations += kernel.prepare_gradient(mode, x, loss.sums, loss.data, loss.clip)
-        kernels = [kernel for kernel, _, _ in work]
+            kept.append(loss.data.float() if loss.data.stride(-1) == 1 else loss.data.float().contiguous())
+            operations += kernel.prepare_gradient(mode, x, loss.sums, kept[-1], loss.clip)
         _run(kernels, operations)
         return [kernel.collect() for kernel in kernels]
 
@@ -134,7 +134,7 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
 def _by_outputs(kernel: Kernel, x: Tensor, loss: Loss) -> Tensor:
     """The gradient of a loss that torch computes between two passes."""
     sums, delta, free = loss(kernel.forward(x), kernel._parameters[:, kernel._free])
-    delta = delta.contiguous()
+    delta = delta.float().contiguous()
     with CREW.lock:
         _run([kernel], kernel.prepare_gradient(Mode.BACKWARD, x, 0, delta))
         kernel.collect()
