@@ -14,7 +14,7 @@ from deimos.nn.losses import Loss, Surrogate, ValueLoss
 from deimos.nn.threads import CREW
 
 ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
-BLOCK = 3 * 2**16  # numbers in a block, 768 KiB: what a core's second cache holds
+BLOCK = 3 * 2**17  # numbers in a block, 1.5 MiB: what a core's caches hold
 PARTS = 16  # of the rows of all networks together, each with a gradient of its own
 LEAST = 2e6  # operations that are worth waking a thread for, about 20 us
 
@@ -77,9 +77,7 @@ class Kernel:
         start = None if start is None else start.contiguous()
         with CREW.lock:
             self._prepare(Mode.FORWARD, x, y)
-            self._fill(
-                parts=-(-rows // self._room), start=0 if start is None else start.data_ptr(), shared=shared
-            )  # fmt: skip
+            self._fill(parts=-(-rows // self._room), shared=shared, start=0 if start is None else start.data_ptr())
             _run([self], rows * self._operations)
         return y
 
@@ -95,8 +93,8 @@ class Kernel:
     def prepare_gradient(self, mode: Mode, x: Tensor, sums: int, data: Tensor, clip: float = 0.0) -> float:
         """Fill in a job that adds up gradients; ``data`` are the loss's, or gradients by outputs. Gives operations."""
         rows, count = x.shape[-2], len(self._parameters)
-        parts = min(-(-rows // self._room), max(4, PARTS // count))
-        shape = (count, max(1, parts), self._size + sums)
+        parts = max(1, min(-(-rows // self._room), max(4, PARTS // count)))
+        shape = count, parts, self._size + sums
         if self._gradient.shape != shape:
             with torch.inference_mode(False):
                 self._gradient = torch.zeros(shape, dtype=torch.float32)

@@ -13,15 +13,13 @@ if TYPE_CHECKING:
     from deimos.nn.cpu import Kernel
 
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.ReLU: "relu", nn.ELU: "elu", nn.Tanh: "tanh"}
-WIDEST = 512
-"""Units of the widest layer that the kernel for CPUs takes: with wider ones torch's own products are as fast."""
 
 
 class MLPs:
     """K networks of one shape in one vector of parameters, those of a network end to end as its module orders them.
 
-    Products are torch's, or those of ``kernels.mlp``: on a CPU, where Warp is installed and no layer is wider than
-    ``WIDEST``. Both give the same to rounding; the kernel's results do not depend on the number of threads.
+    Products are torch's or, on a CPU where Warp is installed, those of ``kernels.mlp``. Both give the same to rounding;
+    the kernel's results do not depend on the number of threads.
 
     Args:
         modules: Linear layers with one kind of activation between them, as ``networks.mlp`` makes them, on one device;
@@ -38,7 +36,8 @@ class MLPs:
         self.units = (linears[0].in_features, *(layer.out_features for layer in linears))
         """Inputs, and outputs of every layer."""
         self.activation = next(ACTIVATIONS[type(layer)] for layer in first.modules() if type(layer) in ACTIVATIONS)
-        offsets, size = {}, 0
+        offsets: dict[Tensor, int] = {}
+        size = 0
         for parameter in first.parameters():
             offsets[parameter] = size
             size += parameter.numel()
@@ -174,11 +173,12 @@ def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
     """``MLPs.gradient`` of several, by threads that pass from one to the next without waiting for each other."""
     for nets, x, _ in work:
         nets._check(x)
-    if all(nets._kernel is not None for nets, _, _ in work):
-        from deimos.nn import cpu
+    prepared = [(nets._kernel, x, loss) for nets, x, loss in work if nets._kernel is not None]
+    if len(prepared) < len(work):
+        return [nets._gradient(x, loss) for nets, x, loss in work]
+    from deimos.nn import cpu
 
-        return cpu.gradients([(nets._kernel, x, loss) for nets, x, loss in work])
-    return [nets._gradient(x, loss) for nets, x, loss in work]
+    return cpu.gradients(prepared)
 
 
 def _kind(tensor: Tensor) -> str:
@@ -208,11 +208,8 @@ def _times_slope(delta: Tensor, y: Tensor, activation: str) -> Tensor:
 
 
 def _kernel(nets: MLPs) -> "Kernel | None":
-    """The kernel for networks, if it takes them and Warp is installed."""
-    memory = nets.parameters
-    if memory.device.type != "cpu" or memory.dtype != torch.float32 or max(nets.units) > WIDEST:
-        return None
-    if find_spec("warp") is None:
+    """The kernel for networks, on a CPU where Warp is installed."""
+    if nets.parameters.device.type != "cpu" or find_spec("warp") is None:
         return None
     from deimos.nn.cpu import Kernel
 
