@@ -210,6 +210,9 @@ def test_the_hosts_default_dtype_does_not_matter():
         return built.forward(x), built.grad, built.parameters, built.score(x[:, :3], x.view(10, 1, 5)[..., 3:])
 
     expected = results()
+    built = build(networks((5, 16, 2), 1))
+    x = torch.rand(10, 5)
+    assert torch.equal(built.forward(x.double()), built.forward(x))
     torch.set_default_dtype(torch.float64)
     try:
         found = results()
@@ -278,12 +281,12 @@ def test_begun_without_gradients_it_continues_with_them():
         (torch.zeros(4, 8), r"x must have the shape \(n, 9\) or \(2, n, 9\), got \(4, 8\)"),
         (torch.zeros(3, 4, 9), r"x must have the shape .* got \(3, 4, 9\)"),
         (torch.zeros(9), r"x must have the shape .* got \(9,\)"),
-        (torch.zeros(4, 9, dtype=torch.float64), "x must be float32 on cpu, got float64 on cpu"),
+        (torch.zeros(4, 9, device="meta"), "x must be on cpu, got it on meta"),
     ],
 )
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_other_inputs_are_refused(backend, x, message):
-    """Inputs of another shape or dtype raise ``ValueError``, forwards and backwards, before anything is computed."""
+    """Inputs of another shape or device raise ``ValueError``, forwards and backwards, before anything is computed."""
     built = build(networks((9, 16, 1), 2), backend)
     with pytest.raises(ValueError, match=message):
         built.forward(x)
