@@ -16,7 +16,7 @@ from deimos.nn.threads import CREW
 ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
 BLOCK = 3 * 2**17  # numbers in a block, 1.5 MiB: what a core's caches hold
 PARTS = 16  # of the rows of all networks together, each with a gradient of its own
-LEAST = 2e6  # operations that are worth waking a thread for, about 20 us
+LEAST = 1e7  # operations that are worth waking a thread for, about 100 us
 
 
 class Kernel:
