@@ -88,9 +88,11 @@ class RND(GoalSelector):
         self.generator = generator(seed, "rnd minibatches", spaces.device)
         # Inputs are whitened by the moments of states, active goals and *uniform* candidates; those of the
         # chosen goals would drift with what is chosen.
-        self._uniform = torch.full((spaces.num_envs, spaces.goal_dim), torch.nan, device=spaces.device)
+        shape = spaces.num_envs, spaces.goal_dim
+        self._uniform = torch.full(shape, torch.nan, dtype=torch.float32, device=spaces.device)
         self._moments = torch.zeros(3, inputs, dtype=torch.float64, device=spaces.device)  # count, sum, of squares
-        self._mean, self._scale = torch.zeros(inputs, device=spaces.device), torch.ones(inputs, device=spaces.device)
+        self._mean = torch.zeros(inputs, dtype=torch.float32, device=spaces.device)
+        self._scale = torch.ones_like(self._mean)
         self._context = slice(0, inputs - spaces.goal_dim)
         self._goal = slice(inputs - spaces.goal_dim, inputs)
         self._learnt_at = 0  # step of the last call of learn
@@ -99,7 +101,7 @@ class RND(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are surprises."""
-        self._uniform[rows] = candidates[:, 0]
+        self._uniform[rows] = candidates[:, 0].float()
         if not self.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         score = self.surprise(state, goal, candidates)
