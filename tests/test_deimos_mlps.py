@@ -2,7 +2,9 @@
 
 import copy
 import os
+import signal
 import threading
+import time
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from deimos.nn.adam import Adam
 from deimos.nn.losses import ValueLoss
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Actor, mlp
-from deimos.nn.threads import on_threads
+from deimos.nn.threads import Crew, on_threads
 
 # Depths; widths that fill no register, some, and all; few and many inputs and outputs.
 SHAPES = [(5, 7, 1), (12, 64, 64, 3), (11, 50, 33, 9, 6), (3, 130, 2), (48, 1100, 256, 128, 12)]
@@ -197,6 +199,26 @@ def test_a_fork_has_threads_of_its_own():
         os._exit(0 if torch.equal(built.forward(x), expected) else 1)
     assert os.waitpid(child, 0)[1] == 0
     assert torch.equal(built.forward(x), expected)
+
+
+@pytest.mark.parametrize("where", ["working", "waiting"])
+def test_an_interrupt_leaves_no_thread_behind(where):
+    """Ctrl-C while it works or waits is raised once all threads are done, and they work again afterwards."""
+    crew, finished = Crew(), []
+
+    def work(i):
+        if i == (0 if where == "working" else 1):
+            os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.05 * (i > 0))
+        finished.append(i)
+
+    with pytest.raises(KeyboardInterrupt):
+        crew.run(work, 4)
+    assert {1, 2, 3} <= set(finished)
+    for count in (4, 2, 4):
+        done = []
+        crew.run(done.append, count)
+        assert sorted(done) == list(range(count))
 
 
 def test_the_hosts_default_dtype_does_not_matter():

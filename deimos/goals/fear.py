@@ -92,7 +92,7 @@ class Fear(Stateful):
         inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
         target = data.crashed.float()
         size = -(-len(data) // self.config.minibatches)
-        loss = torch.zeros((), device=target.device)
+        loss = torch.zeros((), dtype=torch.float32, device=target.device)
         for _ in range(self.config.epochs if epochs is None else epochs):
             order = torch.randperm(len(data), generator=self.generator, device=target.device)
             x, y, w = inputs[order], target[order], weight[order]

@@ -150,7 +150,7 @@ class RND(GoalSelector):
     def _fit(self, inputs: Tensor, target: Tensor) -> float:
         """Adam on the mean squared error; returns that of the last pass."""
         size = -(-len(inputs) // self.config.minibatches)
-        total = torch.zeros((), device=inputs.device)
+        total = torch.zeros((), dtype=torch.float32, device=inputs.device)
         for _ in range(self.config.epochs):
             total.zero_()
             order = torch.randperm(len(inputs), generator=self.generator, device=inputs.device)
