@@ -15,7 +15,7 @@ from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import vds
 from deimos.run.presets import preset
 from deimos.sim.legged.config import LocomotionConfig
-from deimos.sim.legged.engines.mujoco_warp import Captured
+from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.task import Locomotion
 from reproduction.thesis import TABLE_4_1
 

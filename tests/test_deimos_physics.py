@@ -12,7 +12,9 @@ import warp as wp
 from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
-from deimos.sim.legged.engines.mujoco_warp import Captured, Physics, PhysicsConfig
+from deimos.sim.legged import engines
+from deimos.sim.legged.engines import PhysicsConfig
+from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.robots import go1
 from deimos.sim.legged.robots import go1_rx150 as rx150
 
@@ -30,10 +32,11 @@ def stairs():
     )  # fmt: skip
 
 
-def make(n, device, terrain=None, robot=ROBOT, **options):
+def make(n, simulator, terrain=None, robot=ROBOT, **options):
     """Worlds with robots in their default pose, high above the ground."""
+    engine, device = simulator
     config = options.pop("config", PhysicsConfig())
-    physics = Physics(robot, terrain, n, torch.device(device), config, **options)
+    physics = engines.build(engine, robot, terrain, n, torch.device(device), config, **options)
     place(physics, 5.0, robot=robot)
     return physics
 
@@ -43,9 +46,9 @@ def place(physics, z, quat=(1, 0, 0, 0), robot=ROBOT):
     qpos = np.zeros((physics.num_envs, 7 + len(robot.pose)), np.float32)
     qpos[:, 2:7] = [z, *quat]
     qpos[:, 7:] = robot.pose
-    physics.qpos.assign(qpos)
-    physics.ctrl.assign(qpos[:, 7:])
-    physics.qvel.zero_()
+    physics.arrays.qpos.assign(qpos)
+    physics.arrays.ctrl.assign(qpos[:, 7:])
+    physics.arrays.qvel.zero_()
 
 
 def reference(physics, world=0):
@@ -58,12 +61,12 @@ def run_both(physics, targets):
     data = reference(physics)
     ours, theirs = [], []
     for target in targets:
-        physics.ctrl.assign(np.tile(target, (physics.num_envs, 1)).astype(np.float32))
+        physics.arrays.ctrl.assign(np.tile(target, (physics.num_envs, 1)).astype(np.float32))
         physics.step()
         data.ctrl[:] = target
         for _ in range(physics.config.substeps):
             mujoco.mj_step(physics.model, data)
-        ours.append(np.concatenate([physics.qpos.numpy()[0], physics.qvel.numpy()[0]]))
+        ours.append(np.concatenate([physics.arrays.qpos.numpy()[0], physics.arrays.qvel.numpy()[0]]))
         theirs.append(np.concatenate([data.qpos, data.qvel]))
     return np.array(ours), np.array(theirs)
 
@@ -82,13 +85,13 @@ def swing(steps, joints, seed=0):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_free_flight_agrees_with_mujoco(name, device):
+def test_free_flight_agrees_with_mujoco(name, simulator):
     """Half a second of tumbling with moving legs and an arm at its limits: every angle to 1e-4, as float32 allows."""
     robot = ROBOTS[name]
-    physics = make(1, device, robot=robot)
+    physics = make(1, simulator, robot=robot)
     nq, nv = physics.model.nq, physics.model.nv
     qvel = np.random.default_rng(1).normal(size=(1, nv)).astype(np.float32)
-    physics.qvel.assign(qvel)
+    physics.arrays.qvel.assign(qvel)
     ours, theirs = run_both(physics, np.hstack([wave(25, 0.4), swing(25, nv - 18)]))
     # 100 substeps, each with rounding of about 1e-7 in numbers of order 5, and forces of 30 N m/rad that bind them.
     np.testing.assert_allclose(ours[:, :nq], theirs[:, :nq], rtol=0, atol=1e-4)
@@ -96,10 +99,10 @@ def test_free_flight_agrees_with_mujoco(name, device):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_standing_agrees_with_mujoco(name, device):
+def test_standing_agrees_with_mujoco(name, simulator):
     """Set down on flat ground, swaying, an arm swinging between its limits: base to a millimetre, joints to 5 mrad."""
     robot = ROBOTS[name]
-    physics = make(1, device, robot=robot)
+    physics = make(1, simulator, robot=robot)
     place(physics, robot.standing_height, robot=robot)
     nq, joints = physics.model.nq, physics.model.nu - 12
     ours, theirs = run_both(physics, np.hstack([wave(50, 0.1), swing(50, joints, seed=1)]))
@@ -111,14 +114,14 @@ def test_standing_agrees_with_mujoco(name, device):
     assert at_limit.any(axis=0).sum() >= min(joints, 3), "the arm must have been at its limits"
 
 
-def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
+def test_fall_on_stairs_agrees_with_mujoco(simulator, stairs):
     """Dropped askew onto stairs: the same until shortly after the first contacts; later on the stairs, nothing lost."""
-    physics = make(1, device, stairs)
+    physics = make(1, simulator, stairs)
     tilt = np.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0])
     place(physics, stairs.heights.max() + 0.45, tilt)
-    qpos = physics.qpos.numpy()
+    qpos = physics.arrays.qpos.numpy()
     qpos[0, 0] = 0.9
-    physics.qpos.assign(qpos)
+    physics.arrays.qpos.assign(qpos)
     ours, theirs = run_both(physics, np.tile(ROBOT.pose, (100, 1)))
     touched = np.flatnonzero(np.abs(np.diff(theirs[:, 21])) < 0.15)[0]  # the fall is braked
     # A fall is chaotic: contacts on the two sides of a prism's edge part ways, so only its start can be compared.
@@ -128,26 +131,26 @@ def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
     np.testing.assert_allclose(ours[:first, 3:19], theirs[:first, 3:19], rtol=0, atol=3e-2)
     low = stairs.heights.min()
     assert low < ours[-1, 2] < stairs.heights.max() + 0.45
-    assert not physics.overflow.numpy()[0] & physics.lost_contacts
+    assert not physics.arrays.overflow.numpy()[0] & physics.lost_contacts
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_part_forces_carry_the_robot(name, device):
+def test_part_forces_carry_the_robot(name, simulator):
     """Standing still, the feet's normal forces add up to the weight, and no other part touches the ground."""
-    physics = make(3, device, robot=ROBOTS[name])
+    physics = make(3, simulator, robot=ROBOTS[name])
     place(physics, 0.29, robot=ROBOTS[name])
     for _ in range(150):
         physics.step()
-    force = physics.part_force.numpy()
+    force = physics.arrays.part_force.numpy()
     assert force.shape == (4, 3, 13)
     # What remains of the swaying after 3 s moves the forces by less than 2 %.
     np.testing.assert_allclose(force[:, :, 1:5].sum(axis=2), MASS[name] * 9.81, rtol=0.02)
     assert not force[:, :, [0, *range(5, 13)]].any()
 
 
-def test_part_forces_agree_with_mujoco(device):
+def test_part_forces_agree_with_mujoco(simulator):
     """Lying on its back: the normal force on every part is that of MuJoCo C in the same state."""
-    physics = make(1, device, config=PhysicsConfig(substeps=1))
+    physics = make(1, simulator, config=PhysicsConfig(substeps=1))
     place(physics, 0.049, (0, 1, 0, 0))
     data = reference(physics)
     physics.step()
@@ -159,22 +162,22 @@ def test_part_forces_agree_with_mujoco(device):
         expected[next(part[name] for name in names if name in part)] += wrench[0]
     assert expected[0] > 1.0
     # Five Newton iterations converge to float32's accuracy of a stiff problem.
-    np.testing.assert_allclose(physics.part_force.numpy()[0, 0], expected, rtol=1e-2, atol=0.1)
+    np.testing.assert_allclose(physics.arrays.part_force.numpy()[0, 0], expected, rtol=1e-2, atol=0.1)
 
 
-def test_reset_forgets_everything_and_touches_nobody_else(device):
+def test_reset_forgets_everything_and_touches_nobody_else(simulator):
     """A masked reset takes a NaN world back to the start, warm start too, and leaves the others bit for bit."""
-    physics, twin = (make(4, device) for _ in range(2))
+    physics, twin = (make(4, simulator) for _ in range(2))
     for both in (physics, twin):
         place(both, 0.3)
         both.step()
-    qpos = physics.qpos.numpy()
+    qpos = physics.arrays.qpos.numpy()
     qpos[1] = np.nan
-    physics.qpos.assign(qpos)
+    physics.arrays.qpos.assign(qpos)
     for both in (physics, twin):
         both.step()
     assert np.isnan(physics.tensors["warmstart"][1].cpu().numpy()).any()
-    mask = wp.array([False, True, False, False], dtype=wp.bool, device=device)
+    mask = wp.array([False, True, False, False], dtype=wp.bool, device=str(simulator.device))
     for both in (physics, twin):
         both.reset(mask)
         both.step()
@@ -184,24 +187,24 @@ def test_reset_forgets_everything_and_touches_nobody_else(device):
         np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-def test_identical_worlds_stay_identical(device):
+def test_identical_worlds_stay_identical(simulator):
     """Worlds do not depend on their number: equal states give equal motion, bit for bit, on a CPU."""
-    physics = make(5, device)
+    physics = make(5, simulator)
     place(physics, 0.3)
     for target in wave(20, 0.3):
-        physics.ctrl.assign(np.tile(target, (5, 1)).astype(np.float32))
+        physics.arrays.ctrl.assign(np.tile(target, (5, 1)).astype(np.float32))
         physics.step()
-    qpos = physics.qpos.numpy()
-    if device == "cpu":
+    qpos = physics.arrays.qpos.numpy()
+    if simulator.device.type == "cpu":
         np.testing.assert_array_equal(qpos, np.tile(qpos[0], (5, 1)))
     else:  # the order of contacts, and with it that of sums, is not fixed there
         np.testing.assert_allclose(qpos, np.tile(qpos[0], (5, 1)), atol=1e-3)
 
 
-def test_capture_replays_the_step(device):
+def test_capture_replays_the_step(simulator):
     """A captured step does what the launches do, and the launches are made once."""
-    physics, twin = (make(2, device) for _ in range(2))
-    step = Captured(physics.step, torch.device(device))
+    physics, twin = (make(2, simulator) for _ in range(2))
+    step = physics.record_step(lambda: None, lambda: None)
     for both in (physics, twin):
         for tensor in both.tensors.values():
             tensor.zero_()
@@ -209,42 +212,42 @@ def test_capture_replays_the_step(device):
     for _ in range(5):
         step()
         twin.step()
-    np.testing.assert_array_equal(physics.qpos.numpy(), twin.qpos.numpy())
+    np.testing.assert_array_equal(physics.arrays.qpos.numpy(), twin.arrays.qpos.numpy())
 
 
 def test_a_long_silence_is_explained(torch_device, capsys, monkeypatch):
     """A first run that takes longer than a person's patience says what it waits for; a quick one says nothing."""
-    monkeypatch.setattr("deimos.sim.legged.engines.mujoco_warp.PATIENCE", 0.2)
+    monkeypatch.setattr("deimos.sim.legged.engines.captured.PATIENCE", 0.2)
     Captured(lambda: time.sleep(0.01), torch_device)
     assert capsys.readouterr().err == ""
     Captured(lambda: time.sleep(0.3), torch_device)
     assert capsys.readouterr().err.startswith("Compiling the simulator for this machine")
 
 
-def test_friction_is_the_worlds_own(device):
+def test_friction_is_the_worlds_own(simulator):
     """On its own slippery feet a sliding robot slides farther than one with grip, by what friction brakes."""
-    physics = make(2, device, friction=np.array([0.2, 1.0]))
+    physics = make(2, simulator, friction=np.array([0.2, 1.0]))
     place(physics, 0.29)
     for _ in range(50):
         physics.step()
-    physics.qvel.assign(np.array([[1.0, *[0.0] * 17]] * 2, np.float32))
-    start = physics.qpos.numpy()[:, 0].copy()
+    physics.arrays.qvel.assign(np.array([[1.0, *[0.0] * 17]] * 2, np.float32))
+    start = physics.arrays.qpos.numpy()[:, 0].copy()
     for _ in range(50):
         physics.step()
-    way = physics.qpos.numpy()[:, 0] - start
+    way = physics.arrays.qpos.numpy()[:, 0] - start
     assert way[0] > 1.5 * way[1]
 
 
-def test_payload_changes_mass_and_what_follows_from_it(device):
+def test_payload_changes_mass_and_what_follows_from_it(simulator):
     """A payload adds to the base's mass, scales its inertia, and is carried by the feet; sensitivities are MuJoCo's."""
     payload = np.array([-1.0, 0.0, 1.0])
-    physics = make(3, device, payload=payload)
+    physics = make(3, simulator, payload=payload)
     mass = physics.tensors["body_mass"].cpu().numpy()
     np.testing.assert_allclose(mass.sum(axis=1), go1.build().spec.compile().body_mass.sum() + payload, rtol=1e-6)
     place(physics, 0.29)
     for _ in range(150):
         physics.step()
-    carried = physics.part_force.numpy()[-1, :, 1:5].sum(axis=1)
+    carried = physics.arrays.part_force.numpy()[-1, :, 1:5].sum(axis=1)
     np.testing.assert_allclose(carried, (go1.MASS + payload) * 9.81, rtol=0.02)
     spec = go1.build().spec
     spec.body("trunk").mass += 1.0
@@ -257,7 +260,7 @@ def test_payload_changes_mass_and_what_follows_from_it(device):
 
 def test_buffers_tell_their_use(device):
     """The peak of contacts and rows is counted, and too few rows set a bit that means lost contacts."""
-    physics = make(2, device)
+    physics = make(2, ("warp", device))
     place(physics, 0.05, (0, 1, 0, 0))
     physics.step()
     use = physics.buffer_use()
@@ -265,10 +268,10 @@ def test_buffers_tell_their_use(device):
     # Four feet with four rows each, a head and four hips, ten capsules with two contacts each, and twelve limits.
     assert 0 < use["rows"] <= use["max_rows"] == 4 * 4 + 5 + 10 * 2 + 12
     assert physics.buffer_use()["rows"] == 0  # since the last call
-    small = make(2, device, config=PhysicsConfig(rows=8))
+    small = make(2, ("warp", device), config=PhysicsConfig(rows=8))
     place(small, 0.25)
     small.step()
-    assert np.all(small.overflow.numpy() & small.lost_contacts)
+    assert np.all(small.arrays.overflow.numpy() & small.lost_contacts)
 
 
 @pytest.mark.parametrize(
@@ -283,12 +286,12 @@ def test_buffers_tell_their_use(device):
 )
 def test_losses_are_explained(device, bits, message):
     """Every bit that means a lost contact has its name, its reason and what helps, and the solver's bits have none."""
-    assert re.search(message, make(2, device).explain_loss(bits))
+    assert re.search(message, make(2, ("warp", device)).explain_loss(bits))
 
 
-def test_every_loss_has_an_explanation(device):
+def test_every_loss_has_an_explanation(simulator):
     """No single bit of those that mean a lost contact is left without words."""
-    physics = make(1, device)
+    physics = make(1, simulator)
     bits = [1 << i for i in range(16) if physics.lost_contacts & 1 << i]
     assert len(bits) == 7
     assert all(physics.explain_loss(bit) for bit in bits)
@@ -297,32 +300,34 @@ def test_every_loss_has_an_explanation(device):
 def test_buffers_hold_an_arm_that_touches_everything(device, stairs):
     """The buffers hold the arm's contacts with ground and guards, and an arm that swings into both loses none."""
     robot = ROBOTS["go1_rx150"]
-    physics = make(4, device, robot=robot)
+    physics = make(4, ("warp", device), robot=robot)
     # Beside the Go1's 53: five limits, two capsules on the ground and on two guards, twice each, and on a ball.
     among_itself = 2 * 2 * 2 + 2
     assert physics.max_rows == 53 + 5 + 2 * 2 + among_itself
     # On a height field four fifths of what four contacts of each need: four rows for four feet, one for 17 others.
-    assert make(1, device, stairs, robot).max_rows == math.ceil(0.8 * (4 * 4 * 4 + 17 * 4 + 12 + 5 + among_itself))
+    assert make(1, ("warp", device), stairs, robot).max_rows == math.ceil(
+        0.8 * (4 * 4 * 4 + 17 * 4 + 12 + 5 + among_itself)
+    )
     place(physics, 0.1, (0, 1, 0, 0), robot=robot)  # on its back, upon the arm
     touched = set()
     for target in swing(60, 5, seed=1):
-        physics.ctrl.assign(np.tile([*ROBOT.pose, *target], (4, 1)).astype(np.float32))
+        physics.arrays.ctrl.assign(np.tile([*ROBOT.pose, *target], (4, 1)).astype(np.float32))
         physics.step()
         touched |= {physics.model.geom(geom).name for pair in physics.to_mujoco(0).contact.geom for geom in pair}
     assert {"ground", "guard_left", "guard_right", "forearm", "gripper"} <= touched
     use = physics.buffer_use()
     assert use["rows"] < use["max_rows"]
     assert use["contacts"] < use["max_contacts"]
-    assert not (physics.overflow.numpy() & physics.lost_contacts).any()
+    assert not (physics.arrays.overflow.numpy() & physics.lost_contacts).any()
 
 
-def test_to_mujoco_shows_the_state(device):
+def test_to_mujoco_shows_the_state(simulator):
     """One world comes out as MuJoCo's own data, with the geoms where its kinematics put them."""
-    physics = make(2, device)
+    physics = make(2, simulator)
     place(physics, 0.3)
-    qpos = physics.qpos.numpy()
+    qpos = physics.arrays.qpos.numpy()
     qpos[1, 0] = 2.0
-    physics.qpos.assign(qpos)
+    physics.arrays.qpos.assign(qpos)
     data = physics.to_mujoco(1)
     np.testing.assert_allclose(data.qpos, qpos[1], rtol=0)
     np.testing.assert_allclose(data.body("trunk").xpos, [2.0, 0.0, 0.3], rtol=0, atol=1e-6)

@@ -187,12 +187,7 @@ def _add_links(trunk: "mujoco.MjsBody") -> None:
         body = body.add_body(name=BODIES[i], pos=OFFSETS[i])
         add_inertia(body, *LINKS[i])
         body.add_joint(
-            name=joint,
-            axis=_axis(i),
-            range=_limits(i),
-            limited=True,
-            armature=ARMATURE[i],
-            damping=(DRAG[i], 0.0, 0.0),
+            name=joint, axis=_axis(i), range=_limits(i), limited=True, armature=ARMATURE[i], damping=(DRAG[i], 0.0, 0.0)
         )
         _dress(body)
     body.add_site(name="end_effector", pos=OFFSETS[-1], group=VISUAL_GROUP)
