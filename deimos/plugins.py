@@ -3,16 +3,22 @@
 Packages outside this tree register a module through an entry-point group, one of ``HOLDS``.
 """
 
+import dataclasses
 import importlib
 import pkgutil
 import warnings
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from types import ModuleType
+from typing import Any
 
 from deimos.checks import RunError
 
-HOLDS = {"deimos.envs": "Config", "deimos.selectors": "Config", "deimos.robots": "build", "deimos.shapes": "Shape"}
-"""What every plug-in of a group holds."""
+HOLDS = {
+    "deimos.envs": ("dataclass", "Config"), "deimos.selectors": ("dataclass", "Config"),
+    "deimos.robots": ("function", "build"), "deimos.shapes": ("dataclass", "Shape"),
+}  # fmt: skip
+"""What every plug-in of a group holds, and its name."""
 
 
 def names(package: ModuleType) -> list[str]:
@@ -28,34 +34,44 @@ def _own(package: ModuleType) -> set[str]:
     return {module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_")}
 
 
-def load(package: ModuleType, name: str) -> ModuleType:
+def load(package: ModuleType, name: str, use: Callable[[ModuleType], Any] = lambda module: module) -> Any:
     """Import the plug-in ``name`` of ``package``; its own modules come before foreign ones of the same name.
+
+    Args:
+        package: Where it is.
+        name: Its name.
+        use: What the caller makes of the module: an error in it is the plug-in's too.
+
+    Returns:
+        What ``use`` has made of it; by default the module.
 
     Raises:
         ValueError: If there is none; the message lists those that there are.
         RunError: If it is broken.
     """
-    own = name in _own(package)
-    entry = None if own else next(iter(entry_points(group=_group(package), name=name)), None)
+    group, own = _group(package), name in _own(package)
+    entry = None if own else next(iter(entry_points(group=group, name=name)), None)
     if not own and entry is None:
         raise ValueError(f"{package.__name__} has no '{name}'; it has: {', '.join(names(package))}.")
     module = entry.value if entry else f"{package.__name__}.{name}"
+    kind, held = HOLDS[group]
     try:
         found = entry.load() if entry else importlib.import_module(module)
-        if not hasattr(found, HOLDS[_group(package)]):
-            raise AttributeError(f"it holds no {HOLDS[_group(package)]}")
+        thing = getattr(found, held, None)
+        if not (callable(thing) if kind == "function" else dataclasses.is_dataclass(thing)):
+            raise TypeError(f"it holds no {kind} {held}")
+        return use(found)
     except Exception as error:  # a foreign file may raise anything
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise RunError(f"The plug-in '{name}' of {_group(package)}, {module}, is broken ({reason}).") from error
-    return found
+        raise RunError(f"The plug-in '{name}' of {group}, {module}, is broken ({reason}).") from error
 
 
-def load_all(package: ModuleType) -> dict[str, ModuleType]:
-    """All plug-ins of ``package`` by name, sorted; warns of each that is broken, and leaves it out."""
+def load_all(package: ModuleType, use: Callable[[ModuleType], Any] = lambda module: module) -> dict[str, Any]:
+    """``load`` for every plug-in of ``package``, by its name; warns of each that is broken, and leaves it out."""
     found = {}
     for name in names(package):
         try:
-            found[name] = load(package, name)
+            found[name] = load(package, name, use)
         except RunError as error:
             warnings.warn(str(error), stacklevel=2)
     return found

@@ -201,36 +201,3 @@ def set_goals(row: wp.array, goal: wp.array, worlds: Worlds) -> wp.Launch:
     require("row", row, dtype=wp.int32, shape=row.shape, like=worlds.goal)
     require("goal", goal, dtype=wp.float32, shape=(*row.shape, *worlds.goal.shape[1:]), like=row)
     return wp.launch(_set_goals, row.shape[0], inputs=[row, goal, worlds], device=row.device, record_cmd=True)
-
-
-@wp.kernel
-def _make_relative(
-    # In
-    row: wp.array[int],
-    worlds: Worlds,
-    # In and out
-    candidate: wp.array3d[float],
-):
-    i, k = wp.tid()
-    for c in range(candidate.shape[2]):
-        candidate[i, k, c] = candidate[i, k, c] - worlds.origin[row[i], c] * worlds.goal_scale[c]
-
-
-def make_relative(row: wp.array, worlds: Worlds, candidate: wp.array) -> wp.Launch:
-    """Record expressing candidate goals as seen from the origin of each world, where there is one.
-
-    Args:
-        row: Worlds that the candidates are for, int32, shape (n,), each in [0, num_envs).
-        worlds: The worlds; only ``origin`` and ``goal_scale`` are read.
-        candidate: Scaled goals, float32, shape (n, count, goal_dim). Updated to scaled differences.
-
-    Raises:
-        ValueError: If an array has another shape, dtype or device.
-    """
-    require("row", row, dtype=wp.int32, shape=row.shape, like=worlds.goal)
-    require("worlds.origin", worlds.origin, like=worlds.goal)
-    shape = (row.shape[0], *candidate.shape[1:2], worlds.goal.shape[1])
-    require("candidate", candidate, dtype=wp.float32, shape=shape, like=row)
-    return wp.launch(
-        _make_relative, candidate.shape[:2], inputs=[row, worlds, candidate], device=row.device, record_cmd=True
-    )

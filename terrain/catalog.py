@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import ModuleType
 from typing import Any, get_args, get_type_hints
 
 from deimos import plugins
@@ -45,11 +46,13 @@ def name_of(shape: TileShape) -> str:
 
 def _defaults() -> dict[str, TileShape]:
     """Every shape with its default parameters, by its name."""
-    found: list[TileShape] = []
-    for module in plugins.load_all(shapes).values():
-        directions = get_args(get_type_hints(module.Shape).get("direction"))
-        found += [module.Shape(direction=way) for way in directions] or [module.Shape()]
-    return {name_of(shape): shape for shape in found}
+    return {name_of(shape): shape for found in plugins.load_all(shapes, _of_module).values() for shape in found}
+
+
+def _of_module(module: ModuleType) -> list[TileShape]:
+    """The shapes of a module: one for each of its directions."""
+    directions = get_args(get_type_hints(module.Shape).get("direction"))
+    return [module.Shape(direction=way) for way in directions] or [module.Shape()]
 
 
 def convert(name: str, value: Any, hint: Any) -> Any:

@@ -472,7 +472,7 @@ def test_entry_point_with_a_hyphen_is_an_environment(install, tmp_path):
     [
         ("raise ImportError('it needs what is not there')", "ImportError: it needs what is not there"),
         ("def", "SyntaxError: invalid syntax (other_module.py, line 1)"),
-        ("class Konfig: ...", "AttributeError: it holds no Config"),
+        ("class Config: ...", "TypeError: it holds no dataclass Config"),
     ],
 )
 @pytest.mark.parametrize(("group", "kind"), [("deimos.envs", "env"), ("deimos.selectors", "selector")])

@@ -1,6 +1,7 @@
 """Every shape of ground, by itself: its mesh, its formulas and its bounds."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -287,10 +288,21 @@ class Shape(TileShape):
     assert catalog.name_of(shape) == "one-bump"
 
 
-def test_broken_file_stops_no_other(tmp_path, monkeypatch):
-    """A file that is no shape is reported by its name, and all others are there."""
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("def", "SyntaxError: "),
+        (
+            "from deimos.terrain.shape import TileShape as Shape",
+            "TypeError: Can't instantiate abstract class TileShape",
+        ),
+    ],
+)
+def test_broken_file_stops_no_other(tmp_path, monkeypatch, source, reason):
+    """A file that is no shape, or none without parameters, is reported by its name, and all others are there."""
     before = catalog.names()
-    (tmp_path / "crater.py").write_text("def")
+    (tmp_path / "crater.py").write_text(source)
     monkeypatch.setattr(shapes, "__path__", [*shapes.__path__, str(tmp_path)])
-    with pytest.warns(UserWarning, match=r"The plug-in 'crater' of deimos.shapes, .* is broken \(SyntaxError"):
+    monkeypatch.delitem(sys.modules, "deimos.terrain.shapes.crater", raising=False)
+    with pytest.warns(UserWarning, match=rf"The plug-in 'crater' of deimos.shapes, .* is broken \({reason}"):
         assert catalog.names() == before
