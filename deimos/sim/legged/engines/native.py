@@ -28,8 +28,8 @@ SLOTS = 4  # contacts of a geom with the ground that are kept, those with the la
 LARGEST_FORCES = 2  # how a contact sensor chooses; MuJoCo has a number for it and no name
 WARNINGS = (
     ("INERTIA", "the inertia of the robot is close to singular"),
-    ("CONTACTFULL", "there were more contacts than the arena holds"),
-    ("CNSTRFULL", "there were more constraints than the arena holds"),
+    ("CONTACTFULL", "there were more contacts than the arena holds; raise memory of the robot's spec"),
+    ("CNSTRFULL", "there were more constraints than the arena holds; raise memory of the robot's spec"),
     ("BADQPOS", "a position was not finite, or beyond 1e10"),
     ("BADQVEL", "a velocity was not finite, or beyond 1e10"),
     ("BADQACC", "an acceleration was not finite, or beyond 1e10"),
@@ -140,7 +140,8 @@ class Engine(Physics):
             self._batch.rollout(self.config.substeps, record=("sensordata",), out={"sensordata": self._contact})
         except batch.SimulationError as error:  # those worlds are where they were
             world = int(error.ids[0])
-            raise SimulationError(f"World {world}: MuJoCo says '{self._batch.error(world)}'.") from error
+            reason = " ".join(self._batch.error(world).split())
+            raise SimulationError(f"World {world}: MuJoCo stops with '{reason}'.") from error
 
     def reset(self, mask: wp.array) -> None:
         """See ``Physics.reset``."""
