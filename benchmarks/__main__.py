@@ -10,7 +10,7 @@ import torch
 import tyro
 import warp as wp
 
-from benchmarks import commits, director, particle, quad, terrain, training
+from benchmarks import commits, director, engines, particle, quad, terrain, training
 from benchmarks.timing import wide_console
 from deimos.checks import RunError, check_at_least
 from deimos.run.trainer import TrainConfig
@@ -24,7 +24,7 @@ from reproduction.thesis import TABLE_4_1
 class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
-    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain", "director", "commits"]]
+    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "engines", "terrain", "director", "commits"]]
     """What to measure."""
     against: str = "HEAD"
     """The other commit of ``commits``: this checkout's training beside it, in processes of their own."""
@@ -55,7 +55,10 @@ def run(options: BenchOptions) -> dict[str, Any]:
     results: dict[str, Any] = {
         "versions": provenance(), "threads": torch.get_num_threads(), "device": str(device),
     }  # fmt: skip
-    measure = {"particle": measure_particle, "terrain": measure_terrain, "director": measure_director}
+    measure = {
+        "particle": measure_particle, "engines": measure_engines, "terrain": measure_terrain,
+        "director": measure_director,
+    }  # fmt: skip
     if options.what == "commits":
         results["commits"] = commits.measure(options.against, options.rounds, options.threads or cores())
         commits.show(results["commits"], options.against)
@@ -97,6 +100,13 @@ def measure_legged(name: str, rounds: int, device: torch.device) -> dict[str, An
     quad.print_env(name, results["env"])
     results["training"] = quad.measure_training(name, device, 3 * rounds)
     training.print_training(f"{name}, flat, T = {quad.PERIOD}", results["training"])
+    return results
+
+
+def measure_engines(rounds: int, device: torch.device) -> dict[str, Any]:
+    """The engines of the legged environments beside each other."""
+    results = engines.measure(device, rounds)
+    engines.show(results)
     return results
 
 

@@ -87,11 +87,10 @@ def make_worlds(
     return worlds
 
 
-def record(kernel: wp.Kernel, worlds: Worlds, *inputs: object) -> wp.Launch:
-    """Record a kernel over all worlds; its first argument is ``worlds``, the others are ``inputs``."""
-    return wp.launch(
-        kernel, dim=worlds.num_threads, inputs=[worlds, *inputs], device=worlds.goal.device, record_cmd=True
-    )
+def record(kernel: wp.Kernel, worlds: Worlds, *inputs: object, dim: int | tuple[int, ...] | None = None) -> wp.Launch:
+    """Record a kernel whose first argument is ``worlds``, then ``inputs``; over all worlds, or ``dim`` threads."""
+    dim = worlds.num_threads if dim is None else dim
+    return wp.launch(kernel, dim, inputs=[worlds, *inputs], device=worlds.goal.device, record_cmd=True)
 
 
 @wp.func
@@ -169,11 +168,11 @@ def end_step(env: int, crashed: wp.bool, over: wp.bool, cause: int, worlds: Worl
 
 @wp.kernel
 def _set_goals(
+    # In and out
+    worlds: Worlds,
     # In
     row: wp.array[int],
     goal: wp.array2d[float],
-    # In and out
-    worlds: Worlds,
 ):
     i = wp.tid()
     env = row[i]
@@ -200,4 +199,4 @@ def set_goals(row: wp.array, goal: wp.array, worlds: Worlds) -> wp.Launch:
     """
     require("row", row, dtype=wp.int32, shape=row.shape, like=worlds.goal)
     require("goal", goal, dtype=wp.float32, shape=(*row.shape, *worlds.goal.shape[1:]), like=row)
-    return wp.launch(_set_goals, row.shape[0], inputs=[row, goal, worlds], device=row.device, record_cmd=True)
+    return record(_set_goals, worlds, row, goal, dim=len(row))

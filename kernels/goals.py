@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from .check import require, require_axes
-from .episodes import Worlds
+from .episodes import Worlds, record
 from .lanes import WORDS, lanes, threads
 from .random import Purpose, philox_lanes, unit
 
@@ -15,8 +15,8 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def _draw_candidates(
     # In
-    lanes: Any,
     worlds: Worlds,
+    lanes: Any,
     row: wp.array[int],
     scale: wp.array[float],
     # Out
@@ -86,10 +86,5 @@ def draw_candidates(row: wp.array, scale: wp.array, candidate: wp.array, worlds:
     """
     check_candidates(row, scale, candidate, worlds)
     count = candidate.shape[1]
-    return wp.launch(
-        _draw_candidates,
-        dim=threads(len(row), count, row.device),
-        inputs=[WORDS[lanes(count, row.device)](), worlds, row, scale, candidate],
-        device=row.device,
-        record_cmd=True,
-    )
+    words, dim = WORDS[lanes(count, row.device)](), threads(len(row), count, row.device)
+    return record(_draw_candidates, worlds, words, row, scale, candidate, dim=dim)

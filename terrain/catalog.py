@@ -40,7 +40,7 @@ def make(name: str, parameters: Mapping[str, Any] | None = None) -> TileShape:
 
 def name_of(shape: TileShape) -> str:
     """The name that ``make`` knows a shape by."""
-    stem = plugins.name_of(shapes, type(shape).__module__)
+    stem = plugins.name_of(shapes, type(shape).__module__) or type(shape).__name__
     return "-".join([stem.replace("_", "-"), *filter(None, [getattr(shape, "direction", None)])])
 
 

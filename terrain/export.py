@@ -100,7 +100,9 @@ def _mesh_bytes(mesh: Mesh, ending: str) -> bytes:
         vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces) + 1
         text = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel().tolist())
         return (text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel().tolist())).encode()
-    return bytes(mesh.export(file_type=ending[1:]))
+    data = mesh.export(file_type=ending[1:])
+    assert isinstance(data, bytes)  # of these three formats
+    return data
 
 
 def _save_grey(path: Path, terrain: Terrain) -> None:

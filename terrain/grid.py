@@ -76,7 +76,10 @@ class Terrain:
             data["corner"] = tuple(float(value) for value in data["corner"])
             return Terrain(**data | {name: float(data[name]) for name in ("cell", "tile")})
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({error}).") from error
+            raise ValueError(
+                f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({str(error).rstrip('.')}); "
+                "files of other programs are imported first: deimos terrain import."
+            ) from error
 
 
 def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
@@ -91,15 +94,8 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
     """
     check_positive("size", size, finite=True)
     samples = cells("size", size, cell) + 1
-    return Terrain(
-        heights=np.zeros((samples, samples), np.float32),
-        cell=cell,
-        corner=(-size / 2, -size / 2),
-        origins=np.zeros((1, 1, 3), np.float32),
-        shapes=("flat",),
-        tile=size,
-        difficulty=np.zeros(1, np.float32),
-    )
+    corner, origins, difficulty = (-size / 2, -size / 2), np.zeros((1, 1, 3), np.float32), np.zeros(1, np.float32)
+    return Terrain(np.zeros((samples, samples), np.float32), cell, corner, origins, ("flat",), size, difficulty)
 
 
 def check_heights(heights: np.ndarray) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from deimos.kernels.ray_cast import SNAP
 
 from deimos.checks import check_positive
+from deimos.files import first_line
 
 from .export import GREY_NOTE
 from .grid import Terrain, check_heights, on_ground
@@ -84,7 +85,7 @@ def import_file(
             field = _read_array(path, resolution or RESOLUTION)
         else:
             field = _read_mesh(path, resolution or RESOLUTION, scale or 1.0, device)
-        return _with_tiles(path.stem, *field, tile)
+        return _with_tiles(path.stem, field, tile)
     except ValueError as error:
         raise ValueError(f"{path} cannot be imported: {error}") from error
 
@@ -106,7 +107,7 @@ def _read_mesh(path: Path, cell: float, scale: float, device: str) -> _Field:
         try:
             mesh = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), process=False, skip_materials=True)
         except Exception as error:  # its readers raise whatever a broken file makes them stumble over
-            raise ValueError(f"it is no mesh, or it is broken ({error}).") from error
+            raise ValueError(f"it is no mesh, or it is broken ({first_line(error)}).") from error
     if not len(getattr(mesh, "faces", ())):
         raise ValueError("it holds no faces.")
     vertices = scale * np.asarray(mesh.vertices, np.float64)
@@ -118,9 +119,7 @@ def _read_mesh(path: Path, cell: float, scale: float, device: str) -> _Field:
     low, high = (np.round(end(axis=0)[:2] / unit) * unit for end in (vertices.min, vertices.max))
     nx, ny = (int(cells) + 1 for cells in (high - low) / cell + 1e-6)
     if min(nx, ny) < 2:
-        raise ValueError(
-            f"it must extend over at least a cell of {cell:g} m along x and y, got {nx - 1} x {ny - 1} cells."
-        )
+        raise ValueError(f"it must extend over a cell of {cell:g} m along x and y, got {nx - 1} x {ny - 1} cells.")
     require_memory((nx, ny), BYTES_PER_SAMPLE * nx * ny, "resolution", cell)
     corner = float(low[0]), float(low[1])
     heights = rasterise(from_triangles(vertices, mesh.faces), corner, cell, (nx, ny), device=device)
@@ -131,27 +130,24 @@ def _read_picture(path: Path, resolution: float | None, height_range: tuple[floa
     """Grey values as heights; what the picture says of them holds where the arguments say nothing."""
     from PIL import Image
 
-    try:
-        with Image.open(path) as image:
-            mode, grey = image.mode, np.asarray(image)
-            note = GREY_NOTE.match(str(image.info.get("Description")))
-    except (OSError, SyntaxError) as error:  # Pillow's words for a broken file
-        if isinstance(error, FileNotFoundError | PermissionError):
-            raise
-        raise ValueError(f"it is no picture, or it is broken ({error}).") from error
+    with path.open("rb") as file:
+        try:
+            with Image.open(file) as image:
+                mode, grey = image.mode, np.asarray(image)
+                note = GREY_NOTE.match(str(image.info.get("Description")))
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            raise ValueError(f"it is no picture, or it is broken ({first_line(error)}).") from error
     if mode not in ("L", "I", "I;16"):
         raise ValueError(f"it must have 8- or 16-bit grey values and nothing else, got the mode {mode}.")
-    if height_range is None and note is None:
-        raise ValueError("height_range must be given: the heights of its lowest and its highest grey value [m].")
-    grey = grey[::-1].T.astype(np.float64)
+    says = {name: float(value) for name, value in note.groupdict().items()} if note else {}
     if height_range is not None:
         low, high = height_range
-        unit = (high - low) / (255 if mode == "L" else 65535)
-    else:
-        low, unit = float(note["low"]), float(note["unit"])
-    heights = low + unit * grey
-    if resolution is None and note is not None:
-        return heights, float(note["cell"]), (float(note["x"]), float(note["y"]))
+        says |= {"low": low, "unit": (high - low) / (255 if mode == "L" else 65535)}
+    if "low" not in says:
+        raise ValueError("height_range must be given: the heights of its lowest and its highest grey value [m].")
+    heights = says["low"] + says["unit"] * grey[::-1].T.astype(np.float64)
+    if resolution is None and note:
+        return heights, says["cell"], (says["x"], says["y"])
     return _around_origin(heights, resolution or RESOLUTION)
 
 
@@ -162,7 +158,7 @@ def _read_array(path: Path, cell: float) -> _Field:
             found = np.load(file, allow_pickle=False)
             arrays = [found] if isinstance(found, np.ndarray) else [found[name] for name in found.files]
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"it is no NumPy file of numbers, or it is broken ({error}).") from error
+        raise ValueError(f"it is no NumPy file of numbers, or it is broken ({first_line(error)}).") from error
     if len(arrays) != 1 or arrays[0].ndim != 2 or arrays[0].dtype.kind not in "fiu":
         shapes = ", ".join(f"{array.dtype}{list(array.shape)}" for array in arrays)
         raise ValueError(f"it must hold one array of numbers with two axes, got {shapes}.")
@@ -174,10 +170,9 @@ def _around_origin(heights: np.ndarray, cell: float) -> _Field:
     return heights, cell, (-(nx - 1) * cell / 2, -(ny - 1) * cell / 2)
 
 
-def _with_tiles(
-    name: str, heights: np.ndarray, cell: float, corner: tuple[float, float], tile: float | None
-) -> Terrain:
+def _with_tiles(name: str, field: _Field, tile: float | None) -> Terrain:
     """The terrain of a height grid, with as many tiles as fit around its middle."""
+    heights, cell, corner = field
     check_heights(heights)
     size = cell * (np.array(heights.shape) - 1)
     side = float(size.min()) if tile is None else tile
@@ -187,7 +182,5 @@ def _with_tiles(
     index = np.moveaxis(np.indices((levels, columns)), 0, -1)
     middles = corner + size / 2 + side * (index + 0.5 - np.array([levels, columns]) / 2)
     heights = np.ascontiguousarray(heights, np.float32)
-    difficulty = np.zeros(levels, np.float32)
-    return Terrain(
-        heights, cell, corner, on_ground(middles, heights, cell, corner), (name,) * columns, side, difficulty
-    )
+    origins = on_ground(middles, heights, cell, corner)
+    return Terrain(heights, cell, corner, origins, (name,) * columns, side, np.zeros(levels, np.float32))

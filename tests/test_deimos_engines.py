@@ -112,14 +112,11 @@ def test_engines_agree_in_standing():
 
 
 def test_engines_agree_in_a_fall_on_stairs(hill):
-    """Dropped askew: until three steps after the first touch, the base to a millimetre and joints to 10 mrad.
-
-    From then on contacts lie on other sides of a prism's edge. Both engines end on the stairs.
-    """
+    """Dropped askew: until three steps after the first touch, the base to a millimetre and joints to 10 mrad."""
     start = np.array([[x, 0.3, hill.heights.max() + 0.45, math.cos(0.3), math.sin(0.3), 0, 0] for x in (0.0, 0.5, 0.9)])
     paths = [trajectories(engine, start, hill, steps=100) for engine in ENGINES]
     free = start[:, 2] - 0.5 * 9.81 * (0.02 * np.arange(1, 101)[:, None]) ** 2
-    for world in range(3):
+    for world in range(3):  # from then on contacts lie on other sides of a prism's edge
         first = np.flatnonzero(paths[0][:, world, 2] > free[:, world] + 0.01)[0] + 3
         assert first < 40
         assert differences(paths, joints=False)[:first, world].max() < 1e-3
@@ -138,10 +135,7 @@ def test_engines_agree_while_a_policy_walks():
 
 
 def test_engines_agree_in_distribution_on_rough_ground():
-    """Once contacts part, means over worlds agree within chance: tracking, the feet's forces, crashes.
-
-    Tracking and forces agree within 4 standard errors, crashes within 4 standard deviations of a Poisson count.
-    """
+    """Once contacts part, tracking, the feet's forces and crashes agree within 4 standard errors over the worlds."""
     walked = [walk(engine, "rough", num_envs=128) for engine in ENGINES]
     assert differences([path for path, *_ in walked])[-1].max() > 0.1, "they must have parted to be told apart"
     for quantity in (1, 2):

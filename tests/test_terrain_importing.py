@@ -126,6 +126,12 @@ def broken(path):
     path.write_bytes(b"solid nothing at all\x00\x01")
 
 
+def cut_off(path):
+    """A picture that was not written to its end."""
+    Image.fromarray(np.random.default_rng(0).integers(0, 2**16, (64, 64), np.uint16)).save(path)
+    path.write_bytes(path.read_bytes()[:5000])
+
+
 def upright(path):
     """A mesh that nothing can stand on."""
     mesh = rings(np.array([1.0]), np.zeros(1))
@@ -145,7 +151,8 @@ def with_a_hole(path):
     [
         ("a.xyz", broken, {}, "must end in one of .glb, .obj, .ply, .stl, .png, .npy, .npz, got"),
         *((f"a{ending}", broken, {}, "cannot be imported: it ") for ending in importing.OPTIONS),
-        ("a.stl", upright, {}, "it must extend over at least a cell of 0.05 m along x and y, got 40 x 0"),
+        ("a.png", cut_off, {"height_range": (0, 1)}, "it is no picture, or it is broken (image file is truncated"),
+        ("a.stl", upright, {}, "it must extend over a cell of 0.05 m along x and y, got 40 x 0"),
         ("a.stl", with_a_hole, {}, "mesh must cover the grid, but there is nothing above x = "),
         ("a.stl", with_a_hole, {"resolution": 1e-5}, "resolution must be at least 0.000122 m for 16384 cells"),
         ("a.stl", with_a_hole, {"height_range": (0, 1)}, "height_range does not apply to"),

@@ -29,10 +29,7 @@ class WarpEnv(Env):
 
     Args:
         config: The task.
-        num_envs: Number of worlds.
-        device: Where they are simulated.
-        seed: Seed of every draw.
-        env_offset: Global number of world 0.
+        num_envs, device, seed, env_offset: See ``EnvConfig.build``.
         layout: What stands where in the observation. Goals are shown times the scale of the field ``goal``.
         goal_range: Half side of the box that goals are drawn from along every component, in physical units.
         action_dim: Components of an action.

@@ -20,7 +20,7 @@ import math
 
 import warp as wp
 
-from ..episodes import Worlds
+from ..episodes import Worlds, record
 from ..goals import check_candidates
 from ..random import Purpose, uniform4
 from ..rotations import heading, rotate, rotate_about, rotate_by_heading
@@ -254,10 +254,5 @@ def redraw_candidates(legged: LeggedWorlds, arm: Arm, row: wp.array, scale: wp.a
         ValueError: If an array has another shape, dtype or device.
     """
     check_candidates(row, scale, candidate, legged.worlds)
-    return wp.launch(
-        _redraw_candidates,
-        dim=candidate.shape[:2],
-        inputs=[legged.worlds, legged.params, arm, legged.ground, legged.sim, row, scale, candidate],
-        device=row.device,
-        record_cmd=True,
-    )
+    inputs = legged.params, arm, legged.ground, legged.sim, row, scale, candidate
+    return record(_redraw_candidates, legged.worlds, *inputs, dim=candidate.shape[:2])

@@ -70,10 +70,7 @@ class Locomotion(WarpEnv):
         config: The task.
         robot: Who does it.
         parts: What its goals are made of; the velocity goal comes first.
-        num_envs: Number of worlds.
-        device: Where they are simulated.
-        seed: Seed of every draw.
-        env_offset: Global number of world 0.
+        num_envs, device, seed, env_offset: See ``EnvConfig.build``.
     """
 
     config: LocomotionConfig

@@ -150,16 +150,11 @@ def mount(robot: Robot) -> Robot:
     _add_collisions(spec, trunk)
     joints = tuple(
         Joint(
-            name=name,
-            pose=POSE[i],
-            action_scale=ACTION_SCALE,
-            range=_limits(i),
-            stiffness=STIFFNESS[i],
-            damping=DAMPING[i],
-            max_torque=MAX_TORQUE[i],
+            name=name, pose=POSE[i], range=_limits(i), action_scale=ACTION_SCALE,
+            stiffness=STIFFNESS[i], damping=DAMPING[i], max_torque=MAX_TORQUE[i],
         )
         for i, name in enumerate(JOINTS)
-    )
+    )  # fmt: skip
     add_actuators(spec, joints)
     mounted = (MOUNT[0] + OFFSETS[0][0], MOUNT[1] + OFFSETS[0][1], MOUNT[2] + OFFSETS[0][2])
     axes = tuple(_axis(i) for i in range(len(JOINTS)))
