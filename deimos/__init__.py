@@ -1,6 +1,8 @@
 """Deimos: goal-conditioned robot policies, trained under a Director that chooses their goals by fear."""
 
 import importlib
+import sys
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +22,20 @@ _OFFERED = {
 
 __all__ = ["__version__", *_OFFERED]
 
-# Installed, ``kernels`` and ``terrain`` lie inside this package; in a checkout they lie beside it.
 _HOME = Path(__file__).resolve().parent
-if not (_HOME / "kernels").is_dir():
-    __path__.append(str(_HOME.parent))
+
+
+class _Beside:
+    """Finds ``deimos.kernels`` and ``deimos.terrain`` beside this package, and nothing else that lies there."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        beside = name in ("deimos.kernels", "deimos.terrain")
+        return PathFinder.find_spec(name, [str(_HOME.parent)]) if beside else None
+
+
+if not (_HOME / "kernels").is_dir():  # in a checkout; installed, both are inside
+    sys.meta_path.insert(0, _Beside)  # before an editable install of another checkout
 
 
 def __getattr__(name: str) -> Any:

@@ -13,6 +13,11 @@ class SimulationError(RuntimeError):
     """The simulation or the learner has left the realm of finite numbers; the run must stop."""
 
 
+def one_line(error: BaseException) -> str:
+    """What an error says, in one line."""
+    return " ".join(str(error).split())
+
+
 def check_at_least(name: str, value: int, least: int) -> None:
     """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):  # NumPy's whole numbers too

@@ -41,6 +41,8 @@ class Purpose(IntEnum):
     LEVEL = 7
     EXPLORATION = 16
     """The learner's noise, which torch draws (``deimos.nn.random``), as it draws ``GOAL`` for a GoalDirector."""
+    AUDIT = 17
+    AUDIT_CONTEXT = 18
 
 
 class vec4u(wp.types.vector(length=4, dtype=wp.uint32)):

@@ -19,10 +19,8 @@ from torch import Tensor
 from deimos.goals import picks
 from deimos.goals.fear import Fear
 from deimos.goals.selector import GoalSelector, Proposal, uniform_proposal
-from deimos.goals.selectors import director
-from deimos.run.evaluation import EvalConfig, play, train_adversary
+from deimos.run.evaluation import EvalConfig, argmax_director, play, train_adversary
 from deimos.run.folder import RunFolder
-from deimos.run.loop import spaces
 from deimos.run.oracle import Clones, Oracle
 from deimos.run.training import load, read_config
 from deimos.sim.env import Env
@@ -77,9 +75,7 @@ def measure(path: Path) -> tuple[list[list[float]], list[float]]:
     play(env, act, watcher, STEPS)
     same = [[watcher.rate(known, name) for known in ("learnt", "truth")] for name in RULES]
     env = worlds()
-    learnt = director.Config(rule="argmax", fear=evaluation.fear).build(spaces(env), 0)
-    learnt.fear = fear
-    closed = [play(env, act, learnt, STEPS)["crash_rate"]]
+    closed = [play(env, act, argmax_director(env, fear), STEPS)["crash_rate"]]
     for known in (None, fear):
         env = worlds()
         closed.append(play(env, act, Oracle(env, clones, fear=known), STEPS)["crash_rate"])
@@ -91,7 +87,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", type=Path)
     wp.config.quiet = True
-    found = [measure(path) for path in sorted(parser.parse_args().root.glob("directional-uniform-s*"))]
+    found = [measure(path) for path in sorted(parser.parse_args().root.glob("cells/directional-uniform-s*/run"))]
     same, closed = (np.array(part) for part in zip(*found, strict=True))
     print(f"Crashes per chosen goal on the same decisions, median over {len(found)} policies (min-max):\n")
     print("| rule | learnt fear | the truth |\n|---|---|---|")

@@ -21,10 +21,10 @@ from deimos.checks import RunError
 from deimos.run import training
 from deimos.run.presets import preset
 from deimos.sim.legged.config import LocomotionConfig
+from deimos.study import stats
 
 RESULTS = Path(__file__).parent.parent / "docs" / "results"
 ORIGINS = {"quad": RESULTS / "quad_flat", "quad-arm": RESULTS / "quad_arm_stand"}
-RESAMPLES = 10_000
 RECORDS = ("reward", "level", "invalid", "memory", "seconds")
 
 
@@ -60,9 +60,7 @@ class Recorder:
 
 def interval(values: np.ndarray) -> str:
     """Mean over worlds with its bootstrap interval."""
-    draws = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
-    low, high = np.percentile(values[draws].mean(1), [2.5, 97.5])
-    return f"{values.mean():+.5f} [{low:+.5f}, {high:+.5f}]"
+    return f"{stats.bootstrap([values], lambda x: x.mean(axis=-1)):+.5f}"
 
 
 def table(path: Path) -> str:

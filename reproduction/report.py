@@ -106,5 +106,6 @@ def _limits(data: Data) -> list[str]:
         "at the level that contradicts.",
         "The best p is chosen on one half of the seeds and tested on the other, from 20 seeds on.",
         *rest,
+        "`python -m reproduction coverage` measures again how often these intervals contain the truth.",
         "What the thesis measured its Table 4.1 on is not known.",
     ]

@@ -51,6 +51,19 @@ def test_the_same_evaluation_replaces_its_rows(run):
     assert len(RunFolder(run).read_json("evaluation.json")) == before
 
 
+@pytest.mark.parametrize("changes", [{"worlds": 8}, {"adversary_steps": 30}])
+def test_another_evaluation_stands_beside(run, changes):
+    """An evaluation of other sizes, or by an Adversary that was trained otherwise, leaves the earlier rows alone."""
+    large = deimos.evaluate(run)
+    before = RunFolder(run).read_json("evaluation.json")
+    small = deimos.evaluate(run, **changes)
+    after = RunFolder(run).read_json("evaluation.json")
+    for row in (*large, small[1]):
+        key = {name: row[name] for name in ("goals", "worlds", "reward", "crashes", "adversary_setting") if name in row}
+        assert sum(each.items() >= key.items() for each in after) == 1, key
+    assert len(after) == len(before) + (1 if "worlds" not in changes else 2)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -3,13 +3,16 @@
 import importlib.util
 import re
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from deimos.checks import SimulationError
+from deimos.nn.random import Purpose, uniforms
 from deimos.sim.check_env import check_env
+from deimos.sim.env import Env, EnvConfig, ObsField, Step
 from deimos.sim.envs import particle, quad, quad_arm
 
 PAGE = Path(__file__).parent.parent / "docs" / "add_an_environment.md"
@@ -107,6 +110,10 @@ FORGOTTEN = {
         '    """Carts; see ``Config``."""\n', "    goal_groups = (slice(0, 1), slice(0, 1))\n",
         "goal_groups must name every component of a goal once",
     ),
+    "a name": (
+        '    """Carts; see ``Config``."""\n', '    goal_group_names = ("place", "speed")\n',
+        "goal_group_names must name every group once",
+    ),
 }  # fmt: skip
 
 
@@ -179,6 +186,24 @@ def forget_the_difference(self, result, *arguments):
     return result
 
 
+def forget_the_penalty(self, result, *arguments):
+    """A crash that costs nothing."""
+    result.reward[:] += self.crash_penalty * result.terminated
+    return result
+
+
+def forget_the_order(self, result, *arguments):
+    """A penalty that the reward is clipped after."""
+    result.reward.clamp_(min=0.0)
+    return result
+
+
+def forget_what_a_penalty_is(self, result, *arguments):
+    """A penalty that the policy sees."""
+    self.obs[:, 0] -= self.crash_penalty * result.terminated
+    return result
+
+
 def forget_the_first_goal_count(self, result, *arguments):
     """First goals that count."""
     self.tensors["goal_count"] += self._views["mask"]
@@ -200,6 +225,9 @@ BUGS = [
     ("step", forget_the_clock, "a goal must be not be due before T = 6 steps, but not so after 5 steps"),
     ("step", forget_the_limit, "episodes must be truncated at the time limit of 30 steps"),
     ("step", forget_the_difference, "a world that crashed must not be truncated too"),
+    ("step", forget_the_penalty, "the step of a crash, and no other, must cost crash_penalty"),
+    ("step", forget_the_order, "the step of a crash, and no other, must cost crash_penalty, taken off after"),
+    ("step", forget_what_a_penalty_is, "crash_penalty must change the reward alone, but obs differs"),
     ("reset", forget_the_first_goal_count, "first goals must not count in goal_count"),
     ("state_dict", forget_the_copy, "state_dict must give copies"),
 ]
@@ -212,6 +240,103 @@ def test_bugs_in_methods_are_named(torch_device, monkeypatch, method, bug, messa
     monkeypatch.setattr(particle.Particle, method, wrap(getattr(particle.Particle, method), bug))
     with pytest.raises(ValueError, match=f"Particle: .*({message})"):
         check_env(env)
+
+
+def test_the_unit_of_the_penalty_is_checked(torch_device, monkeypatch):
+    """An environment that names another penalty than its configuration would have wrong rewards reported."""
+    monkeypatch.setattr(particle.Particle, "crash_penalty", property(lambda self: 1.0, lambda self, value: None))
+    env = OURS["relative"].build(2, torch_device, 0)
+    with pytest.raises(
+        ValueError, match="Particle: crash_penalty must be the configuration's times its largest_reward"
+    ):
+        check_env(env)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineConfig(EnvConfig):
+    """A point on a line, in plain torch."""
+
+    clip_last: bool = False
+
+    def build(self, num_envs, device, seed, env_offset=0):
+        """See ``EnvConfig.build``."""
+        return Line(self, num_envs, device, seed, env_offset)
+
+
+class Line(Env):
+    """See ``LineConfig``; it crashes where the line ends."""
+
+    layout = (ObsField("position", 1, "m", 1.0), ObsField("goal", 1, "m", 1.0))
+    action_dim, action_bound, dt, time_limit = 1, 1.0, 1.0, 0
+
+    def __init__(self, config, num_envs, device, seed, env_offset):
+        self.config, self.num_envs, self.device, self.goal_period = config, num_envs, device, config.goal_period
+        self.crash_penalty = config.crash_penalty * config.largest_reward
+        self._seed, self._world, self._sound = seed, torch.arange(num_envs, device=device) + env_offset, True
+        self.obs, self.episode_step = torch.zeros(num_envs, 2, device=device), self._zeros(torch.int32)
+        counts = {name: self._zeros(torch.int64) for name in ("goal_clock", "episode_count", "goal_count")}
+        self.tensors = counts | {"obs": self.obs, "episode_step": self.episode_step}
+        self._step = Step(self.obs, self._zeros(torch.float32), *(self._zeros(torch.bool) for _ in range(4)))
+        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
+
+    def _zeros(self, dtype):
+        return torch.zeros(self.num_envs, dtype=dtype, device=self.device)
+
+    def _uniform(self, purpose, rows, count):
+        return 2 * uniforms(self._seed, purpose, self._world[rows].unsqueeze(1), count)[..., :1] - 1
+
+    def step(self, action):
+        """See ``Env.step``."""
+        if action.shape != (self.num_envs, 1):
+            raise ValueError("action")
+        self._sound &= bool(action.isfinite().all())
+        self.obs[:, 0] += 0.1 * action[:, 0].clamp(-1, 1)
+        self.episode_step += 1
+        self.tensors["goal_clock"] += 1
+        step, (position, goal) = self._step, self.obs.T
+        step.terminated[:] = position.abs() > 1
+        step.goal_due[:] = self.tensors["goal_clock"] >= self.goal_period
+        step.reward[:] = (1 - (position - goal).abs()).clamp(min=0) - self.crash_penalty * step.terminated
+        if self.config.clip_last:
+            step.reward.clamp_(min=0)
+        return step
+
+    def reset(self, mask, goal_scale=None):
+        """See ``Env.reset``."""
+        rows = mask.nonzero().squeeze(1)
+        self.tensors["episode_count"][rows] += 1
+        self.episode_step[rows] = 0
+        self.tensors["goal_clock"][rows] = 0
+        first = self._uniform(2, rows, self.tensors["episode_count"][rows].unsqueeze(1))[:, 0]
+        self.obs[rows, 0] = 0.0
+        self.obs[rows, 1:] = first if goal_scale is None else first * goal_scale
+
+    def sample_goals(self, rows, count, scale=None):
+        """See ``Env.sample_goals``."""
+        address = 1000 * self.tensors["goal_count"][rows].unsqueeze(1) + torch.arange(count, device=self.device)
+        return self._uniform(1, rows, address) * (1.0 if scale is None else scale)
+
+    def draw(self, rows):
+        """See ``Env.draw``."""
+        return uniforms(self._seed, Purpose.GOAL, self._world[rows], self.tensors["goal_count"][rows])
+
+    def set_goals(self, rows, goal):
+        """See ``Env.set_goals``."""
+        self.obs[rows, 1:] = goal
+        self.tensors["goal_clock"][rows] = 0
+        self.tensors["goal_count"][rows] += 1
+
+    def check(self):
+        """See ``Env.check``."""
+        if not self._sound:
+            raise SimulationError("An action is not finite.")
+
+
+def test_an_environment_of_plain_torch_is_checked(torch_device):
+    """The contract needs no Warp: a sound environment passes, and one whose penalty is clipped away is named."""
+    check_env(LineConfig().build(3, torch_device, 0))
+    with pytest.raises(ValueError, match="Line: the step of a crash, and no other, must cost crash_penalty, taken off"):
+        check_env(LineConfig(clip_last=True).build(3, torch_device, 0))
 
 
 def test_the_configuration_must_be_one(torch_device):

@@ -54,6 +54,7 @@ TRAIN_ERRORS = {
     "--env-steps 0": "env_steps must be at least 1, got 0",
     "--env-steps -5": "env_steps must be at least 1, got -5",
     "--threads -1": "threads must be at least 0, got -1",
+    "--threads 1000000": r"threads must be in \[0, 4096\], got 1000000",
     "--seed -1": r"seed must be in \[0, 2\^32\), got -1",
     "--seed 4294967296": r"seed must be in \[0, 2\^32\), got 4294967296",
     "--ppo.minibatches 0": "minibatches must be at least 1, got 0",
@@ -342,6 +343,13 @@ def test_evaluation_of_a_run_without_policy_is_refused(copied, capfd):
     assert f"There is no policy at {copied / 'policy.pt'}." in refused(["evaluate", copied], capfd)
 
 
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(copied, capfd, monkeypatch):
+    """An evaluation that could not be kept is not begun."""
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert refused(["evaluate", copied], capfd) == f"deimos: {copied} cannot be written to; evaluate a copy of it.\n"
+
+
 def test_broken_evaluation_is_refused_before_the_work(copied, capfd, monkeypatch):
     """An evaluation.json that cannot be added to is refused before anything is computed, and stays as it is."""
     monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))
@@ -375,7 +383,7 @@ def test_true_process_says_one_line(copied, arguments):
     ("arguments", "package"),
     [
         (["terrain", "shape", "flat"], "trimesh"),
-        (["play", "run", "--video", "x.mp4"], "mujoco"),
+        (["play", str(HOME / "docs" / "results" / "quad_flat"), "--video", "x.mp4"], "mujoco"),
         (["train", "env:quad", "--num-envs", "1"], "mujoco"),
     ],
 )
@@ -416,7 +424,7 @@ def described_fields(config, prefix=""):
     classes = [kind for kind in type(config).__mro__ if dataclasses.is_dataclass(kind)]
     trees = [ast.parse(inspect.getsource(kind)).body[0] for kind in classes]
     texts = {
-        field.target.id: " ".join(doc.value.value.split())
+        field.target.id: " ".join(doc.value.value.replace("``", "").split())
         for tree in reversed(trees)
         for field, doc in zip(tree.body, tree.body[1:], strict=False)
         if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr)
@@ -509,7 +517,9 @@ def test_run_leaves_its_files(finished):
         "config.json", "progress.csv", "timing.csv", "checkpoint.pt", "policy.pt", "evaluation.json", "summary.png",
     }  # fmt: skip
     assert out.splitlines()[-1] == str(path)
-    assert re.search(r"Naive .*Adversary", out)
+    assert re.search(r"uniform goals +feared goals\n +\(Naive\) +\(Adversary\)\n", out)
+    assert re.search(r"\n\nUnder uniform goals .* of the goals end in a crash; the Adversary, .*\n", out)
+    assert re.search(r"\nTraining took \d+\.\d s: env \d+%, policy ", out)
     assert (path / "summary.png").read_bytes().startswith(b"\x89PNG")
     folder = RunFolder(path)
     assert [row["iteration"] for row in folder.read_csv("progress.csv")] == ["1", "2"]

@@ -161,6 +161,7 @@ def test_tracking_is_the_reward_terms_unweighted(torch_device):
     """``Step.tracking`` is each tracking term over its weight and the duration, a column for each goal group."""
     env = build(torch_device)
     assert env.goal_groups == (slice(0, 2), slice(2, 3))
+    assert env.goal_group_names == ("velocity", "yaw rate")
     step = env.step(actions(6, torch_device))
     weights = RewardWeights()
     for column, name in enumerate(("linear_tracking", "yaw_tracking")):

@@ -60,6 +60,7 @@ def test_observation_is_quads_with_the_arm_in_it(torch_device):
     ]  # fmt: skip
     assert (env.obs_dim, env.goal_dim, env.action_dim) == (256, 6, 17)
     assert env.goal_groups == (slice(0, 2), slice(2, 3), slice(3, 6))
+    assert env.goal_group_names == ("velocity", "yaw rate", "end effector")
     noise = [0.2] * 3 + [0.05] * 6 + [0.0] * 6 + [0.01] * 17 + [0.075] * 17 + [0.0] * 17 + [0.01] * 3 + [0.5] * 187
     np.testing.assert_allclose(env.legged.sensing.noise.numpy(), noise, rtol=1e-6)
 

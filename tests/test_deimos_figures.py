@@ -1,4 +1,4 @@
-"""The figures of a run: what stands above the bars of an evaluation."""
+"""The figures of a run: what stands in them, and what does not."""
 
 import math
 
@@ -11,33 +11,101 @@ from scipy.stats import binomtest
 from deimos.app import figures
 from deimos.run.folder import RunFolder
 
+HEADER = "env_steps,reward,crashes_per_1000,explained_variance,fear/auroc\n"
 
-def evaluated(score):
+
+def evaluated(score=0.754, weights="w", **more):
     """The rows of one evaluation, as far as they are drawn."""
-    shared = {"goal_period": 100, "worlds": 8, "steps": 200, "score": score}
-    return [
-        shared | {"goals": "naive", "crashes_per_1000": 0.5},
-        shared | {"goals": "adversary", "crashes_per_1000": 2},
+    shared = {"goal_period": 100, "worlds": 8, "steps": 200, "score": score, "seed": 1, "weights": weights} | more
+    return [shared | {"goals": "naive", "crash_rate": 0.005}, shared | {"goals": "adversary", "crash_rate": 0.36}]
+
+
+@pytest.fixture
+def saved(monkeypatch):
+    """The figures that were drawn, in place of their files."""
+    drawn = []
+    monkeypatch.setattr(figures, "_save", lambda figure, path: drawn.append(figure))
+    return drawn
+
+
+def folder_of(tmp_path, progress="", rows=()):
+    """A run folder with rows of its training and of its evaluations."""
+    folder = RunFolder(tmp_path)
+    if progress:
+        (tmp_path / "progress.csv").write_text(HEADER + progress)
+    if rows:
+        folder.write_json("evaluation.json", rows)
+    return folder
+
+
+@pytest.mark.parametrize(("score", "note"), [(0.754, "\nscore 0.75"), (0.0, "\nscore 0"), (None, "")])
+def test_score_is_written_only_where_there_is_one(score, note):
+    """Above each bar stands its share in percent, and the score where there is a reference policy."""
+    axes = Figure().subplots()
+    figures._bars(axes, evaluated(score))
+    assert [text.get_text() for text in axes.texts] == [f"0.5 %{note}", f"36 %{note}"]
+
+
+def test_evaluations_stand_beside_each_other():
+    """A small later evaluation does not replace a large one: the large one comes first, each says its size."""
+    axes = Figure().subplots()
+    figures._bars(axes, [*evaluated(worlds=8), *evaluated(worlds=2000), *evaluated(goal_period=50)])
+    assert [label.get_text().replace("\n", " ") for label in axes.get_xticklabels()] == [
+        "2,000 worlds x 200 steps, a goal every 100 steps", "8 worlds x 200 steps, a goal every 100 steps",
+        "8 worlds x 200 steps, a goal every 50 steps",
+    ]  # fmt: skip
+    assert len(axes.patches) == 6
+    assert [text.get_text() for text in axes.get_legend().texts] == [
+        "uniform goals (Naive)",
+        "feared goals (Adversary)",
     ]
 
 
-@pytest.mark.parametrize(
-    ("score", "note"), [(0.754, "\nscore 0.75"), (0.0, "\nscore 0.00"), (math.nan, ""), (None, "")]
-)
-def test_score_is_written_only_where_there_is_one(score, note):
-    """Without a reference policy a row has no score, NaN from the evaluation or None from a file; none is written."""
+def test_a_share_that_is_not_known_is_a_dash():
+    """Where no goal was pursued to its end there is a dash and no bar."""
     axes = Figure().subplots()
-    figures._bars(axes, evaluated(score))
-    assert [text.get_text() for text in axes.texts] == [f"0.5{note}", f"2{note}"]
+    figures._bars(axes, [evaluated()[0] | {"crash_rate": None}])
+    assert axes.texts[0].get_text().startswith("-")
 
 
-@pytest.mark.parametrize("rows", [[], evaluated(math.nan)])
-def test_summary_is_drawn(tmp_path, rows):
-    """A run is drawn evaluated or not, and with an environment that has no score."""
-    header = "env_steps,reward,crashes_per_1000,explained_variance\n"
-    (tmp_path / "progress.csv").write_text(header + "24,0.1,3.0,\n48,0.2,2.0,0.5\n")
-    path = figures.draw_summary(RunFolder(tmp_path), "title", rows)
-    with Image.open(path) as image:
+@pytest.mark.parametrize(
+    ("progress", "rows", "panels"),
+    [
+        ("24,0.1,3.0,,\n48,0.2,2.0,0.5,\n", [], 3),
+        ("24,0.1,3.0,,\n", [], 2),
+        ("24,0.1,3.0,0.1,0.6\n48,0.2,2.0,0.5,0.7\n", evaluated(), 4),
+        ("24,0.1,3.0,0.1,0.6\n48,0.2,2.0,0.5,0.7\n", [], 3),
+        ("", evaluated(None), 1),
+    ],
+)
+def test_no_panel_is_empty(tmp_path, saved, progress, rows, panels):
+    """There is a panel for what the run has numbers of, with a line or bars in it, and no other."""
+    figures.draw_summary(folder_of(tmp_path, progress, rows), "title")
+    (figure,) = saved
+    assert len(figure.axes) == panels
+    for axes in figure.axes:
+        assert axes.lines or axes.patches
+        assert axes.get_ylabel()
+        assert all(np.isfinite(line.get_ydata()).all() and len(line.get_ydata()) for line in axes.lines)
+
+
+def test_a_run_without_numbers_has_no_picture(tmp_path, saved):
+    """Where nothing was trained and nothing evaluated, nothing is drawn."""
+    figures.draw_summary(folder_of(tmp_path), "title")
+    assert not saved
+
+
+def test_evaluations_of_an_earlier_policy_are_not_drawn(tmp_path, saved):
+    """A run that went on is drawn with what was found of its policy as it is now."""
+    rows = [*evaluated(weights="old", worlds=2000), *evaluated(weights="new")]
+    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n", rows), "title")
+    assert len(saved[0].axes[-1].patches) == 2
+
+
+def test_summary_is_a_picture(tmp_path):
+    """The file is a picture with something in it."""
+    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n48,0.2,2.0,0.5,\n", evaluated(math.nan)), "title")
+    with Image.open(tmp_path / "summary.png") as image:
         assert len(image.convert("RGB").getcolors(2**24)) > 10
 
 

@@ -7,7 +7,8 @@ from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.selectors import director
 from deimos.learn.ppo import PPOConfig
-from deimos.run.audit import audit_calibration, audit_fear
+from deimos.nn.random import Purpose, normals
+from deimos.run.audit import _Explorer, audit_calibration, audit_fear
 from deimos.run.evaluation import EvalConfig, evaluate, play
 from deimos.run.loop import GoalLoop
 from deimos.run.oracle import Clones, Oracle
@@ -121,6 +122,20 @@ def test_calibration_is_judged_on_whole_periods(afraid):
         assert ((probability > 0) & (probability < 1)).all()
         assert 0 < quality["crash_rate"] < 1
         assert quality["brier"] <= 1
+
+
+def test_audits_draw_by_address(afraid):
+    """What a world does in an audit follows from the seed, its number and the step, and not from training's noise."""
+    obs, actor = torch.zeros(8, afraid.env.obs_dim), afraid.ppo.actor
+    whole, half = _Explorer(afraid), _Explorer(afraid, first_world=4)
+    with torch.no_grad():
+        for step in range(3):
+            action = whole(obs)
+            assert torch.equal(half(obs[:4]), action[4:])
+            drawn = (action - actor(obs)) / actor.std
+            address = torch.arange(8), torch.tensor(step), 3
+            torch.testing.assert_close(drawn, normals(0, Purpose.AUDIT, *address), rtol=1e-4, atol=1e-5)
+            assert (drawn - normals(0, Purpose.EXPLORATION, *address)).abs().min() > 1e-4
 
 
 def test_audit_agrees_with_itself(afraid):

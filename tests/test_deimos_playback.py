@@ -1,13 +1,21 @@
 """``deimos play``: pictures of a policy, or one line that says why there are none."""
 
+import inspect
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import imageio_ffmpeg
+import numpy as np
 import pytest
+import torch
 
+from deimos.app import cli
+from deimos.app.drawing import BLUE, HEADER, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing
 from deimos.app.playback import PlayOptions
+from deimos.app.video import ENDINGS
+from deimos.sim.envs.particle import Config
 
 HOME = Path(__file__).parent.parent
 WALK = HOME / "docs" / "results" / "quad_flat"
@@ -19,6 +27,99 @@ def play(*arguments, **environment):
     command = [sys.executable, "-m", "deimos", "play", *map(str, arguments)]
     done = subprocess.run(command, cwd=HOME, env=known, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout.strip(), done.stderr.strip()
+
+
+@pytest.fixture(scope="module")
+def particle(tmp_path_factory):
+    """Folder of a run in Particle Gym that has hardly learnt anything, with its policy and its fear network."""
+    path = tmp_path_factory.mktemp("play") / "run"
+    budget = "--no-evaluation --num-envs 32 --env-steps 48 --threads 1 --device cpu --ppo.hidden 16"
+    assert cli.main(["train", *budget.split(), "--env.goal-period", "10", "--out", str(path)]) == 0
+    return path
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_every_format_that_help_names_works(particle, tmp_path, ending, capsys):
+    """A video of every ending has the size, the number of pictures and the duration that were asked for."""
+    assert ending in inspect.getsource(PlayOptions)
+    path = tmp_path / f"x{ending}"
+    asked = "--seconds 1 --fps 10 --width 160 --height 120".split()
+    assert cli.main(["play", str(particle), "--video", str(path), *asked]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(path)
+    decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(decode, capture_output=True, check=True).stdout
+    frames = np.frombuffer(raw, np.uint8).reshape(10, 120, 160, 3)
+    assert len({frame.tobytes() for frame in frames}) > 1
+    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (10, pytest.approx(1.0, abs=0.06))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_shortest_video_has_a_picture(particle, tmp_path, capsys):
+    """However short a video is asked for, it holds the first picture."""
+    path = tmp_path / "x.gif"
+    assert cli.main(["play", str(particle), "--video", str(path), "--seconds", "0.001"]) == 0
+    assert path.read_bytes().startswith(b"GIF")
+
+
+def test_a_particle_is_drawn_where_it_is():
+    """The particle, its goal and the wall are where they should be in both views, and an episode's end is marked."""
+    env = Config(variant="absolute").build(1, torch.device("cpu"), seed=0)
+    env.tensors["position"][0] = torch.tensor([500.0, -500.0, 900.0])
+    env.set_goals(torch.tensor([0]), torch.tensor([[-0.5, 0.5, 0.0]]))
+    drawing = Drawing(env, 640, 480)
+    picture = drawing()
+    assert picture.shape == (480, 640, 3)
+    side, gap = drawing._side, (640 - 2 * drawing._side) // 3
+
+    def pixel(place, x, y):
+        half = REACH * 1000
+        column = gap + place * (side + gap) + round(side / 2 * (1 + x / half))
+        return tuple(picture[HEADER + round(side / 2 * (1 - y / half)), column].tolist())
+
+    assert pixel(0, 500, -500) == pixel(1, 500, 900) == BLUE
+    assert pixel(0, -500, 500) == ORANGE
+    assert pixel(0, -500, -500) == PAPER
+    assert pixel(0, 1080, 0) == pixel(1, -1080, 0) == OUTSIDE
+    counts = [int((picture == colour).all(axis=2).sum()) for colour in (ORANGE, RED)]
+    assert counts[0] > 20
+    env.step(torch.zeros(1, 3))
+    drawing()
+    env.reset(torch.ones(1, dtype=torch.bool))
+    assert int((drawing() == RED).all(axis=2).sum()) > counts[1] + 20
+
+
+def test_a_velocity_leads_somewhere():
+    """The goal of a directional particle is drawn where it leads by the time that it ends."""
+    env = Config(goal_period=40).build(1, torch.device("cpu"), seed=0)
+    env.set_goals(torch.tensor([0]), torch.tensor([[0.5, 0.0, -0.25]]))
+    np.testing.assert_allclose(env.sketch(0).target, [200.0, 0.0, -100.0], rtol=1e-5)
+    for _ in range(10):
+        env.step(torch.zeros(1, 3))
+    sketch = env.sketch(0)
+    np.testing.assert_allclose(sketch.target - sketch.position, [150.0, 0.0, -75.0], rtol=1e-5)
+
+
+def test_pictures_of_a_particle_need_no_mujoco(particle, tmp_path):
+    """A particle is shown where MuJoCo is missing or has nothing to render with."""
+    code, said, complaint = play(particle, "--frames", tmp_path / "x", "--seconds", "0.2", MUJOCO_GL="nonsense")
+    assert (code, said) == (0, str(tmp_path / "x")), complaint
+    assert len(list((tmp_path / "x").iterdir())) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("x.avi", "video must end in one of .mp4, .mkv, .mov, .webm, .gif, got x.avi"),
+        ("x", "video must end in one of"),
+        ("nowhere/x.gif", "The folder of nowhere/x.gif does not exist"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(particle, tmp_path, monkeypatch, capsys, name, message):
+    """Another ending or a folder that is not there is refused in one line, before anything is rendered."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["play", str(particle), "--video", name]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_frames_show_something(tmp_path):
@@ -55,8 +156,10 @@ def test_an_unknown_back_end_is_one_line(tmp_path, backend):
         ({"video": Path("x.mp4"), "frames": Path("x")}, "Give one of --video FILE and --frames FOLDER"),
         ({"video": Path("x.mp4"), "seconds": 0.0}, "seconds must be finite and positive, got 0.0"),
         ({"video": Path("x.mp4"), "fps": float("inf")}, "fps must be finite and positive, got inf"),
-        ({"video": Path("x.mp4"), "width": 8}, "width must be at least 16, got 8"),
+        ({"video": Path("x.mp4"), "width": 8}, r"width must be in \[16, 8192\], got 8"),
         ({"video": Path("x.mp4"), "world": -1}, "world must be at least 0, got -1"),
+        ({"video": Path("x.mp4"), "seed": -1}, r"seed must be in \[0, .*\], got -1"),
+        ({"video": Path("x.mp4"), "goal_period": 0}, "goal_period must be at least 1, got 0"),
     ],
 )
 def test_options_are_checked(options, message):

@@ -7,6 +7,7 @@ import pytest
 from deimos.checks import RunError
 from deimos.study import cli, plan
 from deimos.study.results import RESULT_COLUMNS, Results, identity
+from deimos.study.runner import Progress
 
 SMALL = Path(__file__).parent.parent / "examples" / "study.toml"
 
@@ -16,14 +17,14 @@ SMALL = Path(__file__).parent.parent / "examples" / "study.toml"
 )
 def test_seeds_are_a_number_a_range_or_a_list(text, seeds):
     """A plain number is how many seeds; a range and a list say which."""
-    assert cli.parse_seeds(text) == seeds
+    assert plan.parse_seeds(text) == seeds
 
 
 @pytest.mark.parametrize("text", ["", "-3", "a", "3-", "5-3", "1;2", "1.5"])
 def test_other_seeds_are_refused(text):
     """Anything else is refused with what it was."""
     with pytest.raises(RunError, match=f"seeds must be .*got '{text}'"):
-        cli.parse_seeds(text)
+        plan.parse_seeds(text)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,7 @@ def test_results_of_another_schema_stop_the_run(tmp_path):
 def test_cells_that_do_not_compare_with_the_results_stop_the_run(tmp_path, change, message):
     """A study of another setting, or of another selector of the same name, is refused before its cells are made."""
     (cell,) = plan.expand(plan.read(SMALL), seeds=[7], methods=["p25"])
-    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
+    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
     row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | identity(cell) | change
     Results([row]).write(tmp_path)
     with pytest.raises(RunError, match=message):
@@ -98,6 +99,13 @@ def test_empty_folder_is_refused(tmp_path, name):
     """There is nothing to show, export or report in an empty folder, and the line says so."""
     with pytest.raises(RunError, match="holds no "):
         cli.COMMANDS[name](folder=tmp_path).run()
+
+
+def test_progress_counts_what_is_done():
+    """The share of a study that is done counts finished and failed cells in full and running ones by their training."""
+    progress = Progress(5, 1, {"a": "it failed"}, {"b": 0.5, "c": 1.0}, seconds_left=90.0)
+    assert cli._share(progress) == pytest.approx(0.7)
+    assert cli._summary(progress) == "1 of 5 cells finished, 1 failed, b 50%, c evaluating, 0:01:30 left"
 
 
 def test_every_command_explains_itself():

@@ -155,8 +155,9 @@ ERRORS = {
     TOML.replace('"uniform", "p25"', '"uniform", "q33"'): "There is no method 'q33'; there are: uniform, coop",
     TOML.replace('"uniform", "p25"', '"uniform", "uniform"'): "Every method must be given once; doubled: uniform",
     TOML.replace("[3, 5]", "[3, 3]"): "Every seed must be given once; doubled: 3",
-    TOML.replace("[3, 5]", "0"): "seeds must be a number of seeds or a list of them, got 0",
-    TOML.replace("[3, 5]", "[-1]"): r"seed must be in \[0, 2\^32\), got -1",
+    TOML.replace("[3, 5]", "0"): "seeds must be a number of seeds, .* or a list like 0,3,5, got 0",
+    TOML.replace("[3, 5]", "[-1]"): r"seeds must be .* got \[-1\]",
+    TOML.replace("[3, 5]", "[4294967296]"): r"seed must be in \[0, 2\^32\), got 4294967296",
     TOML.replace('"far"', '"near"'): "Every environment must be given once; doubled: near",
     TOML.replace('"far"', '"../far"'): r"must have a name of letters, digits, '\.' and '_', got '\.\./far'",
     TOML.replace(

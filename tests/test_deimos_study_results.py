@@ -1,5 +1,6 @@
 """The results of a study: read from cells and from tables, exported whole, and merged."""
 
+import csv
 import json
 import math
 import os
@@ -9,6 +10,7 @@ import pytest
 
 from deimos.checks import RunError
 from deimos.study import results
+from deimos.study.data import Data, Where
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results, merge, read_table, write_table
 
 COLUMNS = {"name": str, "count": int, "rate": float, "weak": bool, "points": tuple, "errors": dict}
@@ -28,7 +30,7 @@ def row(name, **more):
 
 def result(hash, goals="naive", **more):
     """A row of an evaluation."""
-    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}}
+    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
     own = {"hash": hash, "seed": int(hash), "goals": goals}
     return {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | own | more
 
@@ -137,6 +139,23 @@ def test_tables_of_version_0_1_0_are_read(tmp_path):
     path = tmp_path / "a" / "curves.csv"
     path.write_text(path.read_text().replace("selected_fraction", "selected_share"))
     assert Results.read(tmp_path / "a").curves == [curve("1")]
+
+
+def test_tables_without_later_columns_are_read(tmp_path):
+    """A table that was written before a column existed has nothing in it; what goal groups are called is kept since."""
+    named = result("1", tracking=(0.5, 1.0), goal_groups=["velocity", "end effector"])
+    fill(tmp_path / "a", [named])
+    assert Results.read(tmp_path / "a").rows == [named]
+    path = tmp_path / "a" / "results.csv"
+    with path.open(newline="") as file:
+        (old,) = csv.DictReader(file)
+    del old["goal_groups"]
+    path.write_text(",".join(old) + "\n" + ",".join(old.values()) + "\n")
+    (found,) = Results.read(tmp_path / "a").rows
+    assert found == named | {"goal_groups": []}
+    named_parts = Data(Results([named])).parts(Where("x", "naive", 1))
+    assert list(named_parts.values()) == ["tracking of velocity", "tracking of end effector"]
+    assert "tracking of goal group 0" in Data(Results([found])).parts(Where("x", "naive", 1)).values()
 
 
 def test_training_curve_is_cut_into_stretches():

@@ -1,6 +1,7 @@
 """Studies run for real, on tiny budgets: stopped, killed, resumed, with workers that die."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import deimos
 from deimos.checks import RunError
 from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
@@ -111,6 +113,21 @@ def test_study_leaves_its_tables(whole):
     assert whole.finished(cells) == set(by_digest)
     for path in (whole.path, *map(whole.cell_path, cells)):
         assert (path / "lock").read_text() == ""
+
+
+def test_a_cell_takes_its_own_evaluations_only(whole, tmp_path, monkeypatch):
+    """What somebody else evaluated in a cell's run is none of its results, and its own evaluations are not repeated."""
+    folder = tmp_path / "copy"
+    shutil.copytree(whole.path, folder)
+    study = StudyFolder(folder)
+    cell = study.cells()[0]
+    path = study.cell_path(cell)
+    before = RunFolder(path).read_json("result.json")
+    deimos.evaluate(path / "run", worlds=8, seed=7)
+    (path / "result.json").unlink()
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated again"))
+    assert worker.run(study, cell)
+    assert RunFolder(path).read_json("result.json") == before
 
 
 def test_finished_study_starts_nothing(whole, file, monkeypatch):

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from deimos.kernels.random import Purpose
 
 import deimos
 from deimos import plugins
@@ -303,6 +305,61 @@ print(deimos.kernels.__file__)
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()) == HOME / "kernels" / "__init__.py"
+
+
+def test_checkout_is_used_beside_an_editable_install_of_another(tmp_path):
+    """The import hook of another checkout's editable install gives this one none of its kernels."""
+    (tmp_path / "kernels.py").write_text("raise AssertionError('the other one')")
+    code = f"""
+import importlib.util, sys
+class Hook:
+    def find_spec(name, path=None, target=None):
+        if name == "deimos.kernels":
+            return importlib.util.spec_from_file_location(name, {str(tmp_path / "kernels.py")!r})
+sys.meta_path.append(Hook)  # where setuptools puts its own
+import deimos.kernels
+print(deimos.kernels.__file__)
+"""
+    done = python(code, cwd=tmp_path)
+    assert (done.stdout.strip(), done.stderr) == (str(HOME / "kernels" / "__init__.py"), "")
+
+
+def test_nothing_else_of_a_checkout_is_in_the_package():
+    """Of what lies beside the package only ``kernels`` and ``terrain`` are its modules: ``deimos.train`` is none."""
+    beside = {path.stem for path in HOME.glob("[!.]*") if path.suffix == ".py" or list(path.glob("*.py"))}
+    assert {"train", "tests", "benchmarks", "reproduction", "kernels", "terrain"} <= beside
+    code = f"""
+import importlib.util
+print(*[name for name in {sorted(beside)} if importlib.util.find_spec("deimos." + name)])
+"""
+    for folder in (HOME, HOME / "tests"):
+        done = python(code, cwd=folder)
+        assert (done.stdout.split(), done.stderr) == (["kernels", "terrain"], "")
+
+
+def test_no_file_is_loaded_twice():
+    """After all of the library was imported, no file of it has two names."""
+    modules = [name for name in module_names(*PACKAGES) if not name.endswith("__main__")]
+    code = f"""
+import importlib, sys
+for name in {modules}:
+    importlib.import_module(name)
+names = {{}}
+for name, module in sys.modules.items():
+    if (getattr(module, "__file__", None) or "").startswith({tuple(f"{HOME / name}{os.sep}" for name in PACKAGES)}):
+        names.setdefault(module.__file__, []).append(name)
+assert len(names) == {len(modules)}, names
+print([twice for twice in names.values() if len(twice) > 1])
+"""
+    done = python(code, cwd=HOME)
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
+def test_another_process_unpickles(tmp_path):
+    """A process that has imported nothing of Deimos yet finds what a pickle names, in ``kernels`` too."""
+    code = f"import pickle; print(repr(pickle.loads({pickle.dumps(Purpose.PUSH)})))"
+    done = python(code, cwd=tmp_path)
+    assert (done.stdout.strip(), done.stderr) == (repr(Purpose.PUSH), "")
 
 
 def test_terrain_of_a_checkout_runs_under_one_name():

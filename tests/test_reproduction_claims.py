@@ -28,7 +28,7 @@ def level(environment, method, goals, period):
 def population(seeds=10, environments=ENVIRONMENTS, level=level, spread=0.5, methods=None):
     """Rows and curves of every method everywhere, with log crashes that are normal around a level."""
     rng = np.random.default_rng(0)
-    blank = {str: None, tuple: (), dict: {}}
+    blank = {str: None, tuple: (), dict: {}, list: []}
     empty = {name: blank.get(kind, math.nan) for name, kind in RESULT_COLUMNS.items()}
     rows, lines = [], []
     for environment in environments:

@@ -17,7 +17,7 @@ PARTICLE = [name for name in FILES if not name.startswith("quad")]
 def test_every_study_of_the_thesis_is_there():
     """Each figure of the thesis has its study."""
     assert set(FILES) == {
-        "absolute", "relative", "directional", "particle", "quad", "quad_arm", "population", "study",
+        "absolute", "relative", "directional", "particle", "quad", "quad_arm", "population", "pilots", "study",
     }  # fmt: skip
 
 

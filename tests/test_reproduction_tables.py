@@ -1,38 +1,96 @@
 """The commands behind the tables of the documentation, on made-up or tiny runs."""
 
-import json
+import itertools
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from deimos.goals.fear import FearConfig
+from deimos.goals.selectors import director
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.evaluation import EvalConfig
+from deimos.run.folder import RunFolder
 from deimos.sim.envs.particle import Config
+from deimos.study import plan
+from deimos.study.results import Results
 from reproduction import oracle_table, particle_population, quad_rough
 
 
-def test_table_of_populations_has_medians_and_ranges(tmp_path, capsys):
+def row(environment, seed, goals="naive", **values):
+    """A row of a study, with all that the tables show."""
+    shown = {"crashes_per_1000": 0.01 * seed, "crash_rate": 0.001, "score": 0.8, "reward": 0.7, "interactions": 100,
+             "interaction_crashes": 1, "adversary_auroc": math.nan, "weak_adversary": None}  # fmt: skip
+    return shown | {"environment": environment, "method": "uniform", "seed": seed, "goals": goals} | values
+
+
+def test_table_of_populations_has_medians_and_ranges(capsys):
     """Every cell of the populations has a row against each kind of goals, with the median of its five seeds."""
-    cells = [(*cell, seed) for cell in particle_population.CELLS for seed in particle_population.SEEDS]
-    for variant, method, seed in cells:
-        naive = {
-            "crashes_per_1000": 0.01 * seed, "crash_rate": 0.001, "score": 0.8, "reward": 0.7, "interactions": 100,
-            "interaction_crashes": 1, "adversary_auroc": None, "weak_adversary": None,
-        }  # fmt: skip
-        attacked = naive | {"crashes_per_1000": 1.0 + seed, "interaction_crashes": 7, "crash_rate": 0.5}
-        attacked |= {"adversary_auroc": 0.9, "weak_adversary": seed == 0}
-        folder = tmp_path / f"{variant}-{method}-s{seed}"
-        folder.mkdir()
-        (folder / "evaluation.json").write_text(json.dumps([naive, attacked]))
-    particle_population.print_tables(tmp_path)
+    attacked = {"interaction_crashes": 7, "crash_rate": 0.5, "adversary_auroc": 0.9}
+    rows = []
+    for variant, seed in itertools.product(("directional", "relative"), range(5)):
+        hurt = attacked | {"crashes_per_1000": 1.0 + seed, "weak_adversary": seed == 0}
+        rows += [row(variant, seed), row(variant, seed, "adversary", **hurt)]
+    particle_population.print_populations(rows[::-1])
     lines = capsys.readouterr().out.splitlines()
     assert "| relative | uniform | naive | 0.020 (0.000-0.040) | 0.0010 | 0.800 (0.800-0.800) | 0.7000 |  |" in lines
-    assert sum("| 3.000 (1.000-5.000) | 0.5000 |" in line and "0.900 (1 of 5 weak)" in line for line in lines) == 6
+    assert sum("| 3.000 (1.000-5.000) | 0.5000 |" in line and "0.900 (1 of 5 weak)" in line for line in lines) == 2
     assert "non-first interaction: median 5 [5, 5], each 5, 5, 5, 5, 5." in lines[-1]
-    particle_population.write_rows(tmp_path, [[{"seed": 0}]])
-    found = json.loads((tmp_path / "population.json").read_text())
-    assert (len(found["evaluations"]), found["audits"]) == (2 * len(cells), [{"seed": 0}])
+
+
+def test_table_of_pilots_says_what_differs(capsys):
+    """A pilot has a row with its flags and the crashes of its training, by eighths."""
+    pilots = plan.read(particle_population.STUDIES / "pilots.toml")["environment"]
+    rows = [row(each["name"], 0, crashes_per_1000=0.25) for each in pilots]
+    curves = [{"environment": each["name"], "crashes_per_1000": tuple(range(16))} for each in pilots]
+    particle_population.print_pilots(Results(rows, curves), pilots)
+    lines = capsys.readouterr().out.splitlines()
+    eighths = "0.5, 2.5, 4.5, 6.5, 8.5, 10, 12, 14 | 0.250 | 0.800 |"
+    assert lines[2] == f"| directional | defaults | {eighths}"
+    assert f"| directional | `--env.reward exponential --env.reward-length 5` | {eighths}" in lines
+    assert f"| directional | `--ppo.hidden 128 128` | {eighths}" in lines
+    assert f"| directional | `--env.stagger-goals` | {eighths}" in lines
+    assert lines[-1] == f"| absolute | `--env.reward reciprocal` | {eighths}"
+
+
+def test_population_is_a_study(tmp_path, monkeypatch, capsys):
+    """The command has ``deimos study`` train what is missing of the population, and prints and keeps its rows."""
+    rows = [row("directional", seed, goals) for seed in range(2) for goals in ("naive", "adversary")]
+    asked = []
+
+    class Options:
+        def __init__(self, **options):
+            asked.append(options)
+
+        def run(self):
+            Results([each | {"hash": f"{each['seed']}"} for each in rows], []).write(tmp_path)
+
+    monkeypatch.setattr(particle_population, "RunOptions", Options)
+    monkeypatch.setattr("sys.argv", ["it", str(tmp_path), "--workers", "3"])
+    particle_population.main()
+    assert asked == [{"folder": tmp_path, "file": particle_population.STUDIES / "population.toml", "workers": 3}]
+    assert "| directional | uniform | adversary | 0.005 (0.000-0.010) |" in capsys.readouterr().out
+    kept = RunFolder(tmp_path).read_json("population.json")
+    assert ([each["seed"] for each in kept["evaluations"]], kept["audits"]) == ([0, 0, 1, 1], [])
+
+
+def test_audits_follow_the_training(tmp_path, monkeypatch):
+    """A run is audited after each stage of its training, which continues, and what was audited is kept."""
+    config = training.TrainConfig(
+        env=Config(goal_period=20, max_speed=100.0, max_force=50.0), num_envs=128, ppo=PPOConfig(hidden=(8,)),
+        selector=director.Config(fear=FearConfig(min_per_class=4)), evaluation=False, threads=1,
+    )  # fmt: skip
+    monkeypatch.setattr(
+        particle_population, "TrainConfig", lambda method, seed, env_steps, **rest: replace(config, env_steps=env_steps)
+    )
+    monkeypatch.setattr(particle_population, "AUDITED", (96, 144))
+    monkeypatch.setattr(particle_population, "CONTEXTS", 2)
+    found = particle_population.audit(tmp_path, 0)
+    assert [(row["steps"], row["iteration"]) for row in found] == [(96, 4), (144, 6)]
+    monkeypatch.setattr(particle_population, "audit_fear", lambda *arguments: pytest.fail("audited again"))
+    assert particle_population.audit(tmp_path, 0) == found
 
 
 def test_audits_are_printed(capsys):

@@ -44,8 +44,8 @@ def test_every_shape_and_preset_is_named(capsys):
     assert run("shape") == 0
     said = capsys.readouterr().out
     for name in catalog.names():
-        assert f"  {name} " in said
-        assert (type(catalog.make(name)).__doc__ or "").splitlines()[0] in said
+        assert f"\n  {name} " in said
+        assert (type(catalog.make(name)).__doc__ or "").splitlines()[0] in " ".join(said.split())
     assert run("grid", "--help") == 0
     said = capsys.readouterr().out
     for name in presets.preset_names():
@@ -100,6 +100,61 @@ def test_everything_is_written_at_once(folder, small, capsys):
     with Image.open("view.png") as picture:
         assert min(picture.size) > 300
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 100
+
+
+@pytest.mark.parametrize("ending", [".stl", ".obj", ".ply", ".glb", ".npz", ".png"])
+def test_what_was_written_is_imported(folder, small, capsys, ending):
+    """``import`` gives back the terrain of what ``grid`` has written; by default into NAME.npz of the working folder."""
+    (folder / "elsewhere").mkdir()
+    assert run("grid", *SMALL, "--out", f"elsewhere/ground{ending}") == 0
+    resolution = ["--resolution", "0.2"] if ending in (".stl", ".obj", ".ply", ".glb") else []
+    capsys.readouterr()
+    assert run("import", f"elsewhere/ground{ending}", *resolution) == 0
+    said = capsys.readouterr().out
+    ground, found = small[1], terrain.load("ground.npz")
+    assert found.corner == pytest.approx(ground.corner, abs=1e-6)
+    assert found.cell == pytest.approx(ground.cell)
+    atol = 0.51 * float(np.ptp(ground.heights)) / 65535 if ending == ".png" else 0.0
+    np.testing.assert_allclose(found.heights, ground.heights, rtol=0, atol=atol)
+    nx, ny = ground.heights.shape
+    assert f"{nx:,} x {ny:,} samples" in said
+    assert said.splitlines()[-1] == "ground.npz"
+
+
+def test_ground_from_elsewhere_becomes_everything(folder, capsys):
+    """An array of heights becomes a mesh, a model and a picture, with tiles of the size that was asked for."""
+    heights = np.zeros((41, 21))
+    heights[10:20] = 0.3
+    np.save("dig.npy", heights)
+    options = "--resolution 0.1 --tile 1 --out dig.stl --mjcf model --preview dig.png".split()
+    assert run("import", "dig.npy", *options) == 0
+    said = capsys.readouterr().out
+    assert "4 x 2 of 1 m" in said
+    assert "0.000 to 0.300" in said
+    assert sorted(path.name for path in folder.iterdir()) == ["dig.npy", "dig.png", "dig.stl", "model"]
+    np.testing.assert_allclose(np.ptp(trimesh.load("dig.stl").bounds, axis=0), [4.0, 2.0, 0.3], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("nowhere.stl", "nowhere.stl could not be read or written (No such file or directory)"),
+        ("notes.txt", "A file to import must end in one of .glb, .obj"),
+        ("broken.png", "broken.png cannot be imported: it is no picture, or it is broken"),
+        ("flat.npy --resolution 0", "resolution must be finite and positive, got 0.0"),
+        ("flat.npy --height-range 0 1", "height_range does not apply to flat.npy"),
+        ("flat.npy --out there.npz", "there.npz exists and is not overwritten"),
+    ],
+)
+def test_what_is_no_ground_is_not_imported(folder, capsys, arguments, message):
+    """One line says what is wrong with a file or an option, and nothing is written."""
+    np.save("flat.npy", np.zeros((5, 5)))
+    for name in ("notes.txt", "broken.png", "there.npz"):
+        Path(name).write_text("nothing")
+    before = sorted(folder.iterdir())
+    assert run("import", *arguments.split()) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(folder.iterdir()) == before
 
 
 def test_mujoco_model_stands_by_itself(folder, small):

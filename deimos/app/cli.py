@@ -1,11 +1,17 @@
 """The command line: one table of commands, one table of errors.
 
 Whatever the user can mend (a flag, a folder, a disk, a missing package) ends in one line on stderr and exit code 2.
+A process that runs ``main`` is a command's: its environment and its standard streams are set up here, and only here.
+Importing the library leaves both alone; a program that shares its cores sets OMP_WAIT_POLICY=passive itself.
 """
 
+import contextlib
 import importlib.util
+import io
+import os
 import sys
 import threading
+import warnings
 
 from deimos import __version__
 from deimos.app import console
@@ -15,7 +21,7 @@ COMMANDS = {
     "train": ("deimos.app.train", "train a policy and evaluate it (also: python train.py)"),
     "evaluate": ("deimos.app.evaluate", "evaluate the policy of a run folder"),
     "study": ("deimos.app.study", "train and compare populations of policies"),
-    "play": ("deimos.app.playback", "render a trained robot as a video"),
+    "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }
 """By name: the module whose ``main`` is the command, imported when it is asked for, and a line about it."""
@@ -26,6 +32,8 @@ EXTRAS = {
 }  # fmt: skip
 """The extra of ``deimos-rl`` that installs a package."""
 
+BROKEN_PIPE = 141  # what a shell says of a program that SIGPIPE ends
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run ``deimos``; returns the exit code.
@@ -34,9 +42,14 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: The command line; ``None`` for that of the process.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    _prepare_process()
     hook, threading.excepthook = threading.excepthook, _skip_file_errors
+    spell, warnings.formatwarning = warnings.formatwarning, _spell_warning
     try:
         _run(arguments)
+        sys.stdout.flush()  # what cannot be written is said here, and not by Python when it ends
+    except BrokenPipeError:  # whoever read has read enough
+        return BROKEN_PIPE
     except (RunError, SimulationError) as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -45,18 +58,48 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         return _fail(f"This needs {package}, which is not installed: pip install 'deimos-rl[{EXTRAS[package]}]'")
     except OSError as error:
-        return _fail(f"{error.filename or 'A file'} could not be read or written ({error.strerror or error}).")
+        what = error.filename or "A file or the output"
+        return _fail(f"{what} could not be read or written ({error.strerror or error}).")
     except KeyboardInterrupt:
         _fail("Interrupted; files written so far are intact.")
         return 130
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0
     finally:
-        threading.excepthook = hook
+        threading.excepthook, warnings.formatwarning = hook, spell
+        _drop_broken_streams()
     return 0
 
 
+def _prepare_process() -> None:
+    """Set up what torch and matplotlib read when they are loaded, and the standard streams."""
+    # Threads that wait sleep: where cores are shared, those that spin cost more than they win. A user's value stays.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ["MPLBACKEND"] = "agg"  # commands draw into files; the back end of a notebook need not be installed here
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:  # closed: the next file that is opened would take its number, and all that is said to it
+            null = open(os.devnull, "w" if number else "r")
+            os.dup2(null.fileno(), number)
+            setattr(sys, name, null)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a path that this terminal cannot spell
+
+
+def _drop_broken_streams() -> None:
+    """Send to nowhere what can no longer be written; Python would complain of it when it ends."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def _run(arguments: list[str]) -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:  # torch's libraries would end the process
+        raise RunError("The working folder does not exist any more; change to one that does.") from error
     if arguments[:1] == ["--version"]:
         print(__version__)
         return
@@ -71,6 +114,13 @@ def _command(module: str) -> console.Command:
     return lambda arguments, program: importlib.import_module(module).main(arguments, program)
 
 
+def _spell_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """A warning in one line: whoever runs a command need not know which line of the program says it."""
+    return f"deimos: {' '.join(str(message).split())}\n"
+
+
 def _skip_file_errors(thread: threading.ExceptHookArgs) -> None:
     """Say nothing of a full disk that TensorBoard's thread has met: it reports it to the main thread."""
     if not issubclass(thread.exc_type, OSError):
@@ -78,5 +128,6 @@ def _skip_file_errors(thread: threading.ExceptHookArgs) -> None:
 
 
 def _fail(message: str) -> int:
-    print(f"deimos: {' '.join(message.split())}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody reads it
+        print(f"deimos: {' '.join(message.split())}", file=sys.stderr)
     return 2

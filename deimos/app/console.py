@@ -3,18 +3,33 @@
 Importing it needs Python alone, so that ``deimos`` can say which packages are missing.
 """
 
+import ast
 import contextlib
+import dataclasses
+import functools
+import inspect
+import io
+import itertools
 import os
+import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import textwrap
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from decimal import Decimal
+from types import MappingProxyType
 from typing import Any
 
 from deimos.checks import RunError
 
 Command = Callable[[list[str], str], None]
 """Runs on its arguments, under the name that a person calls it by, such as ``deimos study run``."""
+
+LEAST_WIDTH = 60  # columns of a terminal that help is wrapped at
+# From line to line where progress cannot be shown in place: seconds at least, and a share of what has passed.
+PLAIN_SECONDS, PLAIN_SHARE = 20.0, 0.05
 
 
 def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments: list[str], program: str) -> None:
@@ -30,10 +45,14 @@ def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments:
         RunError: If there is no such command.
     """
     if not arguments or arguments[0] in ("-h", "--help"):
-        width = max(map(len, commands))
-        listed = [f"  {name:{width}}  {text}" for name, (text, _) in commands.items()]
-        print(about, f"usage: {program} COMMAND [OPTIONS]", "\n".join(["commands:", *listed]),
-              "Every command explains its options with --help.", sep="\n\n")  # fmt: skip
+        width, screen = max(map(len, commands)), max(LEAST_WIDTH, shutil.get_terminal_size().columns)
+        listed = [
+            textwrap.fill(f"  {name:{width}}  {text}", screen, subsequent_indent=" " * (width + 4))
+            for name, (text, _) in commands.items()
+        ]
+        parts = (about, f"usage: {program} COMMAND [OPTIONS]", "Every command explains its options with --help.")
+        first, usage, last = (textwrap.fill(part, screen) for part in parts)
+        print(first, usage, "\n".join(["commands:", *listed]), last, sep="\n\n")
         return
     name, rest = arguments[0], arguments[1:]
     if name not in commands:
@@ -51,14 +70,67 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
     """
     import tyro
 
-    try:
-        from tyro._errors import on_parse_error  # since 1.0.17, and not promised
-    except ImportError:  # then tyro's own, framed words stay, with exit code 2
-        hook: Any = contextlib.nullcontext()
-    else:
-        hook = on_parse_error(_refuse)
-    with hook:
+    arguments = [_at_home(argument) for argument in arguments]
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(ImportError):  # then tyro's own, framed words stay, with exit code 2
+            from tyro._errors import on_parse_error  # since 1.0.17, and not promised
+
+            stack.enter_context(on_parse_error(_refuse))
+        if {"-h", "--help"} & set(arguments):
+            more["registry"] = registry = tyro.constructors.ConstructorRegistry()
+            registry.struct_rule(_explain)
+            stack.enter_context(_wrapped_help())
         return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
+
+
+def _explain(struct: Any) -> None:
+    """Tell tyro the docstrings below the fields of a dataclass, without the line breaks that it would keep."""
+    if not (isinstance(struct.type, type) and dataclasses.is_dataclass(struct.type)):
+        return
+    texts: dict[str, str] = {}
+    for kind in reversed(inspect.getmro(struct.type)):
+        texts |= _docstrings(kind.__module__).get(kind.__name__, {})
+    for known in dataclasses.fields(struct.type):
+        if known.name in texts:
+            known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+
+
+@functools.cache
+def _docstrings(module: str) -> dict[str, dict[str, str]]:
+    """The docstrings below the fields of a module's classes, by class and field."""
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+    except (OSError, TypeError):  # it has no source
+        return {}
+    found: dict[str, dict[str, str]] = {}
+    for node in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
+        for field, below in itertools.pairwise(node.body):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
+                    found.setdefault(node.name, {})[name] = " ".join(text.replace("``", "").split())
+    return found
+
+
+@contextlib.contextmanager
+def _wrapped_help() -> Iterator[None]:
+    """Wrap what tyro prints without regard to the terminal's width: what a command is for."""
+    said, width = io.StringIO(), max(LEAST_WIDTH, shutil.get_terminal_size().columns)
+    said.isatty = sys.stdout.isatty  # type: ignore[method-assign]
+    os.environ["COLUMNS"] = str(width)  # in less, tyro leaves descriptions a column of one letter
+    try:
+        with contextlib.redirect_stdout(said):
+            yield
+    finally:
+        for line in said.getvalue().splitlines():
+            print(line.rstrip() if "\x1b" in line else textwrap.fill(line.rstrip(), width))
+
+
+def _at_home(argument: str) -> str:
+    """An argument with its ``~`` expanded as by a shell, which leaves that of ``--out=~/x`` alone."""
+    flag, is_given, value = argument.partition("=")
+    if argument.startswith("--") and is_given:
+        return f"{flag}={os.path.expanduser(value)}"
+    return os.path.expanduser(argument)
 
 
 def _refuse(event: Any) -> None:
@@ -82,16 +154,54 @@ def _refuse(event: Any) -> None:
 
 
 @contextlib.contextmanager
-def stage_bar(title: str = "") -> Iterator[Callable[[str, float], None]]:
-    """A bar over named stages that vanishes at the end; gives the function that reports (stage, fraction done)."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+def progress(title: str) -> Iterator[Callable[[str, float], None]]:
+    """Show how far something is: gives the function that reports (what is done, fraction of the whole that is done).
 
-    columns = (TextColumn(title + "{task.description}"), BarColumn(), TaskProgressColumn())
+    On a terminal a bar; elsewhere, such as in the log of a job, a plain line now and then, more seldom in a long job.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
     screen = Console(stderr=True)
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
-        task = progress.add_task("", total=1.0)
-        yield lambda stage, fraction: progress.update(task, description=stage, completed=fraction)
+    if not screen.is_terminal:
+        yield _plain_progress(title)
+        return
+    text = TextColumn(title + ": {task.description}", markup=False)
+    with Progress(
+        text, BarColumn(bar_width=12), TaskProgressColumn(), TimeRemainingColumn(), console=screen, transient=True
+    ) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+
+
+def _plain_progress(title: str) -> Callable[[str, float], None]:
+    begin = last = time.monotonic()
+
+    def report(stage: str, fraction: float) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= max(PLAIN_SECONDS, PLAIN_SHARE * (last - begin)):
+            last = now
+            print(f"{title}: {stage}, {fraction:.0%}", file=sys.stderr, flush=True)
+
+    return report
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lines of a table, labels to the left and values to the right; as wide as it must be, on any terminal."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = []
+    for label, *values in (header, *rows):
+        aligned = [value.rjust(width) for value, width in zip(values, widths[1:], strict=True)]
+        lines.append("  ".join([label.ljust(widths[0]), *aligned]).rstrip())
+    return "\n".join(lines)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with as many significant digits, in full: never in powers of ten, and 0 for nothing but zero."""
+    if abs(value) >= 10.0**digits:
+        return f"{value:,.0f}"
+    return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
 @contextlib.contextmanager
@@ -120,6 +230,11 @@ def quiet_warp() -> None:
         os.dup2(file.fileno(), 2)  # the warning is printed from C
         try:
             wp.init()
+        except OSError as error:
+            way_out = "set WARP_CACHE_PATH to a folder that can be written."
+            raise RunError(
+                f"Compiled kernels cannot be kept in {error.filename} ({error.strerror}); {way_out}"
+            ) from error
         finally:
             os.dup2(kept, 2)
             os.close(kept)

@@ -1,11 +1,12 @@
 """The figures of a run."""
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from deimos.app.console import number
+from deimos.app.findings import GOALS, conditions, percent
 from deimos.files import write_whole
 from deimos.goals.calibration import reliability
 from deimos.run.folder import RunFolder
@@ -16,15 +17,30 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"  # of Okabe and Ito's palette, told apart by the colour-blind
+GOAL_COLOURS = {"naive": BLUE, "adversary": ORANGE, "oracle": GREEN}
+VALUES = ("explained_variance", "critic: explained variance\nof the values", BLUE)
+FEAR = ("fear/auroc", "fear network: how well it ranked\nthe goals' crashes (AUROC)", BLUE)
+CURVES = (
+    ("reward", "reward per step", BLUE),
+    ("crashes_per_1000", "crashes per 1000 steps", ORANGE),
+    VALUES,
+    FEAR,
+)
+"""Columns of ``progress.csv`` that are drawn, what they are called, and their colours."""
+MARKED = 3  # points; a line through fewer is hard to see
+BAR = 0.42  # width of a bar with the gap beside it; evaluations are 1 apart
+MOST_EVALUATIONS = 4
+EVALUATION = "evaluation"
 
 
-def draw_summary(folder: RunFolder, title: str, evaluated: list[dict]) -> Path:
-    """Draw ``summary.png``: reward, crashes and fear AUROC over training, and Naive beside Adversary.
+def draw_summary(folder: RunFolder, title: str) -> None:
+    """Draw ``summary.png``: reward, crashes and the learners' quality over training, and what the evaluations found.
+
+    There is no panel for what the folder has no numbers of, and no picture where it has none at all.
 
     Args:
         folder: The run.
         title: Above it all.
-        evaluated: The rows of one evaluation, or none.
 
     Raises:
         RunError: If it cannot be written.
@@ -32,19 +48,23 @@ def draw_summary(folder: RunFolder, title: str, evaluated: list[dict]) -> Path:
     from matplotlib.figure import Figure
 
     rows = folder.read_csv("progress.csv")
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    (reward, crashes), (quality, bars) = figure.subplots(2, 2)
-    _curve(reward, rows, "reward", "mean reward per transition", BLUE)
-    _curve(crashes, rows, "crashes_per_1000", "crashes per 1000 transitions", ORANGE)
-    if rows and "fear/auroc" in rows[0]:
-        _curve(quality, rows, "fear/auroc", "AUROC of fear when the goal was issued", BLUE)
-        quality.axhline(0.5, color="grey", linewidth=0.8, linestyle=":")
-        quality.set_ylim(0.3, 1.02)
-    else:
-        _curve(quality, rows, "explained_variance", "explained variance of the values", BLUE)
-    _bars(bars, evaluated)
+    evaluated = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+    evaluated = [row for row in evaluated if row["weights"] == evaluated[-1]["weights"]]  # of the policy as it is now
+    curves = [curve for curve in CURVES if any(row.get(curve[0]) for row in rows)]
+    if curves[-1:] == [FEAR]:
+        curves.remove(VALUES)
+    panels = [curve[0] for curve in curves]
+    places = [*([panels] if panels else []), *([[EVALUATION] * max(1, len(panels))] if evaluated else [])]
+    if not places:
+        return
+    figure = Figure(figsize=(11, 3.3 * len(places) + 0.3), layout="constrained")
+    axes: dict[str, Axes] = figure.subplot_mosaic(places)  # type: ignore[arg-type]
+    for column, label, colour in curves:
+        _curve(axes[column], rows, column, label, colour)
+    if evaluated:
+        _bars(axes[EVALUATION], evaluated)
     figure.suptitle(title)
-    return _save(figure, folder.path / "summary.png")
+    _save(figure, folder.path / "summary.png")
 
 
 def wilson(share: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +88,7 @@ def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor
 
     figure = Figure(figsize=(6, 7), layout="constrained")
     curves, histogram = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)
-    curves.plot([0, 1], [0, 1], color="grey", linewidth=0.8, linestyle=":")
+    curves.plot([0, 1], [0, 1], color="grey", linewidth=0.8, linestyle=":", label="honest probabilities")
     for (name, (probability, crashed)), colour, marker in zip(audited.items(), (ORANGE, BLUE), "so", strict=False):
         bins = reliability(probability, crashed)
         low, high = wilson(bins.observed.numpy(), bins.count.numpy())
@@ -94,25 +114,37 @@ def _save(figure: "Figure", path: Path) -> Path:
 
 def _curve(axes: "Axes", rows: list[dict[str, str]], column: str, label: str, colour: str) -> None:
     points = [(int(row["env_steps"]), float(row[column])) for row in rows if row[column]]
-    axes.plot([x for x, _ in points], [y for _, y in points], color=colour, linewidth=1.4)
-    axes.set_xlabel("parallel steps")
+    axes.plot(*zip(*points, strict=True), color=colour, linewidth=1.4, marker="o" if len(points) < MARKED else None)
+    axes.set_xlabel("training: steps of every world")
     axes.set_ylabel(label)
     axes.grid(alpha=0.3)
+    if column == FEAR[0]:
+        axes.axhline(0.5, color="grey", linewidth=0.8, linestyle=":", label="chance")
+        axes.set_ylim(0.0, 1.02)
+        axes.legend(frameon=False, loc="lower right")
 
 
-def _bars(axes: "Axes", evaluated: list[dict]) -> None:
-    """Crashes per 1000 transitions of one evaluation, with the score written above where there is one."""
-    axes.set_ylabel("crashes per 1000 transitions")
-    if not evaluated:
-        axes.text(0.5, 0.5, "not evaluated", ha="center", va="center", transform=axes.transAxes, color="grey")
-        axes.set_axis_off()
-        return
-    names, heights = zip(*[(row["goals"].capitalize(), row["crashes_per_1000"]) for row in evaluated], strict=True)
-    bars = axes.bar(names, heights, color=[BLUE, ORANGE, GREEN][: len(names)], width=0.5)
-    # Without a reference policy the score is NaN as it is evaluated, and None as it is read from a file.
-    scores = [math.nan if row["score"] is None else row["score"] for row in evaluated]
-    notes = ["" if math.isnan(score) else f"\nscore {score:.2f}" for score in scores]
-    axes.bar_label(bars, [f"{height:.3g}{note}" for height, note in zip(heights, notes, strict=True)], padding=3)
-    axes.margins(y=0.25)
-    shape = "T = {goal_period}, {worlds} worlds x {steps} steps".format_map(evaluated[0])
-    axes.set_title(shape, size=9)
+def _bars(axes: "Axes", rows: list[dict]) -> None:
+    """Shares of goals that ended in a crash, with the score where there is one: large evaluations first."""
+    groups: dict[tuple, list[dict]] = {}
+    for row in sorted(rows, key=lambda row: -row["worlds"] * row["steps"]):
+        groups.setdefault((row["worlds"], row["steps"], row["goal_period"], row["seed"]), []).append(row)
+    shown = list(groups.values())[:MOST_EVALUATIONS]
+    for place, group in enumerate(shown):
+        for i, row in enumerate(group):
+            known = row["crash_rate"] is not None
+            bar = axes.bar(
+                place + (i - (len(group) - 1) / 2) * BAR, 100 * row["crash_rate"] if known else 0.0, 0.9 * BAR,
+                color=GOAL_COLOURS[row["goals"]], label=" ".join(GOALS[row["goals"]]),
+            )  # fmt: skip
+            # Without a reference policy there is no score.
+            score = "" if row["score"] is None else f"\nscore {number(row['score'], 2)}"
+            axes.bar_label(bar, [percent(row["crash_rate"]) + score], padding=2, fontsize=9)
+    labels = [conditions(group[0]).replace(", ", ",\n") for group in shown]
+    axes.set_xticks(range(len(shown)), labels, fontsize=9)
+    axes.set_xlim(-0.7, len(shown) - 0.3)
+    axes.set_ylabel("evaluation: goals that\nended in a crash [%]")
+    axes.margins(y=0.3)
+    handles, names = axes.get_legend_handles_labels()
+    legend = dict(zip(names, handles, strict=True))
+    axes.legend(legend.values(), legend.keys(), frameon=False, fontsize=9, loc="upper center", ncols=len(legend))

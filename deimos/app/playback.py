@@ -1,6 +1,5 @@
 """``deimos play``: watch a trained policy, as a video or as single pictures."""
 
-import itertools
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -13,16 +12,22 @@ import torch
 import tyro
 
 from deimos.app import console
-from deimos.checks import RunError, check_at_least, check_positive
+from deimos.app.drawing import Drawing, with_caption
+from deimos.app.findings import percent
+from deimos.app.video import pictures, video
+from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.selectors import uniform
-from deimos.learn.policy import load_policy
+from deimos.learn.policy import Policy, load_policy
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
+from deimos.sim.legged.config import LocomotionConfig
 
+LARGEST = 8192  # [pixels] along a side of a picture
+PACE = 50.0  # steps per second of video, in worlds that have no seconds
 RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)
 
 
@@ -30,23 +35,24 @@ RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)
 class PlayOptions:
     """Render the policy of a run in one world under uniform goals; the goal and its fear are written in the picture.
 
-    It renders without a display: MUJOCO_GL says how (egl or osmesa; Debian has libegl1 and libosmesa6).
+    Robots are rendered without a display: MUJOCO_GL says how (egl or osmesa; Debian has libegl1 and libosmesa6).
+    Particles are drawn, with their trail in blue, their goal in orange and a cross where they crashed.
     """
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     video: Path | None = None
-    """Video to write (.mp4, .gif, ...)."""
+    """Video to write: .mp4, .mkv, .mov, .webm or .gif."""
     frames: Path | None = None
-    """Folder for single pictures instead; must not exist."""
+    """Folder for single pictures (.png) instead; must not exist."""
     seconds: float = 10.0
-    """Simulated time [s], positive."""
+    """Length of the video [s], positive: simulated seconds, or 50 steps each where the world has no seconds."""
     fps: float = 25.0
-    """Pictures per simulated second, positive."""
+    """Pictures per second, positive."""
     width: int = 640
-    """Width of a picture [pixels], at least 16."""
+    """Width of a picture [pixels], in [16, 8192]."""
     height: int = 480
-    """Height of a picture [pixels], at least 16."""
+    """Height of a picture [pixels], in [16, 8192]."""
     world: int = 0
     """Global number of the world, at least 0: where it stands, and which goals it gets."""
     goal_period: int | None = None
@@ -58,10 +64,20 @@ class PlayOptions:
         for name in ("seconds", "fps"):
             check_positive(name, getattr(self, name), finite=True)
         for name in ("width", "height"):
-            check_at_least(name, getattr(self, name), 16)
+            check_range(name, getattr(self, name), 16, LARGEST)
         check_at_least("world", self.world, 0)
+        check_range("seed", self.seed, 0, 2**32 - 1)
+        if self.goal_period is not None:
+            check_at_least("goal_period", self.goal_period, 1)
         if (self.video is None) == (self.frames is None):
             raise ValueError("Give one of --video FILE and --frames FOLDER.")
+
+    @property
+    def target(self) -> Path:
+        """Where the pictures go."""
+        target = self.video or self.frames
+        assert target is not None
+        return target
 
 
 def main(arguments: list[str], program: str) -> None:
@@ -69,29 +85,38 @@ def main(arguments: list[str], program: str) -> None:
     options: PlayOptions = console.parse(PlayOptions, arguments, program)
     console.quiet_warp()
     if sys.platform.startswith("linux"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
-    with _rendering():
-        import mujoco  # noqa: F401 (it decides now how it will render)
+        os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
     folder = RunFolder.open(options.run)
     config = read_config(folder)
+    if isinstance(config.env, LocomotionConfig):
+        with _rendering():
+            import mujoco  # noqa: F401 (it decides now how it will render)
     policy = load_policy(folder.path)
-    env_config = config.env.for_evaluation()
-    if options.goal_period is not None:
-        env_config = env_config.with_goal_period(options.goal_period)
     try:
+        env_config = config.env.for_evaluation().with_goal_period(options.goal_period or config.env.goal_period)
         env = env_config.build(1, torch.device("cpu"), options.seed, options.world)
     except ValueError as error:
         raise RunError(str(error)) from error
+    _render(env, policy, _fear(folder, config, env), options)
+    print(options.target)
+
+
+def _render(env: Env, policy: Policy, afraid: FearSelector | None, options: PlayOptions) -> None:
+    """Let the policy act under uniform goals, and write the pictures."""
     loop = GoalLoop(env, uniform.Config().build(spaces(env), 0))
-    afraid = _fear(folder, config, env)
-    every = max(1, round(1.0 / (options.fps * env.dt)))
-    with _camera(env, options) as picture, _writer(options, 1.0 / (every * env.dt)) as write:
-        for t in range(round(options.seconds / env.dt)):
+    seconds = env.dt if env.has_seconds else 1.0 / PACE  # of a step
+    every, count = (max(1, round(time / seconds)) for time in (1.0 / options.fps, options.seconds))
+    size, fps, crashes = (options.width, options.height), 1.0 / (every * seconds), 0
+    writer = video(options.video, size, fps) if options.video else pictures(options.target)
+    with _view(env, *size) as picture, writer as write, console.progress("rendering") as report:
+        for t in range(count):
             if t % every == 0:
-                write(_captioned(picture(), _caption(env, afraid, t)))
-            loop.advance(env.step(policy.scaled(env.obs)))
+                write(with_caption(picture(), _caption(env, afraid, t, crashes)))
+                report(f"step {t} of {count}", t / count)
+            step = env.step(policy.scaled(env.obs))
+            crashes += int(step.terminated[0])
+            loop.advance(step)
     env.check()
-    print(options.video or options.frames)
 
 
 @contextmanager
@@ -120,29 +145,32 @@ def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | No
     return afraid if afraid.fear.fitted else None
 
 
-def _caption(env: Env, afraid: FearSelector | None, t: int) -> str:
+def _caption(env: Env, afraid: FearSelector | None, t: int, crashes: int) -> str:
     goal = env.obs[:, env.goal_slice]
     field = next(field for field in env.layout if field.name == "goal")
     physical = (goal[0] / torch.as_tensor(field.scale)).tolist()
-    text = f"{t * env.dt:5.2f} s   goal " + "  ".join(f"{value:+.2f}" for value in physical) + f"  [{field.unit}]"
+    now = f"{t * env.dt:5.2f} s" if env.has_seconds else f"step {t}"
+    text = f"{now}   crashes {crashes}   goal " + "  ".join(f"{value:+.2f}" for value in physical) + f"  [{field.unit}]"
     if afraid is None:
         return text
     score = afraid.score(env.state(env.obs), goal, goal.unsqueeze(1))[:, 0]
-    return text + f"\nfear of keeping it {afraid.calibration.probability(score).item():.3f}"
+    return text + f"\nfear of keeping it {percent(afraid.calibration.probability(score).item())}"
 
 
 @contextmanager
-def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]]:
-    """A camera that follows the robot of world 0 and shows its goal, where it is a point, as a red ball."""
+def _view(env: Env, width: int, height: int) -> Iterator[Callable[[], np.ndarray]]:
+    """Gives the function that shows world 0: by MuJoCo where it can, else as a drawing."""
+    if (shown := env.scene(0)) is None:
+        if env.sketch(0) is None:
+            raise RunError("This environment has nothing to render: neither a scene nor a sketch.")
+        yield Drawing(env, width, height)
+        return
     import mujoco
 
-    shown = env.scene(0)
-    if shown is None:
-        raise RunError("This environment has nothing to render; play shows robots.")
     model = shown[0]
-    model.vis.global_.offwidth, model.vis.global_.offheight = options.width, options.height
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     with _rendering():
-        renderer = mujoco.Renderer(model, options.height, options.width)
+        renderer = mujoco.Renderer(model, height, width)
     camera = mujoco.MjvCamera()
     camera.distance, camera.azimuth, camera.elevation = 1.8, 130.0, -18.0
 
@@ -160,47 +188,3 @@ def _camera(env: Env, options: PlayOptions) -> Iterator[Callable[[], np.ndarray]
 
     with renderer:
         yield picture
-
-
-def _captioned(picture: np.ndarray, text: str) -> np.ndarray:
-    from PIL import Image, ImageDraw
-
-    image = Image.fromarray(picture)
-    draw = ImageDraw.Draw(image)
-    box = draw.multiline_textbbox((8, 6), text, font_size=14)
-    draw.rectangle((0, 0, box[2] + 8, box[3] + 6), fill=(255, 255, 255))
-    draw.multiline_text((8, 6), text, fill=(20, 20, 20), font_size=14)
-    return np.asarray(image)
-
-
-@contextmanager
-def _writer(options: PlayOptions, fps: float) -> Iterator[Callable[[np.ndarray], object]]:
-    """Writes pictures one after another; a video that is cut off does not stay."""
-    if options.frames is not None:
-        from PIL import Image
-
-        folder = options.frames
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError as error:
-            raise RunError(f"{folder} exists already; name another folder.") from error
-        number = itertools.count()
-        yield lambda picture: Image.fromarray(picture).save(folder / f"{next(number):06d}.png")
-        return
-    import imageio_ffmpeg
-
-    assert options.video is not None
-    if not options.video.parent.is_dir():
-        raise RunError(f"The folder of {options.video} does not exist.")
-    unfinished = options.video.with_name(f".unfinished-{options.video.name}")
-    video = imageio_ffmpeg.write_frames(
-        str(unfinished), (options.width, options.height), fps=fps, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    video.send(None)
-    try:
-        yield lambda picture: video.send(np.ascontiguousarray(picture))
-        video.close()
-        unfinished.replace(options.video)
-    finally:
-        video.close()
-        unfinished.unlink(missing_ok=True)

@@ -16,7 +16,7 @@ def main(arguments: list[str], program: str) -> None:
 def _run(options: Any, arguments: list[str], program: str) -> None:
     parsed = console.parse(options, arguments, program)
     if isinstance(parsed, RunOptions):  # the one that takes long
-        with console.stop_on_interrupt() as stopped:
-            parsed.run(stopped)
+        with console.stop_on_interrupt() as stopped, console.progress("study") as report:
+            parsed.run(stopped, report)
     else:
         parsed.run()

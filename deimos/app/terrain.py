@@ -7,12 +7,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 from deimos.app import console
 from deimos.checks import RunError, check_range
 from deimos.terrain import catalog, export, presets
-from deimos.terrain.mesh import highest_riser, steepest_slope
+from deimos.terrain.grid import Terrain
+from deimos.terrain.importing import import_file
+from deimos.terrain.mesh import Mesh, highest_riser, sheet, steepest_slope
 from deimos.terrain.preview import save_preview
 from deimos.terrain.shape import TileShape
 from deimos.terrain.world import Grid, Share, build_with_mesh
@@ -96,12 +99,32 @@ class GridOptions(Outputs):
         return Grid(shapes=shares, **({"columns": len(shares), "border": 1.0} | changes))
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ImportOptions(Outputs):
+    """Make a terrain of a mesh, a grey picture or an array of heights, for --env.terrain and for other programs.
+
+    Without --out, --mjcf and --preview it is written to NAME.npz here. What deimos terrain wrote comes back exactly.
+    """
+
+    file: tyro.conf.Positional[Path]
+    """STL, OBJ, PLY or GLB mesh with z up (y in GLB), PNG height map, or NumPy array of heights [m], x along axis 0."""
+    resolution: float | None = None
+    """Distance of two samples of the height grid [m], positive. By default what a picture says of itself, or 0.05."""
+    height_range: tuple[float, float] | None = None
+    """Heights of a picture's lowest and highest possible grey value [m]. By default what it says of itself."""
+    scale: float | None = None
+    """Length of a mesh's unit [m], positive: 0.001 for millimetres. By default 1."""
+    tile: float | None = None
+    """Side of the tiles in whose middles robots start [m], positive. By default there is one, in the middle."""
+
+
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos terrain``."""
     commands = {
         "list": ("show the shapes with their parameters, and the presets", show_list),
         "shape": ("build one tile: deimos terrain shape stairs-up --out stairs.stl --preview stairs.png", build_shape),
         "grid": ("build a grid of tiles, from a preset, a TOML file or a list of shapes", build_grid),
+        "import": ("make a terrain of an STL, OBJ, PLY, GLB, PNG or NumPy file", import_terrain),
     }
     about = "Generates terrain for legged robots: triangle meshes, height grids, MuJoCo models, pictures."
     try:
@@ -177,31 +200,63 @@ def _make(grid: Grid, outputs: Outputs, title: str) -> None:
     _check_outputs(outputs)
     console.quiet_warp()
     start = time.perf_counter()
-    with console.stage_bar() as progress:
+    with console.progress("terrain") as progress:
         terrain, mesh = build_with_mesh(grid, progress=progress)
         seconds = time.perf_counter() - start
-        jobs: dict[Path, Callable[[], None]] = {path: partial(export.save, path, terrain, mesh) for path in outputs.out}
-        if outputs.mjcf:
-            jobs[outputs.mjcf] = partial(export.save_mjcf, outputs.mjcf, terrain)
-        if outputs.preview:
-            jobs[outputs.preview] = partial(save_preview, outputs.preview, terrain, title)
-        for number, (path, job) in enumerate(jobs.items()):
-            progress(f"writing {path.name}", number / len(jobs))
-            job()
-    low, high = float(terrain.heights.min()) + 0.0, float(terrain.heights.max()) + 0.0  # no -0
-    nx, ny = terrain.heights.shape
+        files = _write(terrain, mesh, outputs, title, progress)
     levels = f"{grid.easiest:g} to {grid.hardest:g} in {grid.levels} levels"
-    report = {
-        "extents [m]": " x ".join(f"{size:.3g}" for size in (*terrain.size, high - low)),
-        "heights [m]": f"{low:.3f} to {high:.3f}",
+    report = _measure(terrain, mesh) | {
         "difficulty": f"{grid.easiest:g}" if grid.levels == 1 else levels,
-        "steepest slope": f"{steepest_slope(mesh):.3f} rise over run",
         "highest riser [m]": f"{highest_riser(mesh):.3f}",
-        "mesh": f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces",
-        "height grid": f"{nx:,} x {ny:,} samples, {terrain.cell:g} m apart",
         "time [s]": f"{seconds:.2f}",
     }
-    print(title, *[f"{name:18} {value}" for name, value in report.items()], *jobs, sep="\n")
+    print(title, *[f"{name:18} {value}" for name, value in report.items()], *files, sep="\n")
+
+
+def import_terrain(arguments: list[str], program: str) -> None:
+    """Make a terrain of a file of another program."""
+    options: ImportOptions = console.parse(ImportOptions, arguments, program)
+    if not (options.out or options.mjcf or options.preview):
+        options = dataclasses.replace(options, out=(Path(f"{options.file.stem}.npz"),))
+    _check_outputs(options)
+    console.quiet_warp()
+    with console.progress("terrain") as progress:
+        names = ("resolution", "height_range", "scale", "tile")
+        terrain = import_file(options.file, **{name: getattr(options, name) for name in names})
+        x, y = (low + terrain.cell * np.arange(n) for low, n in zip(terrain.corner, terrain.heights.shape, strict=True))
+        mesh = sheet(x, y, terrain.heights)
+        files = _write(terrain, mesh, options, options.file.name, progress)
+    levels, columns = terrain.origins.shape[:2]
+    report = _measure(terrain, mesh) | {"tiles": f"{levels} x {columns} of {terrain.tile:g} m"}
+    print(options.file.name, *[f"{name:18} {value}" for name, value in report.items()], *files, sep="\n")
+
+
+def _write(
+    terrain: Terrain, mesh: Mesh, outputs: Outputs, title: str, progress: Callable[[str, float], None]
+) -> list[Path]:
+    """Write all outputs; returns where they are."""
+    jobs: dict[Path, Callable[[], None]] = {path: partial(export.save, path, terrain, mesh) for path in outputs.out}
+    if outputs.mjcf:
+        jobs[outputs.mjcf] = partial(export.save_mjcf, outputs.mjcf, terrain)
+    if outputs.preview:
+        jobs[outputs.preview] = partial(save_preview, outputs.preview, terrain, title)
+    for number, (path, job) in enumerate(jobs.items()):
+        progress(f"writing {path.name}", number / len(jobs))
+        job()
+    return list(jobs)
+
+
+def _measure(terrain: Terrain, mesh: Mesh) -> dict[str, str]:
+    """What is to be said of any terrain."""
+    low, high = float(terrain.heights.min()) + 0.0, float(terrain.heights.max()) + 0.0  # no -0
+    nx, ny = terrain.heights.shape
+    return {
+        "extents [m]": " x ".join(f"{size:.3g}" for size in (*terrain.size, high - low)),
+        "heights [m]": f"{low:.3f} to {high:.3f}",
+        "steepest slope": f"{steepest_slope(mesh):.3f} rise over run",
+        "mesh": f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces",
+        "height grid": f"{nx:,} x {ny:,} samples, {terrain.cell:g} m apart",
+    }
 
 
 def _check_outputs(outputs: Outputs) -> None:

@@ -11,7 +11,7 @@ import tyro
 
 from deimos import plugins
 from deimos.app import console, figures
-from deimos.app.evaluate import evaluate_run, title
+from deimos.app.evaluate import show_evaluation, title
 from deimos.checks import RunError
 from deimos.goals import selectors
 from deimos.run import presets, training
@@ -34,37 +34,35 @@ class ResumeOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FolderOptions(TrainConfig):
-    """``TrainConfig`` and what belongs to the folder."""
+class FirstOptions:
+    """What decides which other options there are."""
+
+    preset: str | None = None
+    """Name of a ready configuration to start from; the others change it."""
+    resume: Path | None = None
+    """Resume the run in this folder from its last checkpoint; takes only --env-steps and --device."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderOptions(TrainConfig, FirstOptions):
+    """What people ask for first, ``TrainConfig``, and what belongs to the folder."""
 
     out: Path | None = None
     """Folder of the run, which must not exist. By default runs/ENV-METHOD-sSEED-TIME."""
-    resume: Path | None = None
-    """Resume the run in this folder from its last checkpoint; takes only --env-steps and --device."""
     init_from: Path | None = None
     """Start with the networks of the run in this folder."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FirstOptions:
-    """What decides which other options there are."""
-
-    resume: Path | None = None
-    """See ``ResumeOptions``."""
-    preset: str | None = None
-    """Name of a ready configuration to start from."""
-
-
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos train``."""
-    first, rest = console.parse(FirstOptions, arguments, program, add_help=False, return_unknown_args=True)
+    first, _ = console.parse(FirstOptions, arguments, program, add_help=False, return_unknown_args=True)
     if first.resume is not None:
         _resume(console.parse(ResumeOptions, arguments, program))
         return
-    _check_names(rest)
-    options, config = _train_options(), _preset(first.preset, rest)
+    _check_names(arguments)
+    options, config = _train_options(), _preset(first.preset, arguments)
     default = options(**vars(config))
-    _train(console.parse(options, rest, program, default=default))
+    _train(console.parse(options, arguments, program, default=default))
 
 
 def _train(options: Any) -> None:
@@ -85,35 +83,31 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
     """Train, evaluate, draw and say where everything is."""
     config = trainer.config
     with console.stop_on_interrupt() as stopped:
-        with _training_bar(trainer) as report:
+        with _training_progress(trainer) as report:
             finished = training.train(trainer, folder, report, stopped)
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(130)
-    rows = evaluate_run(folder, config.env, config.eval, trainer.env.device) if config.evaluation else []
-    figures.draw_summary(folder, title(config), rows)
+    if config.evaluation:
+        show_evaluation(folder, config, config.env, config.eval, trainer.env.device)
+    else:
+        figures.draw_summary(folder, title(config))
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
-        print("time:", *[f"{name} {100 * seconds / total:.1f} % " for name, seconds in trainer.seconds.items()])
+        parts = [f"{name} {seconds / total:.0%}" for name, seconds in trainer.seconds.items()]
+        print(f"Training took {total:.1f} s: {', '.join(parts)}.")
     print(folder.path)
 
 
 @contextlib.contextmanager
-def _training_bar(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
-    """Iteration, frames per second, reward, crashes per 1000 transitions, time left."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    numbers = "{task.fields[fps]:.0f} FPS  reward {task.fields[reward]:.3f}  crashes/1000 {task.fields[crashes]:.2f}"
-    columns = (
-        TextColumn("iteration {task.completed}/{task.total}"), BarColumn(), TextColumn(numbers), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(
-            "train", total=trainer.config.iterations, completed=trainer.iteration, fps=0.0, reward=0.0, crashes=0.0
-        )
-        yield lambda row, fps: progress.update(
-            task, completed=row["iteration"], fps=fps, reward=row["reward"], crashes=row["crashes_per_1000"]
+def _training_progress(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
+    """Frames per second, reward and crashes per 1000 transitions, short enough for 80 columns."""
+    total = trainer.config.iterations
+    with console.progress("training") as report:
+        yield lambda row, fps: report(
+            f"{fps:,.0f} FPS, reward {console.number(row['reward'])}, "
+            f"crashes/1000 {console.number(row['crashes_per_1000'])}",
+            row["iteration"] / total,
         )
 
 

@@ -21,6 +21,8 @@ class Purpose(IntEnum):
 
     GOAL = 0  # the choice of a goal: a GoalDirector draws what an environment draws for it
     EXPLORATION = 16
+    AUDIT = 17  # exploration in the audits of a fear network
+    AUDIT_CONTEXT = 18  # which of the contexts are audited
 
 
 def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[int, int]) -> tuple[Tensor, ...]:

@@ -1,6 +1,5 @@
 """Training and evaluation as two functions, for programs."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,21 +7,20 @@ from typing import Any
 import torch
 
 from deimos.checks import RunError
-from deimos.learn.policy import load_policy
 from deimos.nn.matmul import on_threads
-from deimos.run import evaluation, training
-from deimos.run.evaluation import EvalConfig
+from deimos.run import training
+from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
-Progress = Callable[[str, float], None]
-"""Called now and then with the stage's name and the share of it that is done."""
-
 
 def train(config: TrainConfig | None = None, out: Path | str | None = None) -> Path:
     """Train a policy and evaluate it.
+
+    The environment of the process is left alone. Where other programs use the cores too, set OMP_WAIT_POLICY=passive
+    before torch is loaded, as the ``deimos`` command does: threads that spin while they wait are slow there.
 
     Args:
         config: What to train; ``None`` for the main job, Particle Gym under the Director.
@@ -84,19 +82,3 @@ def configure_evaluation(
     except (TypeError, ValueError) as error:
         raise RunError(str(error)) from error
     return env_config, eval_config
-
-
-def evaluate_run(
-    folder: RunFolder, env_config: EnvConfig, eval_config: EvalConfig, device: torch.device,
-    progress: Progress = lambda stage, share: None,
-) -> list[dict]:  # fmt: skip
-    """Evaluate the folder's policy; rows of the same policy, goals and sizes are replaced, others are kept."""
-    policy = load_policy(folder.path, str(device))
-    known = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
-    rows = evaluation.evaluate(policy.scaled, env_config, eval_config, device, progress)
-    rows = [row | {"weights": evaluation.weights_hash(policy.actor)} for row in rows]
-    key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
-    fresh = {tuple(row[name] for name in key) for row in rows}
-    kept = [row for row in known if tuple(row.get(name) for name in key) not in fresh]
-    folder.write_json("evaluation.json", kept + rows)
-    return rows

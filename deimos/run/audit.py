@@ -1,13 +1,11 @@
 """Does the fear network rank goals rightly *within* a context? Exact labels from cloned worlds.
 
-The AUROC over all interactions is flattered by states: near a wall everything is dangerous. What a
-Director uses is the ranking of goals for one state and one goal in force. Here worlds at the moment of
-a goal change are cloned, every clone gets another candidate goal, and the policy is rolled out for T
-steps under each, with its actions drawn as in training.
+The AUROC over all interactions is flattered by states: near a wall everything is dangerous. What a Director uses is the
+ranking of goals for one state and one active goal. Here worlds at the moment of a goal change are cloned, every clone
+gets another candidate goal, and the policy is rolled out for T steps under each, with its actions drawn as in training.
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,12 +18,10 @@ from deimos.goals.fear_selector import FearSelector, fear_selector
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
-from deimos.nn import seeds
+from deimos.nn.random import Purpose, normals, uniforms
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
-
-if TYPE_CHECKING:
-    from deimos.run.trainer import Trainer
+from deimos.run.trainer import Trainer
 
 CANDIDATES = 50  # goals tried in every context
 BATCH = 256  # contexts cloned at a time
@@ -33,44 +29,57 @@ PATIENCE = 50  # contexts tried per context wanted, before giving up
 RESAMPLES = 10_000
 
 
-def audit_fear(trainer: "Trainer", contexts: int) -> dict:
+class _Explorer:
+    """The policy with actions drawn as in training, by an audit's own numbers.
+
+    They are addressed by the seed, the number of the world, of which the first row's is given, and how often it acted.
+    """
+
+    def __init__(self, trainer: Trainer, first_world: int = 0) -> None:
+        self._actor, self._seed, self._first = trainer.ppo.actor, trainer.config.seed, first_world
+        self.steps = 0
+
+    def __call__(self, obs: Tensor) -> Tensor:
+        mean = self._actor(obs)
+        world = torch.arange(len(obs), device=obs.device)
+        noise = normals(self._seed, Purpose.AUDIT, world + self._first, world.new_tensor(self.steps), mean.shape[1])
+        self.steps += 1
+        return mean + self._actor.std * noise
+
+
+def audit_fear(trainer: Trainer, contexts: int) -> dict:
     """Measure the AUROC within contexts of a training run's fear network.
 
-    The run's own worlds go on as in training, without learning, and supply the contexts; only
-    those where some candidates crash and some do not can be ranked.
+    The run's own worlds continue as in training, without learning, and supply the contexts; only those where some
+    candidates crash and some do not can be ranked.
 
     Args:
         trainer: A run whose selector has a fear network that has learnt. Its worlds move on.
         contexts: Contexts with both outcomes to collect, at least 1.
 
     Returns:
-        ``auroc``, the mean over contexts; ``low`` and ``high``, its 95 % bootstrap interval by
-        context; ``contexts`` with both outcomes among those ``tried``; ``crash_rate`` of all
-        rollouts; ``iteration``.
+        ``auroc``, the mean over contexts; ``low`` and ``high``, its 95 % bootstrap interval by context; ``contexts``
+        with both outcomes among those ``tried``; ``crash_rate`` of all rollouts; ``iteration``.
 
     Raises:
         RunError: If there is no fear network, or no context with both outcomes.
     """
     afraid = _learnt_fear(trainer)
-    generator = seeds.generator(trainer.config.seed, "audit", trainer.env.device)
-    config = trainer.config
+    config, act = trainer.config, _Explorer(trainer)
     clones = Clones(
         lambda count: config.env.build(count, trainer.env.device, config.seed),
-        lambda obs: _act(trainer, obs, generator), limit=BATCH * CANDIDATES,
+        _Explorer(trainer, first_world=config.num_envs), limit=BATCH * CANDIDATES,
     )  # fmt: skip
     ranks: list[float] = []
     crashes = tried = 0
     while len(ranks) < contexts and tried < PATIENCE * contexts:
-        state, goal, candidates, survived = _next_contexts(trainer, clones, generator)
+        state, goal, candidates, survived = _next_contexts(trainer, act, clones)
         logit = afraid.score(state, goal, candidates)
         crashed = survived < trainer.env.goal_period
         tried += len(logit)
         crashes += int(crashed.sum())
-        ranks += [
-            auroc(score, label)
-            for score, label in zip(logit, crashed, strict=True)
-            if 0 < int(label.sum()) < CANDIDATES
-        ]
+        pairs = zip(logit, crashed, strict=True)
+        ranks += [auroc(score, label) for score, label in pairs if 0 < int(label.sum()) < CANDIDATES]
     if not ranks:
         raise RunError(
             f"None of {tried} contexts had both outcomes; the policy is too safe or too bad to rank its goals."
@@ -78,39 +87,34 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
     picks = np.random.default_rng(0).integers(len(ranks), size=(RESAMPLES, len(ranks)))
     low, high = np.quantile(np.array(ranks)[picks].mean(axis=1), [0.025, 0.975])
     return {
-        "auroc": math.fsum(ranks) / len(ranks),
-        "low": float(low),
-        "high": float(high),
-        "contexts": len(ranks),
-        "tried": tried,
-        "crash_rate": crashes / (tried * CANDIDATES),
-        "iteration": trainer.iteration,
-    }
+        "auroc": math.fsum(ranks) / len(ranks), "low": float(low), "high": float(high), "contexts": len(ranks),
+        "tried": tried, "crash_rate": crashes / (tried * CANDIDATES), "iteration": trainer.iteration,
+    }  # fmt: skip
 
 
-def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[Tensor, Tensor, dict[str, float]]]:
-    """Judge the calibrated probabilities of a training run's fear network, on goals that it did not learn from.
+def audit_calibration(trainer: Trainer, interactions: int) -> dict[str, tuple[Tensor, Tensor, dict[str, float]]]:
+    """Evaluate the calibrated probabilities of a training run's fear network, on goals that it did not learn from.
 
-    The run's own worlds go on as in training, without learning: first under the goals of its selector, which
-    are a biased sample of all goals, then under uniform goals, which are not.
+    The run's own worlds continue as in training, without learning: first under the goals of its selector, which are a
+    biased sample of all goals, then under uniform goals, which are not.
 
     Args:
-        trainer: A run whose selector has a fear network that has learnt. Its worlds move on.
-        interactions: Interactions to judge under either, at least 1.
+        trainer: See ``audit_fear``.
+        interactions: Interactions under either, at least 1.
 
     Returns:
-        For ``selected`` and ``uniform`` goals: probabilities, shape (n,), what became of them, bool, shape (n,),
-        and the dictionary of ``calibration.evaluate``, with ``interactions``, ``crash_rate`` and ``auroc``.
+        For ``selected`` and ``uniform`` goals: probabilities, shape (n,), outcomes, bool, shape (n,), and what
+        ``calibration.evaluate`` gives, with ``interactions``, ``crash_rate`` and ``auroc``.
 
     Raises:
         RunError: If there is no fear network.
     """
     afraid = _learnt_fear(trainer)
-    generator = seeds.generator(trainer.config.seed, "calibration", trainer.env.device)
+    act = _Explorer(trainer)
     choosers = {"selected": trainer.loop.selector, "uniform": uniform.Config().build(spaces(trainer.env), 0)}
     results = {}
     for name, chooser in choosers.items():
-        done = _watch(trainer, chooser, interactions, generator)
+        done = _watch(trainer, act, chooser, interactions)
         score = afraid.score(done.state, done.goal, done.next_goal.unsqueeze(1)).squeeze(1)
         probability = afraid.calibration.probability(score)
         counts = {"interactions": float(len(done)), "crash_rate": done.crashed.float().mean().item()}
@@ -119,7 +123,7 @@ def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[
     return results
 
 
-def _learnt_fear(trainer: "Trainer") -> FearSelector:
+def _learnt_fear(trainer: Trainer) -> FearSelector:
     afraid = fear_selector(trainer.loop.selector)
     if afraid is None or not afraid.fear.fitted:
         raise RunError("This run's selector has no fear network that has learnt anything.")
@@ -127,44 +131,35 @@ def _learnt_fear(trainer: "Trainer") -> FearSelector:
 
 
 @torch.no_grad()
-def _watch(trainer: "Trainer", chooser: GoalSelector, count: int, generator: torch.Generator) -> Resolved:
-    """Let the policy go on under a selector's goals until ``count`` interactions have ended, in whole periods."""
+def _watch(trainer: Trainer, act: _Explorer, chooser: GoalSelector, count: int) -> Resolved:
+    """Let the policy act under a selector's goals until ``count`` interactions have ended, in whole periods."""
     env = trainer.env
-    periods = -(-count // env.num_envs)
-    loop = GoalLoop(env, chooser, window=(periods + 1) * env.goal_period)
-    begin = periods * env.goal_period
-    for _ in range((periods + 1) * env.goal_period):
-        loop.advance(env.step(_act(trainer, env.obs, generator)))
-    done = loop.interactions.resolved()
-    return done.where(done.issued <= begin)  # of the later ones only the crashes are known yet
-
-
-def _act(trainer: "Trainer", obs: Tensor, generator: torch.Generator) -> Tensor:
-    """Actions as in training: drawn, not the mean."""
-    mean = trainer.ppo.actor(obs)
-    return mean + trainer.ppo.actor.std * torch.randn(mean.shape, generator=generator, device=mean.device)
+    steps = (-(-count // env.num_envs) + 1) * env.goal_period
+    loop = GoalLoop(env, chooser, window=steps)
+    for _ in range(steps):
+        loop.advance(env.step(act(env.obs)))
+    return loop.outcomes()
 
 
 @torch.no_grad()
-def _next_contexts(
-    trainer: "Trainer", clones: Clones, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Go on until goals are due, and try candidates in up to ``BATCH`` of those worlds.
+def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Step until goals are due, and try candidates in up to ``BATCH`` of those worlds.
 
     Returns:
-        States (n, state_dim), goals in force (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the steps
+        States (n, state_dim), active goals (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the steps
         survived under each (n, CANDIDATES).
     """
     env = trainer.env
     while True:
-        step = env.step(clones.act(env.obs))
+        step = env.step(act(env.obs))
         rows = (step.goal_due & ~step.terminated & ~step.truncated).nonzero().squeeze(1)
-        if len(rows) == 0:
-            trainer.loop.advance(step)
-            continue
-        rows = rows[torch.randperm(len(rows), generator=generator, device=rows.device)[:BATCH]]
-        obs = env.obs[rows]
-        candidates = env.sample_goals(rows, CANDIDATES).clone()
-        survived = clones.try_out(env, rows, candidates)
+        if len(rows):
+            break
         trainer.loop.advance(step)
-        return env.state(obs), obs[:, env.goal_slice], candidates, survived
+    draw = uniforms(trainer.config.seed, Purpose.AUDIT_CONTEXT, rows, rows.new_tensor(act.steps))[:, 0]
+    rows = rows[draw.argsort()[:BATCH]]
+    obs = env.obs[rows]
+    candidates = env.sample_goals(rows, CANDIDATES).clone()
+    survived = clones.try_out(env, rows, candidates)
+    trainer.loop.advance(step)
+    return env.state(obs), obs[:, env.goal_slice], candidates, survived

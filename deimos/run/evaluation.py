@@ -1,14 +1,16 @@
 """How good and how safe a policy is: against uniform goals (Naive) and against the worst ones (Adversary).
 
-Every policy meets the same goals: the i-th goal of a world depends on the evaluation's seed, the world
-and i alone. The Adversary is the argmax Director with a fear network of its own, trained after the
-policy, so that it knows this policy's weaknesses and not those of some training run.
+Every policy meets the same goals: the i-th goal of a world depends on the evaluation's seed, the world and i alone. The
+Adversary is the argmax Director with a fear network of its own, trained after the policy, so that it knows this
+policy's weaknesses and not those of some training run.
 """
 
 import hashlib
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -19,12 +21,17 @@ from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.goals.selectors import director, uniform
+from deimos.learn.policy import load_policy
+from deimos.run.config import to_dict
+from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones, Oracle
 from deimos.sim.env import Env, EnvConfig
 
 Policy = Callable[[Tensor], Tensor]
 """Observations, shape (n, obs_dim), to actions, shape (n, action_dim)."""
+Progress = Callable[[str, float], None]
+"""Called now and then with the stage's name and the share of it that is done."""
 
 WEAK_CRASHES, WEAK_AUROC = 100, 0.6  # below either, resisting the Adversary proves nothing
 FITS = 15  # fits of the Adversary's network during its ``adversary_steps``
@@ -77,13 +84,47 @@ def weights_hash(module: nn.Module) -> str:
     return digest.hexdigest()[:16]
 
 
+def evaluate_run(
+    folder: RunFolder, env_config: EnvConfig, config: EvalConfig, device: torch.device,
+    progress: Progress = lambda stage, share: None, *, again: bool = True,
+) -> list[dict]:  # fmt: skip
+    """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
+
+    There they replace the rows of the same evaluation of the same weights. One of another T, size or seed, or of an
+    Adversary that was trained otherwise, is another evaluation, and stays beside them. Rows that the folder has are
+    made ``again`` or given back as they are; for the other arguments see ``evaluate``.
+
+    Returns:
+        The rows of this evaluation, those of ``evaluate`` with the policy's ``weights_hash``.
+    """
+    policy = load_policy(folder.path, str(device))
+    weights = {"weights": weights_hash(policy.actor)}
+    known = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+    identities = [(identity | weights).items() for identity in _identities(env_config, config)]
+    same = [row for row in known if any(row.items() >= identity for identity in identities)]
+    if len(same) == len(identities) and not again:
+        return same
+    fresh = [row | weights for row in evaluate(policy.scaled, env_config, config, device, progress)]
+    folder.write_json("evaluation.json", [row for row in known if row not in same] + fresh)
+    return fresh
+
+
+def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
+    """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
+    trained = {name: value for name, value in to_dict(config).items() if name not in ("steps", "oracle_worlds")}
+    setting = hashlib.sha256(json.dumps(trained, sort_keys=True).encode()).hexdigest()[:12]
+    sizes = {"naive": config.worlds, "adversary": config.worlds, "oracle": config.oracle_worlds}
+    return [
+        {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed, "worlds": worlds,
+         "steps": config.steps} | ({} if goals == "naive" else {"adversary_setting": setting})
+        for goals, worlds in sizes.items() if worlds
+    ]  # fmt: skip
+
+
 def evaluate(
-    policy: Policy,
-    env_config: EnvConfig,
-    config: EvalConfig,
-    device: torch.device,
-    progress: Callable[[str, float], None] = lambda stage, share: None,
-) -> list[dict]:
+    policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device,
+    progress: Progress = lambda stage, share: None,
+) -> list[dict]:  # fmt: skip
     """Evaluate a policy against Naive and against Adversary.
 
     Args:
@@ -91,18 +132,13 @@ def evaluate(
         env_config: The environment that it was trained in; randomisations are switched off.
         config: Sizes and seed.
         device: Where to simulate.
-        progress: Called now and then with the stage's name and the share of it that is done.
+        progress: Told how far it is.
 
     Returns:
-        One row for ``naive`` and one for ``adversary``, and one for ``oracle`` if asked for. In each:
-        ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions``
-        (issued early enough to end in time), ``crash_rate`` (share of those that crashed), steps and
-        crashes under first goals apart, ``return_per_step`` (see ``play``) and ``score``: its place
-        between the policy that does nothing (0) and the environment's reference policy (1), both
-        under the Naive goals; and for the Adversary the size of its collection and its AUROC on
-        worlds that it did not learn from. ``tracking`` has the mean of every group of goal
-        components, ``strata`` the same and more by kind of world, where there are kinds, and ``errors``
-        the median of each of ``Env.errors`` over all goals that were survived, at the end of their period.
+        One row for ``naive`` and one for ``adversary``, and one for ``oracle`` if asked for: what ``play`` gives, and
+        ``score``: the place of its ``return_per_step`` between that of the policy that does nothing (0) and that of the
+        environment's reference policy (1), both under Naive goals; NaN where there is none. For the Adversary also
+        what ``train_adversary`` gives, and ``adversary_setting``, a hash of all that fixed its training but the policy.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -111,43 +147,39 @@ def evaluate(
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
 
-    def build(seed: int) -> Env:
-        return env_config.build(config.worlds, device, seed)
+    def build(worlds: int = config.worlds, seed: int = config.seed) -> Env:
+        return env_config.build(worlds, device, seed)
 
-    env = build(config.seed)
-    naive = uniform.Config().build(spaces(env), config.seed)
-    scale = _scale(env, lambda: build(config.seed), naive, config.steps, progress)
-    rows = [{"goals": "naive"} | play(env, policy, naive, config.steps, lambda x: progress("naive", x))]
-
-    fear, collection = train_adversary(policy, build(config.seed + 1), config, lambda x: progress("collection", x))
-    env = build(config.seed)
-    adversary = director.Config(rule="argmax", fear=config.fear).build(spaces(env), config.seed)
-    adversary.fear = fear
-    attacked = play(env, policy, adversary, config.steps, lambda x: progress("adversary", x))
-    rows.append({"goals": "adversary"} | attacked | collection)
-    if config.oracle_worlds:
-        env = env_config.build(config.oracle_worlds, device, config.seed)
-        clones = Clones(lambda count: env_config.build(count, device, config.seed), policy)
-        oracle = Oracle(env, clones, fear=fear)
-        rows.append({"goals": "oracle"} | play(env, policy, oracle, config.steps, lambda x: progress("oracle", x)))
-    for row in rows:
+    scale = _scale(build, config.steps, progress)
+    fear, collection = train_adversary(policy, build(seed=config.seed + 1), config, partial(progress, "collection"))
+    choosers: dict[str, Callable[[Env], GoalSelector]] = {
+        "naive": _naive,
+        "adversary": lambda env: argmax_director(env, fear),
+        "oracle": lambda env: Oracle(env, Clones(build, policy), fear=fear),
+    }
+    rows = []
+    for identity in _identities(env_config, config):
+        goals, env = identity["goals"], build(identity["worlds"])
+        row = {"goals": goals} | play(env, policy, choosers[goals](env), config.steps, partial(progress, goals))
+        row |= collection if goals == "adversary" else {}
         row["score"] = (row["return_per_step"] - scale[0]) / (scale[1] - scale[0]) if scale else math.nan
-        row |= {"goal_period": env_config.goal_period, "seed": config.seed}
-        worlds = config.oracle_worlds if row["goals"] == "oracle" else config.worlds
-        row |= {"worlds": worlds, "steps": config.steps}
+        rows.append(row | identity)
     return rows
 
 
-def _scale(
-    env: Env, build: Callable[[], Env], naive: GoalSelector, steps: int, progress: Callable[[str, float], None]
-) -> tuple[float, float] | None:
+def _naive(env: Env) -> GoalSelector:
+    return uniform.Config().build(spaces(env), 0)
+
+
+def _scale(build: Callable[[], Env], steps: int, progress: Progress) -> tuple[float, float] | None:
     """Return per step of the zero-action policy and of the reference policy, if there is one."""
+    env = build()
+    nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
     reference = env.reference_policy()
     if reference is None:
         return None
-    nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
-    low = play(build(), lambda obs: nothing, naive, steps, lambda x: progress("zero action", x))
-    high = play(build(), reference, naive, steps, lambda x: progress("reference", x))
+    low = play(env, lambda obs: nothing, _naive(env), steps, partial(progress, "zero action"))
+    high = play(build(), reference, _naive(env), steps, partial(progress, "reference"))
     return low["return_per_step"], high["return_per_step"]
 
 
@@ -157,18 +189,19 @@ def play(
 ) -> dict:
     """Let a policy act under a selector's goals and count.
 
-    ``return_per_step`` is the mean over interactions of (sum of the rewards over the T steps, 0
-    from a crash on) / T. Unlike the mean reward per transition it cannot be raised by crashing,
-    which puts a particle back to the origin, far from every wall.
-
     Returns:
-        See ``evaluate``.
+        ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions`` (issued early enough
+        to end in time), ``crash_rate`` (share of those that crashed), steps and crashes under first goals apart.
+        ``return_per_step``, the mean over interactions of (sum of the rewards over the T steps, 0 from a crash on) / T,
+        cannot be raised by crashing, unlike the reward per transition: a crash puts a particle back to the origin, far
+        from every wall. ``tracking`` has the mean of every group of goal components, ``strata`` the same and more by
+        kind of world, where there are kinds, and ``errors`` the median of each of ``Env.errors`` over all goals that
+        were survived, at the end of their period.
     """
     loop = GoalLoop(env, selector, window=steps)
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)
-    strata = env.strata()
     errors = {name: torch.empty(steps, env.num_envs, device=env.device) for name in env.errors}
     for t in range(steps):
         step = env.step(policy(env.obs))
@@ -185,8 +218,7 @@ def play(
         if t % 100 == 0:
             progress(t / steps)
     env.check()
-    done = loop.interactions.resolved()
-    done = done.where(done.issued <= steps - env.goal_period)  # a later one ends in time only by a crash
+    done = loop.outcomes()
     reward_sum, crash_count, first_count, first_crash_count = totals.sum(1).tolist()
     transitions = steps * env.num_envs
     crashed = int(done.crashed.sum())
@@ -200,9 +232,10 @@ def play(
         "first_goal_steps": int(first_count),
         "first_goal_crashes": int(first_crash_count),
         "return_per_step": done.reward.double().mean().item() / env.goal_period,
+        "goal_groups": list(env.goal_group_names),
         "tracking": (tracking.mean(0) / steps).tolist(),
         "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
-        "strata": _by_stratum(strata, crashes, tracking / steps, done),
+        "strata": _by_stratum(env.strata(), crashes, tracking / steps, done),
         "errors": {name: values.nanmedian().item() for name, values in errors.items()},
     }
 
@@ -212,14 +245,19 @@ def _by_stratum(strata: list[str], crashes: Tensor, tracking: Tensor, done: Reso
     rows = {}
     for name in sorted(set(strata)):
         own = torch.tensor([stratum == name for stratum in strata], device=crashes.device)
-        ended = done.crashed[own[done.env]]
+        success = 1.0 - done.crashed[own[done.env]].float().mean().item()  # NaN where no interaction has ended
         rows[name] = {
-            "worlds": int(own.sum()),
-            "crashes": int(crashes[own].sum()),
-            "tracking": tracking[own].mean(0).tolist(),
-            "success": 1.0 - ended.float().mean().item() if len(ended) else math.nan,
-        }
+            "worlds": int(own.sum()), "crashes": int(crashes[own].sum()),
+            "tracking": tracking[own].mean(0).tolist(), "success": success,
+        }  # fmt: skip
     return rows
+
+
+def argmax_director(env: Env, fear: Fear) -> director.Director:
+    """A Director that asks for the candidate that a fear network, as it is at that time, fears most."""
+    selector = director.Config(rule="argmax", fear=fear.config).build(spaces(env), 0)
+    selector.fear = fear
+    return selector
 
 
 def train_adversary(
@@ -227,13 +265,13 @@ def train_adversary(
 ) -> tuple[Fear, dict]:
     """Train a fear network on a finished policy.
 
-    Half of the goals of the collection are uniform and half are the network's own argmax: uniform
-    goals alone would show few crashes of a safe policy, its own choices alone no survivals.
+    Half of the goals of the collection are uniform and half are the network's own argmax: uniform goals alone would
+    show few crashes of a safe policy, its own choices alone no survivals.
 
     Returns:
-        The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``,
-        ``adversary_auroc`` (on every fifth world, which it did not learn from; NaN where they hold no pair to rank) and
-        ``weak_adversary``: whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
+        The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``, ``adversary_auroc`` (on
+        every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``weak_adversary``:
+        whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
     """
     fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed)
     collector = _Collector(env, fear)
@@ -246,13 +284,13 @@ def train_adversary(
         loop.advance(step)
         if t % pause == 0 or t == limit:
             progress(min(1.0, t / config.adversary_steps))
-            data = _whole(loop)
-            fear.fit(_training_part(data), epochs=1)
+            data = loop.outcomes()
+            learnt_from = data.where(data.env % HELD_OUT != 0)
+            fear.fit(learnt_from, epochs=1)
             if _enough(config, len(data), int(data.crashed.sum()), t):
                 break
     env.check()
-    data = _whole(loop)
-    fear.fit(_training_part(data))
+    fear.fit(learnt_from)
     fear.check()
     quality = _quality(fear, data.where(data.env % HELD_OUT == 0))
     crashes = int(data.crashed.sum())
@@ -289,23 +327,12 @@ def _enough(config: EvalConfig, interactions: int, crashes: int, steps: int) -> 
     return any(counts) if config.adversary_enough == "any" else all(counts) and steps >= config.adversary_steps
 
 
-def _whole(loop: GoalLoop) -> Resolved:
-    """What was issued at least T steps ago: of the later ones only the crashes are known yet."""
-    data = loop.interactions.resolved()
-    return data.where(data.issued <= loop.interactions.now - loop.env.goal_period)
-
-
-def _training_part(data: Resolved) -> Resolved:
-    return data.where(data.env % HELD_OUT != 0)
-
-
 class _Collector(GoalSelector):
     """Half uniform goals, which are marked as probes, half the argmax of a fear network that is being trained."""
 
     def __init__(self, env: Env, fear: Fear) -> None:
-        self._uniform = uniform.Config().build(spaces(env), 0)
-        self._argmax = director.Config(rule="argmax", fear=fear.config).build(spaces(env), 0)
-        self._argmax.fear = fear
+        self._uniform = _naive(env)
+        self._argmax = argmax_director(env, fear)
         self.num_candidates = self._argmax.num_candidates
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:

@@ -3,6 +3,7 @@
 import torch
 
 from deimos.goals.core import Changes, GoalCore
+from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Spaces
 from deimos.sim.env import Env, Step
 
@@ -62,6 +63,11 @@ class GoalLoop:
     def _reset(self, mask: torch.Tensor) -> None:
         self.env.reset(mask, self.selector.goal_range() if self.selector.first_goals_scaled else None)
         self.weight.masked_fill_(mask, 1.0)
+
+    def outcomes(self) -> Resolved:
+        """Interactions that were issued at least T steps ago: of later ones only the crashes are known yet."""
+        done = self.interactions.resolved()
+        return done.where(done.issued <= self.interactions.now - self.env.goal_period)
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""

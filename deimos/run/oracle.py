@@ -18,8 +18,8 @@ from deimos.sim.env import Env
 class Clones:
     """Worlds to try candidates in.
 
-    They come in sets of 1, 2, 4, ... times the candidates of a decision, each made when it is first needed: a
-    set is stepped as a whole, so that one world's decision should not wait for ten thousand clones.
+    They come in sets of 1, 2, 4, ... times the candidates of a decision, each made when it is first needed: a set is
+    stepped as a whole, so that one world's decision should not wait for ten thousand clones.
 
     Args:
         build: Makes worlds like those that are cloned, as many as it is told.
@@ -50,7 +50,10 @@ class Clones:
 
     def _try_some(self, env: Env, rows: Tensor, candidates: Tensor) -> Tensor:
         count = candidates.shape[1]
-        probe = self._set(len(rows), count)
+        size = count << (len(rows) - 1).bit_length()  # the smallest set with room for them
+        if size not in self._sets:
+            self._sets[size] = self._build(size)
+        probe = self._sets[size]
         clones = torch.arange(len(rows) * count, device=rows.device)
         probe.copy_worlds(rows.repeat_interleave(count), clones, origin=env)
         probe.set_goals(clones, candidates.flatten(0, 1))
@@ -60,13 +63,6 @@ class Clones:
             alive &= ~probe.step(self.act(probe.obs)).terminated
             survived += alive
         return survived[: len(clones)].view(-1, count)
-
-    def _set(self, decisions: int, count: int) -> Env:
-        """The smallest set with room for so many decisions of ``count`` candidates."""
-        size = count << (decisions - 1).bit_length()
-        if size not in self._sets:
-            self._sets[size] = self._build(size)
-        return self._sets[size]
 
 
 class Oracle(GoalSelector):

@@ -9,7 +9,7 @@ the command line, hyphens and underscores in a name are the same.
 from typing import Any
 
 from deimos import plugins
-from deimos.run.config import from_dict
+from deimos.run.config import from_dict, kind
 from deimos.run.trainer import TrainConfig
 from deimos.sim import envs
 
@@ -29,12 +29,8 @@ def names() -> list[str]:
 
 
 def environment(name: str) -> str:
-    """Name of the environment that a preset is for.
-
-    Raises:
-        ValueError: If there is no such preset; the message lists those that there are.
-    """
-    return _get(name)[0]
+    """Name of the environment that a preset is for; see ``preset``."""
+    return kind(preset(name).env)
 
 
 def preset(name: str) -> TrainConfig:
@@ -44,15 +40,11 @@ def preset(name: str) -> TrainConfig:
         ValueError: If there is no such preset; the message lists those that there are. Or if one of its fields is
             unknown or not allowed.
     """
-    env, fields = _get(name)
-    return from_dict(TrainConfig, fields | {"env": {"kind": env} | fields.get("env", {})})
-
-
-def _get(name: str) -> tuple[str, dict[str, Any]]:
     found = _all()
     if spelled(name) not in found:
         raise ValueError(f"There is no preset '{name}'; there are: {', '.join(sorted(found))}.")
-    return found[spelled(name)]
+    env, fields = found[spelled(name)]
+    return from_dict(TrainConfig, fields | {"env": {"kind": env} | fields.get("env", {})})
 
 
 def spelled(name: str) -> str:

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, SimulationError, check_at_least, check_choice
+from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_range, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.learn.ppo import PPO, PPOConfig
@@ -17,6 +17,8 @@ from deimos.run.evaluation import EvalConfig
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
+
+MOST_THREADS = 4096  # far more than that, and libraries of threads crash
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,7 @@ class TrainConfig:
         check_at_least("num_envs", self.num_envs, 1)
         check_at_least("env_steps", self.env_steps, 1)
         check_at_least("threads", self.threads, 0)
+        check_range("threads", self.threads, 0, MOST_THREADS)
         check_choice("device", self.device, ["auto", "cpu", "cuda"])
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
@@ -173,12 +176,8 @@ class Trainer:
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
-        return {
-            "iteration": self.iteration,
-            "made_for": _identity(self.config),
-            "ppo": self.ppo.state_dict(),
-            "loop": self.loop.state_dict(),
-        }
+        made_for, ppo, loop = _identity(self.config), self.ppo.state_dict(), self.loop.state_dict()
+        return {"iteration": self.iteration, "made_for": made_for, "ppo": ppo, "loop": loop}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from ``state_dict()``.
@@ -193,8 +192,8 @@ class Trainer:
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise RunError(f"The checkpoint is that of another environment or network size: {reason}") from error
+            text = "The checkpoint is that of another environment or network size: "
+            raise RunError(text + one_line(error)) from error
         self.iteration = state["iteration"]
 
 

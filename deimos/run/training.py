@@ -14,10 +14,11 @@ from pathlib import Path
 import torch
 
 from deimos import __version__
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run.config import from_dict, kind, to_dict
+from deimos.run.cores import cores
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 
@@ -42,37 +43,33 @@ def resolve_device(name: str) -> torch.device:
     return torch.device("cuda", 0) if name != "cpu" and torch.cuda.is_available() else torch.device("cpu")
 
 
-def cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def provenance() -> dict[str, str]:
     """Versions, commit and platform that a run's numbers belong to."""
     packages = ("torch", "warp-lang", "numpy")
-    home = Path(__file__).resolve().parent
-    git = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=home, capture_output=True, text=True, check=False
-    )
     return {
         "deimos": __version__,
-        "commit": git.stdout.strip() if git.returncode == 0 else "unknown",
+        "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
         **{name: version(name) for name in packages},
     }
 
 
-def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tuple[Trainer, RunFolder]:
-    """Begin a run.
+def _commit() -> str:
+    """The commit of the checkout that this file is in; unknown where it is installed, or without git."""
+    home = Path(__file__).resolve().parents[2]
+    describe = ["git", "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]  # no repository around it
+    try:
+        return subprocess.run(describe, cwd=home, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
-    Args:
-        config: What to train.
-        path: Its folder; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
-        init_from: An earlier run whose networks this one starts with.
+
+def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tuple[Trainer, RunFolder]:
+    """Begin a run, in ``path`` or in ``runs/ENV-METHOD-sSEED-TIME``, with the networks of ``init_from`` if it is given.
 
     Raises:
-        RunError: If the folder exists, or ``init_from`` does not fit.
+        RunError: If the folder exists, or the networks do not fit.
     """
     device = resolve_device(config.device)
     found = {"threads": config.threads or cores(), "device": "cuda" if device.type == "cuda" else "cpu"}
@@ -81,8 +78,7 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
     trainer = build(config, device)
     if init_from is not None:
         _load_weights(trainer, RunFolder.open(init_from))
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    folder = RunFolder.create(path or Path("runs") / f"{kind(config.env)}-{config.label}-s{config.seed}-{stamp}")
+    folder = RunFolder.create(path) if path else _new_folder(config)
     try:
         folder.write_json("config.json", {
             "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
@@ -93,6 +89,20 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
         shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
         raise
     return trainer, folder
+
+
+def _new_folder(config: TrainConfig) -> RunFolder:
+    """A folder named after the run; the second of the same second ends in -2."""
+    name = f"{kind(config.env)}-{config.label}-s{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    path, number = Path("runs") / name, 1
+    while True:
+        try:
+            return RunFolder.create(path)
+        except RunError:
+            if not path.exists():  # it is not the name
+                raise
+        number += 1
+        path = path.with_name(f"{name}-{number}")
 
 
 def build(config: TrainConfig, device: torch.device) -> Trainer:
@@ -136,25 +146,16 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
             raise ValueError(f"it observes {layout}, this one {trainer.env.layout}")
         trainer.ppo.load_weights(state["ppo"])
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise RunError(f"The networks of {origin.path} do not fit this run: {reason}") from error
+        raise RunError(f"The networks of {origin.path} do not fit this run: {one_line(error)}") from error
 
 
 def load_checkpoint(folder: RunFolder) -> dict:
-    """What a run's checkpoint holds, of this version or of the one before.
-
-    Raises:
-        RunError: If there is none, or it is broken or foreign.
-    """
+    """What a run's checkpoint holds, of this version or of the one before; ``RunError`` as ``load_tensors`` has it."""
     return load_tensors(folder.path / "checkpoint.pt", "checkpoint", CHECKPOINT_SCHEMA, oldest=1)
 
 
 def load(folder: RunFolder, config: TrainConfig) -> Trainer:
     """Rebuild a run as it was at its last checkpoint; writes nothing.
-
-    Args:
-        folder: Its folder.
-        config: Its configuration.
 
     Raises:
         RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
@@ -172,12 +173,7 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
 
 
 def resume(path: Path, env_steps: int | None = None, device: str | None = None) -> tuple[Trainer, RunFolder]:
-    """Resume a run from its last checkpoint.
-
-    Args:
-        path: Its folder.
-        env_steps: A larger budget; ``None`` for the one that it had.
-        device: Where to resume; ``None`` for where it was.
+    """Resume a run from its last checkpoint, with a larger budget ``env_steps`` or on another device if they are given.
 
     Raises:
         RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.
@@ -227,21 +223,13 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
 
 
 def train(
-    trainer: Trainer,
-    folder: RunFolder,
-    report: Callable[[dict[str, float], float], None] = lambda row, fps: None,
+    trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None] = lambda row, fps: None,
     stopped: Callable[[], bool] = lambda: False,
-) -> bool:
-    """Run all iterations that are left.
+) -> bool:  # fmt: skip
+    """Run all iterations that are left, and return whether the budget was used up.
 
-    Args:
-        trainer: New or resumed.
-        folder: Where its files go.
-        report: Called after every iteration with its row and the frames per second.
-        stopped: Asked after every iteration; true ends the run early, with a checkpoint.
-
-    Returns:
-        Whether the budget was used up.
+    After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true
+    ends the run early, with a checkpoint.
 
     Raises:
         SimulationError: If a number is not finite; the last checkpoint is intact.

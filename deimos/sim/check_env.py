@@ -12,6 +12,8 @@ from deimos.sim.env import Env, EnvConfig, Step
 WORLDS = 6
 LONGEST_PERIOD = 6  # T of the copies: long enough to see that a goal is not due before
 STEPS = 20  # through three goals
+UNTIL_CRASH = 200  # steps with one action, by which most worlds have come to an end of theirs
+PENALTY = 2.0  # in multiples of the largest reward
 COUNTS = ("episode_count", "goal_count")
 FLAGS = ("terminated", "truncated", "goal_due", "invalid")
 
@@ -24,8 +26,9 @@ Claims = Iterator[tuple[bool | Tensor, str]]
 def check_env(env: Env) -> None:
     """Raise ``ValueError`` if an environment breaks the contract of ``deimos.sim.env``; name what it forgot.
 
-    It builds small copies of the environment from its configuration, with a shorter goal period and no penalty for
-    crashes; ``env`` itself is left alone. Actions are random, so what only rare states would show is not found.
+    It builds small copies of the environment from its configuration, with a shorter goal period and, but for one check,
+    no penalty for crashes; ``env`` itself is left alone. Actions are random, so what only rare states would show is not
+    found, and what a crash costs only where random actions that go on for 200 steps crash a world.
 
     Args:
         env: The environment, as ``Config.build`` gave it.
@@ -39,7 +42,7 @@ def check_env(env: Env) -> None:
 
     for check in (
         _check_layout, _check_views, _check_start, _check_draws, _check_candidates, _check_step, _check_clocks,
-        _check_reset, _check_set_goals, _check_repeats, _check_clones, _check_resume, _check_faults,
+        _check_reset, _check_set_goals, _check_repeats, _check_clones, _check_resume, _check_penalty, _check_faults,
     ):  # fmt: skip
         for holds, message in check(build(), build):
             if not torch.as_tensor(holds).all():
@@ -117,6 +120,7 @@ def _check_layout(env: Env, build: Build) -> Claims:
     for group in env.goal_groups:
         covered[group] += 1
     yield covered == 1, "goal_groups must name every component of a goal once."
+    yield len(env.goal_group_names) == len(env.goal_groups), "goal_group_names must name every group once."
     yield len(env.strata()) in (0, WORLDS), "strata must name every world's kind, or be empty."
 
 
@@ -292,6 +296,25 @@ def _check_resume(env: Env, build: Build) -> Claims:
     message = "a resume must be exact, but {name} differs: tensors must hold everything that a step reads."
     for action in actions[STEPS // 2 :]:
         yield from _are_equal(_advance(resumed, action), _advance(env, action), message)
+
+
+def _check_penalty(env: Env, build: Build) -> Claims:
+    """A crash costs its penalty on its step, after every clipping, and nothing else changes."""
+    config = replace(env.config, crash_penalty=PENALTY)
+    punished, cost = build(config=config), PENALTY * config.largest_reward
+    yield punished.crash_penalty == cost, "crash_penalty must be the configuration's times its largest_reward."
+    action = _actions(env, 1)[0].sign() * min(env.action_bound, 1.0)
+    for _ in range(UNTIL_CRASH):
+        plain, step = _results(env.step(action)), _results(punished.step(action))
+        charged = plain.pop("reward") - step.pop("reward")
+        right = torch.isclose(charged, cost * plain["terminated"], rtol=1e-4, atol=1e-5)
+        yield (
+            right,
+            "the step of a crash, and no other, must cost crash_penalty, taken off after the reward is clipped.",
+        )
+        yield from _are_equal(step, plain, "crash_penalty must change the reward alone, but {name} differs.")
+        if plain["terminated"].any():
+            break
 
 
 def _check_faults(env: Env, build: Build) -> Claims:

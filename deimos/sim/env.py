@@ -12,6 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Self, final
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +21,6 @@ from deimos.nn.layout import ObsField, goal_slice
 
 if TYPE_CHECKING:
     import mujoco
-    import numpy as np
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,18 @@ class Step:
     tracking: Tensor | None = None
     """How well each group of goal components is met, in [0, 1], float32, shape (num_envs, len(goal_groups));
     ``None`` where there is one group and the reward itself says it."""
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """What is to be seen of a world that is a point in a box. Lengths are in the world's own unit."""
+
+    half_side: float
+    """Half side of the box, around the origin, whose walls the point must not cross."""
+    position: np.ndarray
+    """Where the point is, shape (3,)."""
+    target: np.ndarray
+    """Where its goal is, or where the goal would lead it from here by the time that it ends; shape (3,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +140,8 @@ class Env(abc.ABC):
     """Whether the run continues where a world becomes invalid; else ``check`` stops it."""
     goal_groups: tuple[slice, ...] = (slice(None),)
     """Components of a goal that are met or missed together."""
+    goal_group_names: tuple[str, ...] = ("goal",)
+    """What each of them is called."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
     """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
     shape (num_envs,). Empty where ``Step.tracking`` says enough."""
@@ -195,10 +209,14 @@ class Env(abc.ABC):
         """
 
     def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData] | None":
-        """One world as MuJoCo's model and data, for rendering; ``None`` where there is nothing to see."""
+        """One world as MuJoCo's model and data, for rendering; ``None`` where MuJoCo cannot show it."""
         return None
 
-    def goal_point(self, world: int) -> "np.ndarray | None":
+    def sketch(self, world: int) -> Sketch | None:
+        """One world as a drawing, for rendering where there is no ``scene``; ``None`` where it is no point in a box."""
+        return None
+
+    def goal_point(self, world: int) -> np.ndarray | None:
         """Where the goal of one world is in its ``scene`` [m], shape (3,); ``None`` where a goal is no place."""
         return None
 

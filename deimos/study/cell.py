@@ -9,14 +9,12 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
-import torch
-
-from deimos.checks import RunError, SimulationError
-from deimos.learn.policy import load_policy
+from deimos.checks import RunError, SimulationError, one_line
 from deimos.run import training
-from deimos.run.evaluation import evaluate, weights_hash
+from deimos.run.evaluation import evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.sim.shared import one_stream
 from deimos.study.folder import StudyFolder
@@ -42,6 +40,11 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
         RunError: If another process works on it, a file cannot be read or written, or the run cannot begin.
         SimulationError: If a number is not finite.
     """
+
+    def watch(stage: str, share: float) -> None:
+        if stopped():
+            raise _Interrupted
+
     home = study.cell_path(cell)
     with hold(home / "lock", f"Cell {cell.name}", patience=PATIENCE_SECONDS):
         path = home / "run"
@@ -54,33 +57,13 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
                 trainer, folder = training.start(cell.config, path, None)
             if not training.train(trainer, folder, stopped=stopped) or stopped():
                 return False
+            tasks = [cell.config.env.with_goal_period(period) for period in cell.goal_periods]
             try:
-                rows = _evaluated(folder, cell, device, stopped)
+                rows = [evaluate_run(folder, task, cell.config.eval, device, watch, again=False) for task in tasks]
             except _Interrupted:
                 return False
-        RunFolder(home).write_json("result.json", result(cell, folder, rows))
+        RunFolder(home).write_json("result.json", result(cell, folder, chain.from_iterable(rows)))
         return True
-
-
-def _evaluated(run: RunFolder, cell: Cell, device: torch.device, stopped: Callable[[], bool]) -> list[dict]:
-    """The rows of all evaluations of a cell; those that the run folder has are not made again."""
-
-    def check(stage: str, share: float) -> None:
-        if stopped():
-            raise _Interrupted
-
-    policy = load_policy(run.path, str(device))
-    weights = weights_hash(policy.actor)
-    config = cell.config.eval
-    rows = run.read_json("evaluation.json") if (run.path / "evaluation.json").exists() else []
-    for period in cell.goal_periods:
-        key = {"goal_period": period, "seed": config.seed, "worlds": config.worlds, "steps": config.steps}
-        if any(row["goals"] == "adversary" and row.items() >= (key | {"weights": weights}).items() for row in rows):
-            continue
-        fresh = evaluate(policy.scaled, cell.config.env.with_goal_period(period), config, device, check)
-        rows = [*rows, *[row | {"weights": weights} for row in fresh]]
-        run.write_json("evaluation.json", rows)
-    return [row for row in rows if row["weights"] == weights]
 
 
 def main(arguments: list[str], stopped: Callable[[], bool] = lambda: False) -> int:
@@ -89,7 +72,7 @@ def main(arguments: list[str], stopped: Callable[[], bool] = lambda: False) -> i
     try:
         return 0 if run(study, study.cell(name), stopped) else STOPPED
     except (RunError, SimulationError) as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
+        print(one_line(error), file=sys.stderr)
         return 2
 
 

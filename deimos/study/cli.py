@@ -1,11 +1,9 @@
 """The commands of ``deimos study``: the options of each, and ``run``, which does what it is for."""
 
-import contextlib
 import math
-import re
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -65,8 +63,16 @@ class RunOptions(_FolderOptions):
         if given and self.file is None:
             raise ValueError(f"{', '.join(given)} change a file; give one too.")
 
-    def run(self, stopped: Callable[[], bool] = lambda: False) -> None:
+    def run(
+        self,
+        stopped: Callable[[], bool] = lambda: False,
+        report: Callable[[str, float], None] = lambda said, share: None,
+    ) -> None:
         """Work on a study until it is finished.
+
+        Args:
+            stopped: Asked now and then; true lets the running cells end.
+            report: Told a few times per second where the study stands, and the share of its cells that are done.
 
         Raises:
             RunError: If the study is not well described or another process works on it, or if a cell has failed; the
@@ -83,8 +89,9 @@ class RunOptions(_FolderOptions):
             raise RunError(f"{study.path} holds no study; begin one with --file.")
         if self.retry_failed:
             study.forget_failures()
-        with _live() as report:
-            end = Runner(study, LocalProcesses(study), self.workers).run(report, stopped)
+        end = Runner(study, LocalProcesses(study), self.workers).run(
+            lambda progress: report(_summary(progress), _share(progress)), stopped
+        )
         if end.finished + len(end.failed) < end.total:
             print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
                   f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
@@ -100,24 +107,9 @@ class RunOptions(_FolderOptions):
     def _described(self, file: Path) -> list[plan.Cell]:
         train = {name: getattr(self, name) for name in ("num_envs", "env_steps", "device", "threads")}
         return plan.expand(
-            plan.read(file), seeds=None if self.seeds is None else parse_seeds(self.seeds), methods=self.methods,
-            environments=self.environments, train={name: x for name, x in train.items() if x is not None},
+            plan.read(file), seeds=self.seeds, methods=self.methods, environments=self.environments,
+            train={name: x for name, x in train.items() if x is not None},
         )  # fmt: skip
-
-
-def parse_seeds(text: str) -> list[int]:
-    """Seeds of ``10`` (the first ten), ``10-19`` or ``0,3,5``; raises ``RunError`` for anything else."""
-    if re.fullmatch(r"[1-9]\d*", text):
-        return list(range(int(text)))
-    seeds: list[int] = []
-    for part in text.split(","):
-        found = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
-        span = range(int(found[1]), int(found[2] or found[1]) + 1) if found else ()
-        if not span:
-            example = "a number of seeds, a range that rises like 10-19 or a list like 0,3,5"
-            raise RunError(f"seeds must be {example}, got '{text}'.")
-        seeds += span
-    return seeds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,26 +193,13 @@ class ReportOptions:
 COMMANDS: dict[str, Any] = {
     "run": RunOptions, "show": ShowOptions, "merge": MergeOptions, "export": ExportOptions, "report": ReportOptions,
 }  # fmt: skip
-"""The options of every command, whose ``run`` does it; that of ``RunOptions`` takes what says when to stop."""
+"""The options of every command, whose ``run`` does it; that of ``RunOptions`` takes what says when to stop
+and what shows progress."""
 
 
-@contextlib.contextmanager
-def _live() -> Iterator[Callable[[Progress], None]]:
-    """Show a study's progress: a line that changes on a terminal, a line for every cell that has ended elsewhere."""
-    console = Console(stderr=True)
-    if console.is_terminal:
-        with console.status("") as status:
-            yield lambda progress: status.update(_summary(progress))
-        return
-    said: list[int] = []
-
-    def lines(progress: Progress) -> None:
-        ended = progress.finished + len(progress.failed)
-        if ended not in said:
-            said.append(ended)
-            console.print(_summary(progress), highlight=False, soft_wrap=True, markup=False)
-
-    yield lines
+def _share(progress: Progress) -> float:
+    done = progress.finished + len(progress.failed) + sum(min(share, 1.0) for share in progress.running.values())
+    return min(1.0, done / progress.total)
 
 
 def _summary(progress: Progress) -> str:

@@ -134,7 +134,8 @@ class Data:
         rows = [row for (place, _), seeds in self._samples.items() if place == where for row in seeds.values()]
         groups = max((len(row["tracking"]) for row in rows), default=0)
         errors = sorted({name for row in rows for name in row["errors"]})
-        tracking = {f"tracking:{i}": f"tracking of goal group {i}" for i in range(groups)}
+        names = next((row["goal_groups"] for row in rows if len(row["goal_groups"]) == groups), None)
+        tracking = {f"tracking:{i}": f"tracking of {names[i] if names else f'goal group {i}'}" for i in range(groups)}
         return tracking | {f"errors:{name}": f"{name}, median over goals" for name in errors}
 
     def curves(self, environment: str, method: str, column: str = "crashes_per_1000") -> list[Array]:

@@ -49,7 +49,8 @@ class LocalProcesses:
             process = subprocess.Popen(
                 [sys.executable, "-m", "deimos.study.cell", str(self._study.path), cell.name],
                 stdin=subprocess.PIPE, stdout=log, stderr=log, bufsize=0,
-                env=os.environ | {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads},
+                env={"OMP_WAIT_POLICY": "passive"}  # threads that wait sleep: other cells use the cores too
+                | os.environ | {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads},
                 start_new_session=True,  # Ctrl-C reaches the runner alone, which passes it on once
             )  # fmt: skip
             self._running[process] = process.stdin

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from scipy.stats import sem
 
 from deimos.study import stats
 from deimos.study.data import Data, Style, Where
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CAVEAT = "Curves of different methods are not comparable: each crashes under its own goals."
+BOXES = "every point is a policy; boxes are quartiles, whiskers 1.5 times their range. Weak adversaries are left out."
+PROFILES = "share of the policies that crash more often than x, with pointwise 95 % bands."
 DPI = 130
 WINDOW = 0.05  # of the training, for the rolling mean
 GOALS = ("naive", "adversary")
@@ -29,23 +32,12 @@ Figures = dict[str, tuple[str, "Figure | None"]]
 
 def of_environment(data: Data, environment: str) -> Figures:
     """The figures of one environment."""
-    figures: Figures = {}
-    if any(data.curves(environment, name) for name in data.methods(environment)):
-        figures[f"training-{environment}"] = (
-            f"Training in {environment}: rolling means, mean over seeds with standard error. {CAVEAT}",
-            training(data, environment),
-        )
+    text = f"Training in {environment}: rolling means, mean over seeds with standard error. {CAVEAT}"
+    figures: Figures = {f"training-{environment}": (text, training(data, environment))}
     for period in data.periods(environment):
         place, ending = f"{environment}, T = {period}", f"{environment}-T{period}"
-        figures[f"evaluation-{ending}"] = (
-            f"{place}: every point is a policy; boxes are quartiles, whiskers 1.5 times their range. Weak adversaries "
-            "are left out.",
-            boxes(data, environment, period),
-        )
-        figures[f"profile-{ending}"] = (
-            f"{place}: share of the policies that crash more often than x, with pointwise 95 % bands.",
-            profiles(data, environment, period),
-        )
+        figures[f"evaluation-{ending}"] = (f"{place}: {BOXES}", boxes(data, environment, period))
+        figures[f"profile-{ending}"] = (f"{place}: {PROFILES}", profiles(data, environment, period))
     return figures
 
 
@@ -116,22 +108,23 @@ def logarithmic(axes: "Axes") -> None:
     axes.set_ylim(bottom=-1)
 
 
-def training(data: Data, environment: str) -> "Figure":
+def training(data: Data, environment: str) -> "Figure | None":
     """Crashes and rewards during training, a column for each panel of methods."""
     found = [name for name in data.methods(environment) if data.curves(environment, name)]
+    if not found:
+        return None
     figure, axes = _panels(data.style, sharey="row")
     for top, bottom, title in zip(*axes, data.style.panels, strict=True):
         own = [name for name in found if data.style.panel(name) == title]
         names = [name for name in found if name == data.style.everywhere and name not in own] + own
+        for panel, column in ((top, "crashes_per_1000"), (bottom, "reward")):
+            panel.grid(alpha=0.3)
+            for name in names:
+                _curve(panel, data, environment, name, column)
         top.set_title(title)
-        for name in names:
-            _curve(top, data, environment, name, "crashes_per_1000")
-            _curve(bottom, data, environment, name, "reward")
         bottom.set_xlabel("parallel steps")
         if names:
             top.legend(frameon=False, ncols=2, fontsize=9)
-        top.grid(alpha=0.3)
-        bottom.grid(alpha=0.3)
         top.set_yscale("symlog", linthresh=0.1)
         top.set_ylim(bottom=0)
     axes[0, 0].set_ylabel("crashes per 1000 transitions")
@@ -175,15 +168,14 @@ def _curve(axes: "Axes", data: Data, environment: str, name: str, column: str) -
     length = min(map(len, curves))
     window = max(1, round(WINDOW * length))
     smooth = np.stack([_rolling(curve[:length], window) for curve in curves])
-    mean, band = smooth.mean(axis=0), None
-    if len(curves) > 1:
-        error = smooth.std(axis=0, ddof=1) / np.sqrt(len(curves))
-        band = mean - error, mean + error
+    mean = smooth.mean(axis=0)
+    error = sem(smooth) if len(curves) > 1 else 0.0
+    band = mean - error, mean + error
     _line(axes, data.style, name, steps[0][:length], mean, band, every=max(1, length // 8), alpha=0.18)
 
 
 def _line(
-    axes: "Axes", style: Style, name: str, x: Array, y: Array, band: Sequence[Array] | None,
+    axes: "Axes", style: Style, name: str, x: Array, y: Array, band: Sequence[Array],
     *, every: int, alpha: float, step: Literal["post"] | None = None,
 ) -> None:  # fmt: skip
     """A method's line with its band of that opacity, and a marker at ``every`` so many points."""
@@ -191,17 +183,13 @@ def _line(
         x, y, drawstyle=step and f"steps-{step}", color=style.colours[name], linewidth=1.6, label=name,
         marker=style.marker(name), markersize=4.5, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
     )  # fmt: skip
-    if band is not None:
-        low, high = band
-        axes.fill_between(x, low, high, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
+    low, high = band
+    axes.fill_between(x, low, high, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
 
 
 def _rolling(x: Array, window: int) -> Array:
     """Mean of the last ``window`` values; of fewer at the start."""
-    total = np.concatenate([[0.0], np.cumsum(x)])
-    end = np.arange(1, len(x) + 1)
-    begin = np.maximum(0, end - window)
-    return (total[end] - total[begin]) / (end - begin)
+    return np.convolve(x, np.ones(window))[: len(x)] / np.minimum(np.arange(1, len(x) + 1), window)
 
 
 def _is_dark(code: str) -> bool:

@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import re
 import tomllib
 import typing
 from collections.abc import Sequence
@@ -11,11 +12,12 @@ from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets
 from deimos.run.config import from_dict, to_dict
+from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
 
@@ -87,19 +89,19 @@ def _digest(**data: Any) -> str:
 
 def read_cell(path: Path) -> Cell:
     """Read a ``cell.json``; raises ``RunError`` if it is broken or of another version."""
+    data = RunFolder(path.parent).read_json(path.name)
     try:
-        data = json.loads(path.read_text())
         if (found := data.pop("schema")) != SCHEMA:
             raise ValueError(f"its schema is {found}, not {SCHEMA}")
         return from_dict(Cell, data)
-    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
 
 
 def read(path: Path) -> dict:
     """Read the description of a study from a TOML file.
 
-    Its keys: ``seeds`` (a number of seeds, or a list of them), ``methods`` (names), ``train`` (fields of
+    Its keys: ``seeds`` (see ``parse_seeds``), ``methods`` (names), ``train`` (fields of
     ``TrainConfig`` for all cells), and an ``[[environment]]`` for each environment or variant, with ``name``,
     ``env`` (its ``kind`` and fields) and, if they differ there, ``methods``, ``train`` and ``goal_periods``; its
     ``preset`` is one of ``deimos.run.presets``, where its environment and settings come from that are not said.
@@ -117,19 +119,15 @@ def read(path: Path) -> dict:
 
 
 def expand(
-    description: dict,
-    *,
-    seeds: Sequence[int] | None = None,
-    methods: Sequence[str] | None = None,
-    environments: Sequence[str] | None = None,
-    train: dict | None = None,
-) -> list[Cell]:
+    description: dict, *, seeds: list[int] | str | None = None, methods: Sequence[str] | None = None,
+    environments: Sequence[str] | None = None, train: dict | None = None,
+) -> list[Cell]:  # fmt: skip
     """All cells of a study, seed by seed, so that a study cut short has the same seeds of every method.
 
     Args:
         description: See ``read``.
-        seeds: In place of its own.
-        methods: In place of its own, in every environment.
+        seeds: See ``parse_seeds``; in place of its own, as ``methods`` are, in every environment.
+        methods: Names.
         environments: Names of those to take; ``None`` for all.
         train: Fields of ``TrainConfig`` that come before its own.
 
@@ -145,7 +143,7 @@ def expand(
     if unknown := [name for name in environments or () if name not in names]:
         raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}.")
     wanted = names if environments is None else environments
-    numbers = _seeds(description.get("seeds", 10) if seeds is None else list(seeds))
+    numbers = parse_seeds(description.get("seeds", 10) if seeds is None else seeds)
     try:
         grid = [
             cell for name, table in zip(names, tables, strict=True) if name in wanted
@@ -153,7 +151,7 @@ def expand(
         ]  # fmt: skip
         return [replace(cell, config=replace(cell.config, seed=seed)) for seed in numbers for cell in grid]
     except (AttributeError, TypeError, ValueError) as error:  # what from_dict and the configurations raise
-        raise RunError(" ".join(str(error).split())) from error
+        raise RunError(one_line(error)) from error
 
 
 def _environment(table: dict, study: dict, methods: Sequence[str] | None, train: dict) -> list[Cell]:
@@ -194,13 +192,24 @@ def _training_preset(table: dict) -> dict:
     return {key: value for key, value in fields.items() if key == "env" or key not in _GRID | {"threads", "device"}}
 
 
-def _seeds(given: Any) -> list[int]:
-    if type(given) is int and given >= 1:
-        return list(range(given))
-    if not isinstance(given, list) or not given or not all(type(seed) is int for seed in given):
-        raise RunError(f"seeds must be a number of seeds or a list of them, got {given!r}.")
-    _check_unique("seed", given)
-    return given
+def parse_seeds(given: Any) -> list[int]:
+    """Seeds of a number of them (10, or the text "10"), a range ("10-19") or a list ("0,3,5", or one of numbers).
+
+    Raises ``RunError`` for anything else, and if a seed is there twice.
+    """
+    spans = []
+    if type(given) is int or re.fullmatch(r"[1-9]\d*", str(given)):
+        spans = [range(int(given))]
+    elif isinstance(given, str | list):
+        for part in given.split(",") if isinstance(given, str) else map(str, given):
+            found = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
+            spans.append(range(int(found[1]), int(found[2] or found[1]) + 1) if found else range(0))
+    if not spans or not all(spans):
+        example = "a number of seeds, a range that rises like 10-19 or a list like 0,3,5"
+        raise RunError(f"seeds must be {example}, got {given!r}.")
+    seeds = [seed for span in spans for seed in span]
+    _check_unique("seed", seeds)
+    return seeds
 
 
 def _check_unique(what: str, values: Sequence[Any]) -> None:

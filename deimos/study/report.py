@@ -27,7 +27,7 @@ COVERAGE = (  # python -m reproduction coverage, its defaults
     "The intervals of IQMs and medians are percentile bootstraps: they cover 93 to 94 % at n = 10, on normal and on "
     "lognormal data. Means have bootstrap-t intervals (94 % and 91 %); the percentile bootstrap would cover 90 % and "
     "81 %, BCa 90 % and 83 %. Intervals of ratios of spread cover more than 99 %: they are too wide, they only "
-    "describe, and no difference is called on them. `python -m reproduction coverage` measures all of this again."
+    "describe, and no difference is called on them."
 )
 _median = partial(np.median, axis=-1)
 
@@ -72,8 +72,7 @@ def what_was_run(data: Data) -> list[Block]:
     """Environments, methods, seeds, sizes, weak adversaries and versions."""
     rows = []
     for environment in data.environments:
-        own = [row for row in data.rows if row["environment"] == environment]
-        methods = data.methods(environment)
+        methods, own = data.methods(environment), [row for row in data.rows if row["environment"] == environment]
         counts = Counter(len({row["seed"] for row in own if row["method"] == name}) for name in methods)
         rows.append({
             "environment": environment, "methods": ", ".join(methods),

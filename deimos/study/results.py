@@ -33,7 +33,8 @@ RESULT_COLUMNS = _CELL | {
     "goals": str, "goal_period": int, "eval_seed": int, "worlds": int, "steps": int,
     # What came out.
     "reward": float, "score": float, "return_per_step": float, "crashes": int, "crashes_per_1000": float,
-    "interactions": int, "interaction_crashes": int, "crash_rate": float, "tracking": tuple, "errors": dict,
+    "interactions": int, "interaction_crashes": int, "crash_rate": float, "tracking": tuple, "goal_groups": list,
+    "errors": dict,
     "first_goal_steps": int, "first_goal_crashes": int,
     "adversary_steps": int, "adversary_interactions": int, "adversary_crashes": int, "adversary_auroc": float,
     "weak_adversary": bool,
@@ -46,6 +47,8 @@ CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS), tuple)
 TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 FORMER_NAMES = {"selected_share": "selected_fraction"}
 """Columns of version 0.1.0 that have another name today."""
+LATER_COLUMNS = {"goal_groups"}
+"""Columns that its tables lack."""
 
 
 @dataclass
@@ -205,7 +208,7 @@ def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
         raise RunError(f"{path} cannot be read ({error}).") from error
     lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())  # version 0.1.0 may have left half a line
     names = [FORMER_NAMES.get(name, name) for name in next(lines, columns)]
-    missing, unknown = ([n for n in a if n not in b] for a, b in ((columns, names), (names, columns)))
+    missing, unknown = [n for n in columns if n not in {*names, *LATER_COLUMNS}], [n for n in names if n not in columns]
     if missing or unknown:
         lists = f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}"
         raise RunError(f"{path} is a table of another schema; {lists}.")
@@ -236,9 +239,9 @@ def _value(kind: type, given: Any) -> Any:
     """The value of a column, from the text in a table or from JSON; what is missing is NaN where numbers stand."""
     if kind is tuple:
         return tuple(map(float, given.split() if isinstance(given, str) else given or ()))
-    if kind is dict:
-        found = json.loads(given or "{}") if isinstance(given, str) else given or {}
-        return {name: math.nan if value is None else value for name, value in found.items()}
+    if kind in (dict, list):
+        found: Any = json.loads(given) if given and isinstance(given, str) else given or kind()
+        return found if kind is list else {name: math.nan if value is None else value for name, value in found.items()}
     if given is None or given == "":
         return math.nan if kind in (int, float) else None
     if kind is bool and str(given) not in ("True", "False"):
@@ -250,8 +253,8 @@ def _text(value: Any) -> str:
     """A cell of a table."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
-    if isinstance(value, tuple | list):
+    if isinstance(value, tuple):
         return " ".join(f"{part:.5g}" for part in value)
-    if isinstance(value, dict):
+    if isinstance(value, dict | list):
         return json.dumps(value) if value else ""
     return str(value)

@@ -7,6 +7,7 @@ interval is two-sided, at ``LEVEL``; every bootstrap draws ``resamples`` (``None
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,9 +52,8 @@ def iqm(x: Array) -> Array:
     return stats.trim_mean(x, 0.25, axis=-1)
 
 
-def iqr(x: Array) -> Array:
-    """Range between the quartiles along the last axis, by linear interpolation of the order statistics."""
-    return stats.iqr(x, axis=-1)
+iqr: Statistic = partial(stats.iqr, axis=-1)
+"""Range between the quartiles along the last axis, by linear interpolation of the order statistics."""
 
 
 def cvar(x: Array, share: float = 0.2) -> Array:

@@ -12,7 +12,7 @@ from torch import Tensor
 from deimos.checks import check_at_least, check_choice, check_positive, check_range
 from deimos.kernels.particle import BROKEN, PARTICLES, ParticleParams, reset_particles, step_particles
 from deimos.kernels.particle_rewards import RewardName, RewardShape
-from deimos.sim.env import EnvConfig, ObsField
+from deimos.sim.env import EnvConfig, ObsField, Sketch
 from deimos.sim.warp_env import WarpEnv
 
 LARGEST = 1e6  # [u] or [u/step]; beyond, float32 positions no longer tell one step from the next
@@ -132,6 +132,13 @@ class Particle(WarpEnv):
             step=step_particles(self.worlds, state, params).launch,
             reset=reset_particles(self.worlds, state, params).launch,
         )
+
+    def sketch(self, world: int) -> Sketch:
+        """See ``Env.sketch``."""
+        goal, position = (self.tensors[name][world].cpu().numpy().copy() for name in ("goal", "position"))
+        if self.config.has_velocity_goals:
+            goal = position + goal * (self.goal_period - int(self.tensors["goal_clock"][world]))
+        return Sketch(HALF_SIDE, position, goal)
 
     def reference_policy(self, brake: bool = True) -> Callable[[Tensor], Tensor]:
         """A controller that follows goals and brakes in time for the wall.

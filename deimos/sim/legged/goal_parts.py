@@ -43,6 +43,8 @@ class GoalPart:
     """What the policy sees components multiplied by."""
     groups: tuple[int, ...]
     """How many components, one after another, are met or missed together."""
+    group_names: tuple[str, ...]
+    """What each of these groups is called."""
     fields: tuple[ObsField, ...] = ()
     """What the observation has of them, between the last action and the heights."""
     noise: Mapping[str, float] = field(default_factory=dict)
@@ -60,6 +62,7 @@ def velocity_goal(speed: float = 1.0) -> GoalPart:
         units=("m/s", "m/s", "rad/s"),
         scale=(VELOCITY_SCALE, VELOCITY_SCALE, RATE_SCALE),
         groups=(2, 1),
+        group_names=("velocity", "yaw rate"),
     )
 
 
@@ -87,6 +90,7 @@ def end_effector_goal(robot: Robot, weights: ArmWeights) -> GoalPart:
         units=("1",) * 3,
         scale=(1.0,) * 3,
         groups=(3,),
+        group_names=("end effector",),
         fields=(ObsField("end_effector", 3, "1", 1.0),),
         noise={"end_effector": 0.01},  # what that of the joints' angles makes of it
         columns=ARM_TERMS,

@@ -84,6 +84,7 @@ class Locomotion(WarpEnv):
         self.robot, self.parts, self.points = robot, tuple(parts), scan_points()
         ends = accumulate((size for part in parts for size in part.groups), initial=0)
         self.goal_groups = tuple(slice(start, stop) for start, stop in pairwise(ends))
+        self.goal_group_names = tuple(name for part in parts for name in part.group_names)
         self.columns = (*COLUMNS, *(name for part in parts for name in part.columns))
         """What the reward is the sum of: the legs' terms, what clipping adds, and the terms of the goal's parts."""
         super().__init__(

@@ -1,9 +1,11 @@
 """Launches that are recorded once and replayed as one graph."""
 
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 import warp as wp
@@ -37,12 +39,18 @@ class Captured:
 
 @contextmanager
 def _say_what_it_waits_for() -> Iterator[None]:
-    """After some seconds of silence, say that the simulator is being compiled."""
-    message = "Compiling the simulator for this machine, which takes a minute or two, once."
-    timer = threading.Timer(PATIENCE, lambda: print(message, file=sys.stderr, flush=True))
-    timer.daemon = True
-    timer.start()
+    """Say that the simulator is being compiled where that takes some seconds; Warp does it in folders of its cache."""
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(PATIENCE):
+            if any(Path(wp.config.kernel_cache_dir or "").glob(f"*_p{os.getpid()}_t*")):
+                message = "Compiling the simulator for this machine, which takes a minute or two, once."
+                print(message, file=sys.stderr, flush=True)
+                return
+
+    threading.Thread(target=watch, daemon=True).start()
     try:
         yield
     finally:
-        timer.cancel()
+        done.set()

@@ -1,0 +1,102 @@
+"""Worlds that are points in a box, drawn from above and from the side, and the captions of all pictures."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from deimos.sim.env import Env, Sketch
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+INK, PAPER, OUTSIDE = (40, 40, 40), (255, 255, 255), (232, 232, 232)
+BLUE, ORANGE, RED = (0, 114, 178), (230, 159, 0), (200, 30, 30)
+VIEWS = {"from above: x, y": (0, 1), "from the side: x, z": (0, 2)}
+REACH = 1.15  # half sides of the box that are seen
+TRAIL = 150  # pictures that the trail goes back
+FINE = 2  # pixels drawn for every pixel shown, along both axes
+HEADER = 72  # [pixels] above the boxes, for the caption and the legend
+LEGEND = (("particle", BLUE), ("where its goal is or leads", ORANGE), ("ends of episodes", RED))
+
+
+class Drawing:
+    """Draws world 0 of an environment with a ``sketch``, with the trail of its episode and where earlier ones ended.
+
+    Args:
+        env: The environment.
+        width: Width of a picture [pixels].
+        height: Height of a picture [pixels].
+    """
+
+    def __init__(self, env: Env, width: int, height: int) -> None:
+        self._env, self._width, self._height = env, width, height
+        self._side = max(1, min(width // 2, height - HEADER) - 8)
+        self._trail: list[np.ndarray] = []
+        self._ends: list[np.ndarray] = []
+        self._age = 0
+
+    def __call__(self) -> np.ndarray:
+        """The picture of this moment, uint8, shape (height, width, 3)."""
+        from PIL import Image, ImageDraw
+
+        sketch, age = self._env.sketch(0), int(self._env.episode_step[0])
+        assert sketch is not None
+        if age < self._age:  # another episode has begun
+            self._ends.append(self._trail[-1])
+            self._trail.clear()
+        self._age = age
+        self._trail = [*self._trail[-TRAIL:], sketch.position]
+        picture = Image.new("RGB", (self._width, self._height), PAPER)
+        gap = (self._width - 2 * self._side) // 3
+        for place, (name, axes) in enumerate(VIEWS.items()):
+            left = gap + place * (self._side + gap)
+            picture.paste(self._view(sketch, axes, name), (left, HEADER))
+        draw, left = ImageDraw.Draw(picture), gap
+        for text, colour in LEGEND:
+            draw.text((left, HEADER - 20), text, fill=colour, font_size=12)
+            left += round(draw.textlength(text, font_size=12)) + 16
+        return np.asarray(picture)
+
+    def _view(self, sketch: Sketch, axes: tuple[int, int], name: str) -> "Image":
+        """The box seen along one axis."""
+        from PIL import Image, ImageDraw
+
+        size, first, second = FINE * self._side, *axes
+
+        def at(point: np.ndarray) -> tuple[float, float]:
+            x, y = point[first], point[second]
+            half = REACH * sketch.half_side
+            return size / 2 * (1 + x / half), size / 2 * (1 - y / half)
+
+        def around(point: np.ndarray, radius: float) -> tuple[float, float, float, float]:
+            x, y = at(point)
+            return x - FINE * radius, y - FINE * radius, x + FINE * radius, y + FINE * radius
+
+        image = Image.new("RGB", (size, size), OUTSIDE)
+        draw = ImageDraw.Draw(image)
+        corner = np.full(3, sketch.half_side)
+        (left, bottom), (right, top) = at(-corner), at(corner)
+        draw.rectangle((left, top, right, bottom), fill=PAPER, outline=INK, width=FINE)
+        for end in self._ends:
+            x0, y0, x1, y1 = around(end, 4)
+            draw.line((x0, y0, x1, y1), fill=RED, width=2 * FINE)
+            draw.line((x0, y1, x1, y0), fill=RED, width=2 * FINE)
+        draw.line([*at(sketch.position), *at(sketch.target)], fill=ORANGE, width=FINE)
+        draw.ellipse(around(sketch.target, 6), outline=ORANGE, width=2 * FINE)
+        draw.line([at(point) for point in self._trail], fill=BLUE, width=FINE + 1)
+        draw.ellipse(around(sketch.position, 5), fill=BLUE)
+        image = image.reduce(FINE)
+        ImageDraw.Draw(image).text((6, self._side - 18), name, fill=INK, font_size=12)
+        return image
+
+
+def with_caption(picture: np.ndarray, text: str) -> np.ndarray:
+    """A picture with lines of text in its upper left corner."""
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    box = draw.multiline_textbbox((8, 6), text, font_size=14)
+    draw.rectangle((0, 0, box[2] + 8, box[3] + 6), fill=(255, 255, 255))
+    draw.multiline_text((8, 6), text, fill=(20, 20, 20), font_size=14)
+    return np.asarray(image)
