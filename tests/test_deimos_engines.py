@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +14,13 @@ from deimos.terrain.shapes.stairs import Shape as Stairs
 
 import deimos
 from deimos import terrain
+from deimos.app import cli
 from deimos.checks import SimulationError
 from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.config import from_dict, to_dict
-from deimos.run.evaluation import play
+from deimos.run.evaluation import EvalConfig, play
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig
@@ -308,6 +310,32 @@ def test_a_run_from_before_the_choice_goes_on_with_mujoco_warp(tmp_path):
 def test_the_committed_policies_are_of_mujoco_warp():
     """The runs of 0.1.0 in docs/results are read as what they were trained on."""
     assert training.read_config(RunFolder.open(WALKER)).env.engine == "warp"
+
+
+def test_a_run_is_evaluated_on_the_other_engine_too(tmp_path, capsys):
+    """Its rows stand beside those of its own engine, in the folder and in the table; a second time replaces them."""
+    tiny = EvalConfig(worlds=3, steps=12, adversary_steps=8, adversary_patience=1)
+    training.train(*training.start(replace(TINY, eval=tiny), tmp_path / "run", None))
+    run = tmp_path / "run"
+    own = deimos.evaluate(run, device="cpu")
+    assert {row["engine"] for row in own} == {"native"}
+    for _ in range(2):
+        assert cli.main(["evaluate", str(run), "--env.engine", "warp", "--device", "cpu"]) == 0
+        kept = RunFolder.open(run).read_json("evaluation.json")
+        assert [(row["engine"], row["goals"]) for row in kept] == [
+            (engine, goals) for engine in ("native", "warp") for goals in ("naive", "adversary")
+        ]
+    text = capsys.readouterr().out
+    assert "a goal every 4 steps, on warp" in text
+    assert re.search(r"^simulated by +warp +warp +native +native$", text, re.MULTILINE)
+
+
+def test_a_particle_is_evaluated_on_no_engine(tmp_path, capsys):
+    """Whoever asks for one is told that it is for legged robots."""
+    config = replace(TINY, env=particle.Config(goal_period=4))
+    training.train(*training.start(config, tmp_path / "run", None))
+    assert cli.main(["evaluate", str(tmp_path / "run"), "--env.engine", "warp"]) != 0
+    assert "env.engine is for legged robots, got 'warp' for particle." in capsys.readouterr().err
 
 
 def test_a_policy_walks_on_either_engine():
