@@ -13,6 +13,7 @@ from rich.table import Table
 from benchmarks.timing import ratio, wide_console
 from deimos.goals.selectors import uniform
 from deimos.learn.policy import load_policy
+from deimos.nn.matmul import on_threads
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.presets import preset
 from deimos.sim.legged.config import LocomotionConfig
@@ -76,10 +77,12 @@ def measure(device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[s
         native, warp = (Walkers(engine, ground, num_envs, device) for engine in ("native", "warp"))
         work |= {f"native, {ground}": native.step, f"bare native, {ground}": native.bare}
         work |= {f"mujoco-warp, {ground}": warp.step}
-    seconds = _in_turn(work, rounds)
+    threads = torch.get_num_threads()  # the native engine's; torch itself has one while worlds are stepped, as in training
+    with on_threads(1):
+        seconds = _in_turn(work, rounds)
     each = 1e6 / (STEPS * num_envs)
     result: dict[str, Any] = {
-        "num_envs": num_envs, "threads": torch.get_num_threads(),
+        "num_envs": num_envs, "threads": threads,
         "us on the clock": {name: each * statistics.median(wall for wall, _ in t) for name, t in seconds.items()},
         "us of all cores": {name: each * statistics.median(cpu for _, cpu in t) for name, t in seconds.items()},
     }  # fmt: skip
