@@ -77,7 +77,7 @@ def measure(device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[s
         native, warp = (Walkers(engine, ground, num_envs, device) for engine in ("native", "warp"))
         work |= {f"native, {ground}": native.step, f"bare native, {ground}": native.bare}
         work |= {f"mujoco-warp, {ground}": warp.step}
-    threads = torch.get_num_threads()  # the native engine's; torch itself has one while worlds are stepped, as in training
+    threads = torch.get_num_threads()  # the native engine's; while worlds are stepped torch has one, as in training
     with on_threads(1):
         seconds = _in_turn(work, rounds)
     each = 1e6 / (STEPS * num_envs)
