@@ -22,8 +22,8 @@ def build_model(robot: Robot, terrain: Terrain | None, config: PhysicsConfig) ->
     if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
         raise ValueError(
             f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
-            f"finer ones the simulator loses contacts. Build it with --cell, or import it with --resolution, "
-            f"{FINEST_CELL}."
+            f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}, or import it with "
+            f"--resolution {FINEST_CELL}."
         )
     spec = _with_ground(robot.spec, terrain)
     _set_options(spec, config)
