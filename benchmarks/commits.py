@@ -3,7 +3,6 @@
 The two versions share nothing but the command line, so any commit since 0.1.0 can be measured in the same run.
 """
 
-import csv
 import os
 import statistics
 import subprocess
@@ -16,6 +15,7 @@ from rich.table import Table
 
 from benchmarks.timing import wide_console
 from deimos.checks import RunError
+from deimos.run.folder import RunFolder
 
 HOME = Path(__file__).resolve().parent.parent
 WARM = 3  # iterations at the start of a run that are not counted: kernels are compiled and memory is found there
@@ -74,8 +74,7 @@ def _run(home: Path, options: list[str]) -> dict[str, float]:
         after = os.times()
         if done.returncode != 0:
             raise RunError(f"{' '.join(command)} in {home} failed: {done.stderr.strip()}")
-        with (out / "timing.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))[WARM:]
+        rows = RunFolder(out).read_csv("timing.csv")[WARM:]
     return {
         "FPS": statistics.median(float(row["fps"]) for row in rows),
         "env, ms per iteration": 1000 * statistics.median(float(row["env"]) for row in rows),

@@ -5,7 +5,9 @@ A process that runs ``main`` is a command's: its environment and its standard st
 Importing the library leaves both alone; a program that shares its cores sets OMP_WAIT_POLICY=passive itself.
 """
 
+import atexit
 import contextlib
+import gc
 import importlib.util
 import io
 import os
@@ -75,6 +77,7 @@ def _prepare_process() -> None:
     """Set up what torch and matplotlib read when they are loaded, and the standard streams."""
     # Threads that wait sleep: where cores are shared, those that spin cost more than they win. A user's value stays.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    atexit.register(gc.freeze)  # Python would search torch's modules for garbage when it ends, half a second long
     os.environ["MPLBACKEND"] = "agg"  # commands draw into files; the back end of a notebook need not be installed here
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
