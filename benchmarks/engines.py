@@ -13,7 +13,6 @@ from rich.table import Table
 from benchmarks.timing import ratio, wide_console
 from deimos.goals.selectors import uniform
 from deimos.learn.policy import load_policy
-from deimos.nn.matmul import on_threads
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.presets import preset
 from deimos.sim.legged.config import LocomotionConfig
@@ -78,8 +77,9 @@ def measure(device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[s
         work |= {f"native, {ground}": native.step, f"bare native, {ground}": native.bare}
         work |= {f"mujoco-warp, {ground}": warp.step}
     threads = torch.get_num_threads()  # the native engine's; while worlds are stepped torch has one, as in training
-    with on_threads(1):
-        seconds = _in_turn(work, rounds)
+    torch.set_num_threads(1)
+    seconds = _in_turn(work, rounds)
+    torch.set_num_threads(threads)
     each = 1e6 / (STEPS * num_envs)
     result: dict[str, Any] = {
         "num_envs": num_envs, "threads": threads,

@@ -50,8 +50,9 @@ class Engine(Physics):
         if device.type != "cpu":
             raise ValueError(f"engine must be warp on {device}, got native, which is for CPUs.")
         # Warnings are counted per world and explained by this engine; MuJoCo itself would also write them to a file in
-        # the working directory.
-        mujoco.set_mju_user_warning(lambda message: None)
+        # the working directory. Whoever has a handler keeps it.
+        if mujoco.get_mju_user_warning() is None:
+            mujoco.set_mju_user_warning(lambda message: None)
         self.config, self.num_envs, self.device = config, num_envs, device
         self.model, spec = build_model(robot, terrain, config)
         part = _watch_contacts(spec, robot, plane=terrain is None)
