@@ -72,8 +72,10 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
         RunError: If the folder exists, or the networks do not fit.
     """
     device = resolve_device(config.device)
-    found = {"threads": config.threads or cores(), "device": "cuda" if device.type == "cuda" else "cpu"}
-    config = replace(config, env=config.env.resolved(device), **found)
+    config = replace(
+        config, env=config.env.resolved(device), threads=config.threads or cores(),
+        device="cuda" if device.type == "cuda" else "cpu",
+    )  # fmt: skip
     torch.set_num_threads(config.threads)
     trainer = build(config, device)
     if init_from is not None:
