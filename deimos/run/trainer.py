@@ -205,7 +205,7 @@ def _identity(config: TrainConfig) -> dict:
 def _completed(identity: dict) -> dict:
     """The identity that an older version wrote, with the defaults of fields that configurations have got since."""
     kinds = {"env": EnvConfig, "selector": SelectorConfig}
-    return identity | {name: to_dict(from_dict(cls, identity[name])) for name, cls in kinds.items()}
+    return identity | {name: to_dict(from_dict(cls, identity[name], stored=True)) for name, cls in kinds.items()}
 
 
 def _check_obs(obs: Tensor) -> None:
