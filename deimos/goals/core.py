@@ -47,7 +47,7 @@ class GoalCore(Stateful):
             spaces.num_envs, spaces.state_dim, spaces.goal_dim, capacity, window, spaces.device,
             groups=0 if spaces.groups == (slice(None),) else len(spaces.groups),
         )  # fmt: skip
-        self.weight = torch.ones(spaces.num_envs, device=spaces.device)
+        self.weight = torch.ones(spaces.num_envs, dtype=torch.float32, device=spaces.device)
         """1 where the learner may use the transitions under the active goal, else 0, shape (num_envs,)."""
         nobody = torch.zeros(0, dtype=torch.int64, device=spaces.device)
         self._nothing = Changes(nobody, nobody, nobody)
