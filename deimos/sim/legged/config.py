@@ -26,7 +26,7 @@ class LocomotionConfig(EnvConfig):
     """Who walks, a name of ``deimos.sim.legged.robots``."""
     terrain: str = "flat"
     """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a terrain file (.npz)."""
-    engine: Literal["auto", "warp", "native"] = field(default="auto", metadata={"before": "warp"})
+    engine: engines.Name = field(default="auto", metadata={"before": "warp"})
     """What simulates: mujoco-warp, or native, MuJoCo's own C code on all cores of a CPU; auto takes mujoco-warp on CUDA
     and native on a CPU."""
     goal_period: int = 500

@@ -9,7 +9,7 @@ import abc
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from deimos.terrain import Terrain
 if TYPE_CHECKING:
     import mujoco
 
+Name = Literal["auto", "warp", "native"]
 MODULES = {"warp": "mujoco_warp", "native": "native"}
 """The file of every engine, by its name in a configuration."""
 
@@ -128,7 +129,7 @@ class Physics(abc.ABC):
         return data
 
 
-def resolve(engine: str, device: torch.device) -> str:
+def resolve(engine: Name, device: torch.device) -> Name:
     """The engine that ``auto`` stands for on a device; others stand for themselves."""
     if engine != "auto":
         return engine
@@ -136,7 +137,7 @@ def resolve(engine: str, device: torch.device) -> str:
 
 
 def build(
-    engine: str, robot: Robot, terrain: Terrain | None, num_envs: int, device: torch.device, config: PhysicsConfig, *,
+    engine: Name, robot: Robot, terrain: Terrain | None, num_envs: int, device: torch.device, config: PhysicsConfig, *,
     friction: np.ndarray | None = None, payload: np.ndarray | None = None,
 ) -> Physics:  # fmt: skip
     """Make the worlds.
