@@ -48,6 +48,15 @@ def above_percentile(score: Tensor, draw: Tensor, percentile: float) -> Tensor:
     return take(score.topk(kept, dim=1, sorted=False).indices, pick)
 
 
+def percentile(score: Tensor, pick: Tensor) -> Tensor:
+    """Percentile of the picked score among those of its row, in (0, 100), ties counting half, shape (B,).
+
+    Whatever the scores, a uniform pick has 50 on average.
+    """
+    own = take(score, pick).unsqueeze(1)
+    return ((score < own).sum(1) + (score <= own).sum(1)) * (50.0 / score.shape[1])
+
+
 def in_proportion(weight: Tensor, draw: Tensor) -> Tensor:
     """A candidate with a probability in proportion to its weight; any, where all weights of a row are 0.
 

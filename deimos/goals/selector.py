@@ -60,23 +60,26 @@ class Proposal:
     """Shape (B, goal_dim)."""
     score: Tensor
     """What the selector thinks of each, NaN where it has no opinion, shape (B,)."""
-    learn: Tensor | None = None
-    """Whether the learner may use what follows, bool, shape (B,); ``None`` for everywhere."""
+    weight: Tensor | None = None
+    """Weight of what follows in everything learnt, at least 0, shape (B,); ``None`` for 1 everywhere."""
     probe: Tensor | None = None
     """True where the goal was drawn uniformly, whatever its score, bool, shape (B,); ``None`` for nowhere."""
     note: Tensor | None = None
     """A whole number that comes back with the interaction, int64 below 2^24, shape (B,); ``None`` for 0."""
+    percentile: Tensor | None = None
+    """Percentile of the goal's fear among the candidates, in [0, 100], shape (B,); ``None`` where nobody knows."""
 
 
 def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
-    """Any of the candidates, without an opinion.
+    """Any of the candidates, without an opinion. Whatever is feared, its percentile is 50 on average.
 
     Args:
         candidates: Shape (B, N, goal_dim).
         draw: Uniform numbers in [0, 1), shape (B,).
     """
     pick = picks.uniformly(draw, candidates.shape[1])
-    return Proposal(picks.take(candidates, pick), torch.full_like(draw, torch.nan))
+    unknown, middle = torch.full_like(draw, torch.nan), torch.full_like(draw, 50.0)
+    return Proposal(picks.take(candidates, pick), unknown, percentile=middle)
 
 
 class Transitions(Protocol):

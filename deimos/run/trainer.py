@@ -149,7 +149,7 @@ class Trainer:
             self.ppo.check()
             clock.lap("update")
             with on_threads(1):
-                selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
+                selector = self.loop.core.learn(self.rollout)
             self.loop.selector.check()
             clock.lap("selector")
         except SimulationError as error:
