@@ -30,6 +30,8 @@ CPU = torch.device("cpu")
 SPACES = Spaces(num_envs=40, state_dim=9, goal_dim=3, goal_period=5, device=CPU, total_steps=96)
 ALL = {name: method(name) for name in [*plugins.names(selectors), *METHODS]}
 
+WEIGHTLESS = ("uniform", "cl", "grid", "plr", "plr-robust", "penalty", "penalty-10", "penalty-100")
+
 # Settings under which a few worlds of an environment crash often within a few steps; one that is not listed is
 # taken as it is.
 SMALL_ENVS = {"particle": {"goal_period": 4, "max_speed": 200.0, "max_force": 100.0, "time_limit": 40}}
@@ -127,7 +129,12 @@ def test_it_chooses_among_the_candidates(env_name, name):
         proposal = selector.propose(*arguments)
         assert (proposal.goal.unsqueeze(1) == arguments[3]).all(2).any(1).all()
         assert proposal.score.shape == (128,)
-        for optional, dtype in (("weight", torch.float32), ("percentile", torch.float32), ("probe", torch.bool), ("note", torch.int64)):
+        for optional, dtype in (
+            ("weight", torch.float32),
+            ("percentile", torch.float32),
+            ("probe", torch.bool),
+            ("note", torch.int64),
+        ):
             value = getattr(proposal, optional)
             assert value is None or (value.shape == (128,) and value.dtype == dtype)
 
@@ -195,7 +202,7 @@ def test_it_has_begun_to_choose(env_name, name):
     assert all(row.keys() == rows[0].keys() for row in rows)
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if name not in ("uniform", "cl", "grid", "plr", "plr-robust")])
+@pytest.mark.parametrize("name", [name for name in ALL if name not in WEIGHTLESS])
 def test_another_seed_is_another_selector(env_name, name):
     """What draws weights draws others from another seed."""
     first, second = (small(ALL[name]).build(spaces(trained(env_name, name)[0].env, 96), seed) for seed in (0, 1))
@@ -203,7 +210,7 @@ def test_another_seed_is_another_selector(env_name, name):
         assert_same(first.state_dict(), second.state_dict())
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if name not in ("uniform", "cl", "grid", "plr", "plr-robust")])
+@pytest.mark.parametrize("name", [name for name in ALL if name not in WEIGHTLESS])
 def test_a_weight_that_is_not_finite_stops_the_run(env_name, name):
     """Whatever selector has weights finds a NaN among them."""
     selector = small(ALL[name]).build(spaces(trained(env_name, name)[0].env, 96), 0)
@@ -411,7 +418,7 @@ def test_predictions_are_judged_once_and_before_they_are_learnt_from(monkeypatch
         (boltzmann.Config, "beta_start", math.nan, "beta_start must be finite, got nan"),
         (boltzmann.Config, "anneal", 2.0, r"anneal must be in \[0, 1\], got 2.0"),
         (vds.Config, "critics", 0, "critics must be at least 1, got 0"),
-        (vds.Config, "rule", "mean", "rule must be one of proportional, argmax, percentile, got 'mean'"),
+        (vds.Config, "rule", "mean", "rule must be one of proportional, argmax, percentile, uniform, got 'mean'"),
         (vds.Config, "role", "both", "role must be one of replace, auxiliary, got 'both'"),
         (vds.Config, "data", "some", "data must be one of all, share, got 'some'"),
         (vds.Config, "clip", 0.0, "clip must be positive, got 0.0"),

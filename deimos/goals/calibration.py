@@ -15,9 +15,9 @@ BINS = 15
 class Calibration(Stateful):
     """Turns logits of a class-balanced classifier into probabilities.
 
-    Where crashes and survivals weigh 1/2 together each, the odds that a classifier learns are (1 - pi) / pi times those
-    of the world, with pi the share of crashes in it; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What is left is a
-    matter of over- and underconfidence, which one temperature on held-out data corrects [2]_.
+    Where crashes and survivals weigh 1/2 together each, the odds that a classifier learns are (1 - pi) / pi times the
+    true ones, with pi the share of crashes; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What
+    is left is a matter of over- and underconfidence, which one temperature on held-out data corrects [2]_.
 
     Attributes:
         prior: log(pi / (1 - pi)).

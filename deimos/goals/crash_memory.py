@@ -40,7 +40,7 @@ class CrashMemory(Stateful):
         self._issued = torch.zeros(capacity, dtype=torch.int64, device=device)
         self.stored = 0
         """Crashes stored so far, those that have made way included."""
-        self._upto = 0  # step that interactions have been looked at up to
+        self._upto = -1  # step that interactions have been looked at up to
         self.generator = generator(seed, "crash memory", device)
 
     @torch.no_grad()

@@ -15,7 +15,15 @@ from deimos.goals.calibration import Calibration, evaluate
 from deimos.goals.crash_memory import CrashMemory
 from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Interactions, Resolved
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
+from deimos.goals.selector import (
+    GoalSelector,
+    Proposal,
+    SelectorConfig,
+    Spaces,
+    Transitions,
+    uniform_proposal,
+    with_parts,
+)
 from deimos.nn.ranks import mean_over_ranks
 
 LEAST = 32  # crashes and survivals that tell a temperature
@@ -62,6 +70,8 @@ class FearSelector(GoalSelector):
     """Learns fear online and leaves the choice to ``choose``. Until it has seen both classes it is uniform."""
 
     config: FearSelectorConfig
+    inputs_per_row: ClassVar[int] = 1
+    """Inputs of the network in a row of ``rows``."""
     saved: ClassVar[tuple[str, ...]] = (
         "fear", "memory", "calibration", "_learnt_at", "_age", "_auroc", "_issued", "_chosen",
     )  # fmt: skip
@@ -69,15 +79,14 @@ class FearSelector(GoalSelector):
     def __init__(self, config: FearSelectorConfig, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
-        self._period = spaces.goal_period
         self._learnt_at = 0  # step of the last call of learn
         self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
         self.calibration = Calibration()
         self.memory: CrashMemory | None = None
         """Where the crashes are kept that fear is learnt from; ``None`` for the last 2 T steps alone."""
         if config.fear.memory:
-            width = spaces.state_dim + 2 * spaces.goal_dim
-            self.memory = CrashMemory(config.fear.memory, self._period, width, spaces.device, seed)
+            width = self.inputs_per_row * (spaces.state_dim + 2 * spaces.goal_dim)
+            self.memory = CrashMemory(config.fear.memory, spaces.goal_period, width, spaces.device, seed)
         self._age = -1  # rollouts since the last fit, -1 before the first
         self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
         self._issued, self._chosen = 0, 0  # goals since the last call of learn, and those of them that fear chose
@@ -107,7 +116,7 @@ class FearSelector(GoalSelector):
             return uniform_proposal(candidates, draws[:, 0])
         self._chosen += len(rows)
         score = self.score(state, goal, candidates)
-        pick, probe = self.choose(self.ranking(score, candidates, draws), draws[:, 0]), None
+        pick, probe = self.choose(self.ranking(state, goal, candidates, score, draws), draws[:, 0]), None
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
@@ -115,13 +124,10 @@ class FearSelector(GoalSelector):
         forecast = picks.take(score, pick) + self.calibration.prior
         return Proposal(picks.take(candidates, pick), forecast, probe=probe, percentile=picks.percentile(score, pick))
 
-    def ranking(self, score: Tensor, candidates: Tensor, draws: Tensor) -> Tensor:
-        """What ``choose`` goes by, shape (B, N): the scores themselves, unless a control is to go by something else.
+    def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
+        """What ``choose`` goes by, shape (B, N): the logits of fear, ``score``, unless somebody knows better.
 
-        Args:
-            score: Logits of the fear network, shape (B, N).
-            candidates: What they are of, shape (B, N, goal_dim).
-            draws: Those of the decision, shape (B, 4).
+        The other arguments are those of ``propose``.
         """
         return _rolled(score, draws[:, 2]) if self.config.control == "shuffled" else score
 
@@ -155,7 +161,7 @@ class FearSelector(GoalSelector):
         crashes = int(crashed.sum())
         if min(crashes, len(crashed) - crashes) >= LEAST:
             self.calibration.fit(score, crashed)
-        loss = self._fit(window, interactions.now)
+        loss = self._fit(window, interactions)
         if not math.isnan(loss):
             self._age = 0
         elif self.fear.fitted:
@@ -167,14 +173,22 @@ class FearSelector(GoalSelector):
         self.calibration.set_share((total + 0.5) / (resolved + 1.0))  # no crash lately is no certainty
         return row | {"fear/loss": loss, "fear/age": float(self._age) if self.fear.fitted else math.nan}
 
-    def _fit(self, window: Resolved, now: int) -> float:
+    def _fit(self, window: Resolved, interactions: Interactions) -> float:
         """Learn from the memory or, without one, from the window; returns the loss, NaN where nothing was learnt."""
-        inputs = torch.cat([self._seen(window.state), window.goal, window.next_goal], dim=1)
+        rows = self.rows(window, interactions)
         if self.memory is None:
-            return self.fear.fit_rows(inputs, window.crashed, torch.ones_like(window.score))
-        self.memory.store(inputs, window, now)
-        inputs, crashed, weight, _ = self.memory.sample(inputs, window)
-        return self.fear.fit_rows(inputs, crashed, weight)
+            return self.fit(rows, window.crashed, torch.ones_like(window.score))
+        self.memory.store(rows, window, interactions.now)
+        rows, crashed, weight, _ = self.memory.sample(rows, window)
+        return self.fit(rows, crashed, weight)
+
+    def rows(self, window: Resolved, interactions: Interactions) -> Tensor:
+        """What to learn from each interaction of the window, shape (n, inputs_per_row * inputs of the network)."""
+        return torch.cat([self._seen(window.state), window.goal, window.next_goal], dim=1)
+
+    def fit(self, rows: Tensor, crashed: Tensor, weight: Tensor) -> float:
+        """Learn from rows, of the window or remembered; see ``Fear.fit_rows``."""
+        return self.fear.fit_rows(rows, crashed, weight)
 
     def _say_why(self, window: Resolved) -> None:
         """Say once why goals are uniform yet."""
@@ -213,10 +227,7 @@ class FearSelector(GoalSelector):
 
 def fear_selector(selector: GoalSelector) -> FearSelector | None:
     """The selector with a fear network in ``selector``: itself, or the first of its parts that is one."""
-    if isinstance(selector, FearSelector):
-        return selector
-    found = (fear_selector(part) for part in selector.parts)
-    return next((part for part in found if part is not None), None)
+    return next((part for part in with_parts(selector) if isinstance(part, FearSelector)), None)
 
 
 def _rolled(score: Tensor, draw: Tensor) -> Tensor:

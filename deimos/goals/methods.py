@@ -31,9 +31,18 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "plr": ("plr", {}),
     "plr-robust": ("plr", {"robust": True}),
     "grid": ("grid", {}),
+    "fear-novelty": ("novelty", {}),
+    "q-fear": ("q_fear", {}),
+    "weighted": ("weighted", {}),
     # Controls.
     "shuffled": ("director", {"percentile": 75, "control": "shuffled"}),
     "state-blind": ("director", {"percentile": 75, "control": "state-blind"}),
+    "swapped": ("swapped", {}),
+    "uniform-ensemble": ("vds", {"rule": "uniform"}),
+    "vds-argmax": ("vds", {"rule": "argmax"}),
+    "rnd-raw": ("rnd", {"whiten": False}),
+    "penalty-10": ("penalty", {"size": 10.0}),
+    "penalty-100": ("penalty", {"size": 100.0}),
 }
 """Methods with names of their own: the selector, and its options where they are not the defaults."""
 

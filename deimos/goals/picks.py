@@ -29,6 +29,11 @@ def uniformly(draw: Tensor, count: int) -> Tensor:
     return (draw * count).long().clamp(max=count - 1)
 
 
+def kept_above(percentile: float, count: int) -> int:
+    """How many of ``count`` candidates are kept above a percentile in [0, 100]: max(1, N - floor(p N / 100))."""
+    return max(1, count - int(percentile * count / 100))
+
+
 def above_percentile(score: Tensor, draw: Tensor, percentile: float) -> Tensor:
     """Any of the candidates above a percentile of the scores.
 
@@ -41,7 +46,7 @@ def above_percentile(score: Tensor, draw: Tensor, percentile: float) -> Tensor:
         percentile: p, in [0, 100].
     """
     count = score.shape[1]
-    kept = max(1, count - int(percentile * count / 100))
+    kept = kept_above(percentile, count)
     pick = uniformly(draw, kept)
     if kept == count:
         return pick

@@ -1,7 +1,7 @@
 """What every goal selector promises. A selector sees tensors only, never an environment or a learner."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -125,6 +125,8 @@ class GoalSelector(Stateful, abc.ABC):
     """Whether ``learn`` needs the learner's transitions."""
     first_goals_scaled: bool = False
     """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
+    crash_penalty: float = 0.0
+    """What a crash takes from the learner's reward, at least 0, in units of the largest reward of a step."""
 
     def goal_range(self) -> Tensor | None:
         """Share of the goal range to draw candidates from, shape (goal_dim,), in (0, 1]; ``None`` for all of it."""
@@ -167,6 +169,13 @@ class GoalSelector(Stateful, abc.ABC):
         """Raise ``SimulationError`` if a weight is not finite."""
 
 
+def with_parts(selector: GoalSelector) -> Iterator[GoalSelector]:
+    """A selector, and all that it is made of."""
+    yield selector
+    for part in selector.parts:
+        yield from with_parts(part)
+
+
 class Delegate(GoalSelector):
     """Leaves everything to another selector, ``current``, but for what it overrides."""
 
@@ -178,6 +187,7 @@ class Delegate(GoalSelector):
     needs_rollout = property(lambda self: any(part.needs_rollout for part in self.parts))
     num_candidates = property(lambda self: self.current.num_candidates)
     first_goals_scaled = property(lambda self: self.current.first_goals_scaled)
+    crash_penalty = property(lambda self: self.current.crash_penalty)
 
     def goal_range(self) -> Tensor | None:
         """See ``GoalSelector.goal_range``."""

@@ -1,5 +1,6 @@
 """Random network distillation over goals (Burda et al., ICLR 2019, arXiv:1810.12894; a rival in the thesis, 4.3)."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,6 +34,8 @@ class Config(SelectorConfig):
     """Units in the hidden layer of the trained network, at least as many, so that it can become the frozen one."""
     features: int = 16
     """Outputs of both networks, at least 1."""
+    whiten: bool = True
+    """Whether inputs are whitened and clipped, as in the paper, or seen as they are."""
     activation: Activation = "relu"
     """Between the layers."""
     learning_rate: float = 1e-3
@@ -97,7 +100,8 @@ class RND(GoalSelector):
         self._mean, self._scale = torch.zeros(inputs, device=spaces.device), torch.ones(inputs, device=spaces.device)
         self._context = slice(0, inputs - spaces.goal_dim)
         self._goal = slice(inputs - spaces.goal_dim, inputs)
-        whitening = Whitening(self._mean[self._goal], self._scale[self._goal], CLIP)
+        self._clip = CLIP if config.whiten else math.inf
+        whitening = Whitening(self._mean[self._goal], self._scale[self._goal], self._clip)
         self._fused = fused_scores(self._difference, spaces.goal_dim, whitening=whitening)
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
@@ -105,12 +109,16 @@ class RND(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are surprises."""
-        self._uniform[rows] = candidates[:, 0]
+        self.watch(rows, candidates)
         if not self.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         score = self.surprise(state, goal, candidates)
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, 0.0)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
+
+    def watch(self, rows: Tensor, candidates: Tensor) -> None:
+        """Note what uniform goals look like; for the arguments see ``propose``."""
+        self._uniform[rows] = candidates[:, 0]
 
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
@@ -132,7 +140,7 @@ class RND(GoalSelector):
         torch.sub(p_last.bias, t_last.bias, out=last.bias.data)
 
     def _whiten(self, inputs: Tensor, part: slice) -> Tensor:
-        return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-CLIP, CLIP)
+        return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-self._clip, self._clip)
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
@@ -145,7 +153,9 @@ class RND(GoalSelector):
         if len(uniform) == 0:
             return {"rnd/surprise": float("nan"), "rnd/loss": float("nan")}
         context = torch.cat([state, goal], dim=1)
-        self._observe(torch.cat([context, uniform], dim=1).double())
+        if self.config.whiten:
+            self._observe(torch.cat([context, uniform], dim=1).double())
+        self.fitted = True
         everything = slice(0, len(self._mean))
         inputs = self._whiten(torch.cat([context, next_goal], dim=1), everything)
         target = self._target_pass.forward(inputs)
@@ -161,7 +171,6 @@ class RND(GoalSelector):
         self._mean.copy_(mean)
         # A constant input tells nothing, and would explode on the first change.
         self._scale.copy_(torch.where(variance > 1e-12, variance, torch.inf).rsqrt())
-        self.fitted = True
 
     def _fit(self, inputs: Tensor, target: Tensor) -> float:
         """Adam on the mean squared error; returns that of the last pass."""
