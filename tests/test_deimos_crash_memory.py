@@ -133,7 +133,7 @@ def test_it_is_bounded_and_keeps_the_newest():
 
 def test_weights_fade():
     """A crash that is ``HALF_LIFE`` periods older than another weighs half, and so do its partners."""
-    rows, crashed, weight, issued = list(lived(memory(), History(synchronous=False), 600).values())[-1]
+    _, crashed, weight, issued = list(lived(memory(), History(synchronous=False), 600).values())[-1]
     count = int(crashed.sum())
     age = (issued[:count].max() - issued[:count]) / (HALF_LIFE * PERIOD)
     torch.testing.assert_close(weight[:count], 0.5**age)
@@ -198,7 +198,7 @@ def test_fear_never_freezes():
 
 
 def test_the_prior_is_that_of_the_last_two_periods():
-    """It is (c + 1/2) / (n + 1) of what was resolved in the window, whatever is remembered; never certain of survival."""
+    """It is (c + 1/2) / (n + 1) of what was resolved in the window, whatever is remembered, and never 0."""
     run = training("p75")
     for _ in range(3):
         run.iterate()
@@ -280,7 +280,7 @@ def test_it_says_once_that_goals_are_uniform_yet(caplog):
             goals.step(torch.zeros(4, 3), torch.zeros(4, 2), no, no, torch.zeros(4, 9, 2))
     assert [record.getMessage() for record in caplog.records] == [
         "Goals are uniform until the fear network has seen 1 crash(es) and as many survivals; "
-        "the last 2 T steps had 0 and 4."
+        "the last 2 T steps had 0 and 0."
     ]
     assert goals.metrics["fear/chosen"] == 0
     assert math.isnan(goals.metrics["fear/age"])

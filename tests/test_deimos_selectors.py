@@ -129,14 +129,11 @@ def test_it_chooses_among_the_candidates(env_name, name):
         proposal = selector.propose(*arguments)
         assert (proposal.goal.unsqueeze(1) == arguments[3]).all(2).any(1).all()
         assert proposal.score.shape == (128,)
-        for optional, dtype in (
-            ("weight", torch.float32),
-            ("percentile", torch.float32),
-            ("probe", torch.bool),
-            ("note", torch.int64),
-        ):
+        numbers = {"weight": torch.float32, "percentile": torch.float32, "probe": torch.bool, "note": torch.int64}
+        for optional, dtype in numbers.items():
             value = getattr(proposal, optional)
             assert value is None or (value.shape == (128,) and value.dtype == dtype)
+        assert proposal.percentile is None or ((proposal.percentile >= 0) & (proposal.percentile <= 100)).all()
 
 
 @pytest.mark.parametrize("name", ALL)
