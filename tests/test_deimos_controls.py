@@ -18,6 +18,7 @@ from deimos.goals.methods import method
 from deimos.goals.selector import Spaces, with_parts
 from deimos.goals.selectors import director, mix, novelty, penalty, q_fear, rnd, swapped, uniform, vds, weighted
 from deimos.learn.ppo import PPOConfig
+from deimos.run.audit import audit_percentile
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
 from deimos.run.trainer import TrainConfig, Trainer
@@ -171,6 +172,20 @@ def test_the_oracle_delivers_its_percentile(oracle_module, percentile):
     no_sooner = (danger <= chosen.score.unsqueeze(1)).float().mean(1) * 100
     assert (no_sooner >= percentile).all()
     assert chosen.percentile.mean() > 50 + percentile / 2 - 15
+
+
+def test_the_exact_percentile_is_measured(oracle_module):
+    """By the truth Uniform's goals have the percentile 50, an oracle's Coop a low one, its Antagonist a high one."""
+    found = {}
+    rules = {rule: oracle_module.Config(rule=rule, candidates=12) for rule in ("argmin", "argmax")}
+    for name, selector in {"uniform": uniform.Config(), **rules}.items():
+        run = small_run(selector, goal_period=20, max_speed=100.0, max_force=50.0)
+        run.ppo.actor.forward = lambda obs: (obs[:, 9:12] - obs[:, 0:3]) * 100.0  # follows goals and minds no wall
+        found[name] = audit_percentile(run, 60)
+        assert found[name]["contexts"] >= 60
+    assert found["uniform"]["percentile"] == pytest.approx(50, abs=15)
+    assert found["argmin"]["percentile"] < 40
+    assert found["argmax"]["percentile"] > 60
 
 
 def test_the_oracle_is_a_plugin(oracle_module):

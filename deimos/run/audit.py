@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import RunError
+from deimos.goals import picks
 from deimos.goals.calibration import evaluate
 from deimos.goals.fear import auroc
 from deimos.goals.fear_selector import FearSelector, fear_selector
@@ -52,16 +53,11 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
         RunError: If there is no fear network, or no context with both outcomes.
     """
     afraid = _learnt_fear(trainer)
-    generator = seeds.generator(trainer.config.seed, "audit", trainer.env.device)
-    config = trainer.config
-    clones = Clones(
-        lambda count: config.env.build(count, trainer.env.device, config.seed),
-        lambda obs: _act(trainer, obs, generator), limit=BATCH * CANDIDATES,
-    )  # fmt: skip
+    generator, clones = _clones(trainer)
     ranks: list[float] = []
     crashes = tried = 0
     while len(ranks) < contexts and tried < PATIENCE * contexts:
-        state, goal, candidates, survived = _next_contexts(trainer, clones, generator)
+        _, state, goal, candidates, survived = _next_contexts(trainer, clones, generator)
         logit = afraid.score(state, goal, candidates)
         crashed = survived < trainer.env.goal_period
         tried += len(logit)
@@ -75,8 +71,8 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
         raise RunError(
             f"None of {tried} contexts had both outcomes; the policy is too safe or too bad to rank its goals."
         )
-    picks = np.random.default_rng(0).integers(len(ranks), size=(RESAMPLES, len(ranks)))
-    low, high = np.quantile(np.array(ranks)[picks].mean(axis=1), [0.025, 0.975])
+    resamples = np.random.default_rng(0).integers(len(ranks), size=(RESAMPLES, len(ranks)))
+    low, high = np.quantile(np.array(ranks)[resamples].mean(axis=1), [0.025, 0.975])
     return {
         "auroc": math.fsum(ranks) / len(ranks),
         "low": float(low),
@@ -86,6 +82,45 @@ def audit_fear(trainer: "Trainer", contexts: int) -> dict:
         "crash_rate": crashes / (tried * CANDIDATES),
         "iteration": trainer.iteration,
     }
+
+
+def audit_percentile(trainer: "Trainer", contexts: int) -> dict[str, float]:
+    """Measure how dangerous the goals of a training run's selector are, by the truth.
+
+    Args:
+        trainer: A run. Its worlds move on.
+        contexts: Contexts to collect where candidates differ in danger, at least 1.
+
+    Returns:
+        ``percentile``: the mean percentile of the chosen goal among 50 candidates, by how soon each crashes the policy,
+        ties counting half: 50 is Uniform's; and the number of ``contexts``.
+
+    Raises:
+        RunError: If no context has candidates that differ.
+    """
+    generator, clones = _clones(trainer)
+    found: list[float] = []
+    tried = 0
+    while len(found) < contexts and tried < PATIENCE * contexts:
+        rows, state, goal, candidates, survived = _next_contexts(trainer, clones, generator)
+        tried += len(rows)
+        chosen = trainer.loop.selector.propose(rows, state, goal, candidates, trainer.env.draw(rows)).goal
+        pick = (candidates == chosen.unsqueeze(1)).all(2).int().argmax(1)
+        percentile = picks.percentile(-survived, pick)
+        found += percentile[survived.amin(1) < survived.amax(1)].tolist()
+    if not found:
+        raise RunError(f"In none of {tried} contexts do candidates differ in danger.")
+    return {"percentile": math.fsum(found) / len(found), "contexts": float(len(found))}
+
+
+def _clones(trainer: "Trainer") -> tuple[torch.Generator, Clones]:
+    """Where to try candidates, with actions drawn as in training, and what these are drawn from."""
+    config, device = trainer.config, trainer.env.device
+    generator = seeds.generator(config.seed, "audit", device)
+    return generator, Clones(
+        lambda count: config.env.build(count, device, config.seed),
+        lambda obs: _act(trainer, obs, generator), limit=BATCH * CANDIDATES,
+    )  # fmt: skip
 
 
 def audit_calibration(trainer: "Trainer", interactions: int) -> dict[str, tuple[Tensor, Tensor, dict[str, float]]]:
@@ -148,12 +183,12 @@ def _act(trainer: "Trainer", obs: Tensor, generator: torch.Generator) -> Tensor:
 @torch.no_grad()
 def _next_contexts(
     trainer: "Trainer", clones: Clones, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Go on until goals are due, and try candidates in up to ``BATCH`` of those worlds.
 
     Returns:
-        States (n, state_dim), goals in force (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the steps
-        survived under each (n, CANDIDATES).
+        Worlds (n,), states (n, state_dim), goals in force (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the
+        steps survived under each (n, CANDIDATES).
     """
     env = trainer.env
     while True:
@@ -167,4 +202,4 @@ def _next_contexts(
         candidates = env.sample_goals(rows, CANDIDATES).clone()
         survived = clones.try_out(env, rows, candidates)
         trainer.loop.advance(step)
-        return env.state(obs), obs[:, env.goal_slice], candidates, survived
+        return rows, env.state(obs), obs[:, env.goal_slice], candidates, survived
