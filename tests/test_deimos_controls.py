@@ -12,7 +12,6 @@ from scipy import stats
 from deimos import GoalDirector, plugins
 from deimos.goals import picks
 from deimos.goals.core import GoalCore
-from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Interactions
 from deimos.goals.methods import method
 from deimos.goals.selector import Spaces, with_parts
@@ -114,7 +113,7 @@ def test_state_blind_goals_ignore_the_state():
         selector = history(config.build(SPACES, 0), across)
         chosen = [selector.propose(rows, s, goal, options, draws).goal for s in (state, -state)]
         assert torch.equal(*chosen) == same
-    assert method("state-blind").fear.memory > 0
+    assert method("state-blind").memory > 0
 
 
 def test_all_controls_of_a_director_have_memory():
@@ -130,7 +129,7 @@ def test_all_controls_of_a_director_have_memory():
         "coop",
         "antagonist",
     ):
-        assert method(name).fear == FearConfig()
+        assert method(name).memory == method("p75").memory > 0
 
 
 @pytest.fixture

@@ -31,10 +31,6 @@ class FearConfig:
     """Parts that the window is split into, at least 1."""
     min_per_class: int = 1
     """Crashes and survivals that a fit must have to learn from, at least 1."""
-    memory: int = 512
-    """Crashes that are remembered with survivals of the same time, at least 0, so that learning goes on where crashes
-    have become rare. 0 is the thesis's literal method: a fit learns from the interactions resolved in the last 2 T
-    steps, and is left out where they lack a class."""
     workspace: int = 64
     """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. One hidden layer
     of ReLU needs none in training: a kernel scores them."""
@@ -45,7 +41,6 @@ class FearConfig:
         check_positive("learning_rate", self.learning_rate, finite=True)
         for name in ("epochs", "minibatches", "min_per_class", "workspace"):
             check_at_least(name, getattr(self, name), 1)
-        check_at_least("memory", self.memory, 0)
 
 
 class Fear(Stateful):

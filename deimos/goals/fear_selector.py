@@ -42,6 +42,10 @@ class FearSelectorConfig(SelectorConfig):
     control: Literal["none", "shuffled", "state-blind"] = "none"
     """``shuffled`` hands every score to another candidate, which must equal Uniform; ``state-blind`` lets the
     network see goals only."""
+    memory: int = 512
+    """Crashes that are remembered with survivals of the same time, at least 0, so that learning goes on where crashes
+    have become rare. 0 is the thesis's literal method: a fit learns from the interactions resolved in the last 2 T
+    steps, and is left out where they lack a class."""
     gate: bool = False
     """Whether goals are uniform as long as the network ranks the last outcomes no better than chance."""
     fear: FearConfig = field(default_factory=FearConfig)
@@ -50,6 +54,7 @@ class FearSelectorConfig(SelectorConfig):
     def __post_init__(self) -> None:
         check_at_least("candidates", self.candidates, 1)
         check_range("probe", self.probe, 0.0, 1.0)
+        check_at_least("memory", self.memory, 0)
         check_choice("control", self.control, ["none", "shuffled", "state-blind"])
 
 
@@ -84,9 +89,9 @@ class FearSelector(GoalSelector):
         self.calibration = Calibration()
         self.memory: CrashMemory | None = None
         """Where the crashes are kept that fear is learnt from; ``None`` for the last 2 T steps alone."""
-        if config.fear.memory:
+        if config.memory:
             width = self.inputs_per_row * (spaces.state_dim + 2 * spaces.goal_dim)
-            self.memory = CrashMemory(config.fear.memory, spaces.goal_period, width, spaces.device, seed)
+            self.memory = CrashMemory(config.memory, spaces.goal_period, width, spaces.device, seed)
         self._age = -1  # rollouts since the last fit, -1 before the first
         self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
         self._issued, self._chosen = 0, 0  # goals since the last call of learn, and those of them that fear chose

@@ -46,7 +46,10 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Methods with names of their own: the selector, and its options where they are not the defaults."""
 
-DATA = {"literal": FearConfig(memory=0), "threshold": FearConfig(memory=0, min_per_class=32)}
+DATA: dict[str, dict[str, Any]] = {
+    "literal": {"memory": 0},
+    "threshold": {"memory": 0, "fear": FearConfig(min_per_class=32)},
+}
 """What a Director's fear learns from, where it has no crash memory: the last 2 T steps as in the thesis, or, as in
 version 0.1.0, only where they hold 32 of each class."""
 
@@ -84,5 +87,5 @@ def _spelled_out(name: str) -> tuple[str, dict[str, Any]]:
     if data in DATA:
         kind, options = _spelled_out(base)
         if kind == "director":
-            return kind, options | {"fear": DATA[data]}
+            return kind, options | DATA[data]
     return name, {}
