@@ -14,7 +14,6 @@ from deimos.checks import SimulationError
 from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn.adam import Adam
-from deimos.nn.networks import Backprop, flatten_parameters, mlp
 from deimos.nn.returns import advantages
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.envs import particle
@@ -68,57 +67,22 @@ def test_advantages_reject_another_shape():
         advantages(one, one, one.t(), one.bool(), one.bool(), discount=0.5, gae_lambda=0.5)
 
 
-@pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])
-@pytest.mark.parametrize("rows", [1, 257])
-def test_backprop_is_autograd(activation, rows):
-    """The written-out passes give autograd's output and gradients, and add to what is there."""
-    torch.manual_seed(0)
-    net = mlp(7, (16, 9), 3, activation, torch.default_generator)
-    x, delta = torch.randn(rows, 7), torch.randn(rows, 3)
-    expected = torch.autograd.grad((net(x) * delta).sum(), list(net.parameters()))
-    flatten_parameters(net)
-    backprop = Backprop(net)
-    torch.testing.assert_close(backprop.forward(x), net(x).detach(), rtol=1e-5, atol=1e-6)
-    backprop.backward(delta)
-    for parameter, gradient in zip(net.parameters(), expected, strict=True):
-        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * math.sqrt(rows))
-    backprop.backward(delta)
-    for parameter, gradient in zip(net.parameters(), expected, strict=True):
-        torch.testing.assert_close(parameter.grad, 2 * gradient, rtol=1e-4, atol=2e-5 * math.sqrt(rows))
-
-
-def test_flat_parameters_keep_the_network():
-    """Laying parameters end to end changes no output, aligns each to 64 bytes and gives every module its gradient."""
-    torch.manual_seed(0)
-    nets = [mlp(3, (5,), 2, "relu", torch.default_generator), mlp(3, (4,), 1, "relu", torch.default_generator)]
-    x = torch.randn(8, 3)
-    before = [net(x) for net in nets]
-    flat, slices = flatten_parameters(*nets)
-    for net, output, gradient in zip(nets, before, slices, strict=True):
-        assert torch.equal(net(x), output)
-        net(x).sum().backward()
-        total = sum(float(p.grad.square().sum()) for p in net.parameters())
-        assert float(gradient.square().sum()) == pytest.approx(total)
-        assert all(p.data_ptr() % 64 == flat.data_ptr() % 64 for p in net.parameters())
-
-
 def test_adam_is_torchs():
     """Fifty steps over changing gradients and learning rates end where torch.optim.Adam ends."""
     generator = torch.Generator().manual_seed(0)
-    ours, theirs = (torch.nn.Parameter(torch.ones(33)) for _ in range(2))
-    ours.grad, theirs.grad = torch.zeros(33), torch.zeros(33)
-    rate = torch.tensor(1e-2)
-    adam, reference = Adam(ours, rate), torch.optim.Adam([theirs], lr=1e-2)
+    ours, theirs, grad, rate = torch.ones(33), torch.nn.Parameter(torch.ones(33)), torch.zeros(33), torch.tensor(1e-2)
+    theirs.grad = torch.zeros(33)
+    adam, reference = Adam(ours, grad, rate), torch.optim.Adam([theirs], lr=1e-2)
     for step in range(50):
         gradient = torch.randn(33, generator=generator) * 10.0 ** (step % 5 - 3)
-        ours.grad.copy_(gradient)
+        grad.copy_(gradient)
         theirs.grad.copy_(gradient)
         rate.fill_(1e-2 / (1 + step))
         reference.param_groups[0]["lr"] = rate.item()
         adam.step()
         reference.step()
     # Each step rounds a handful of operations on numbers of order 1.
-    torch.testing.assert_close(ours.data, theirs.data, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(ours, theirs.data, rtol=1e-5, atol=1e-6)
 
 
 def filled(ppo, seed=1, *, truncations=False):
@@ -186,9 +150,9 @@ def test_returns_and_advantages_are_rsl_rls():
     rollout = filled(ppo)
     storage = rsl_rl_like(ppo, rollout).storage
     batch, _ = ppo.batch(rollout)
-    torch.testing.assert_close(batch.returns, storage.returns.flatten(), rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(batch.advantage, storage.advantages.flatten(), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(batch.log_prob, storage.actions_log_prob.flatten(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(batch.value[0, 2], storage.returns.flatten(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(batch.policy[0, -2], storage.advantages.flatten(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(batch.policy[0, -3], storage.actions_log_prob.flatten(), rtol=1e-5, atol=1e-5)
 
 
 def test_returns_differ_from_rsl_rls_at_time_limits_only_by_the_value():
@@ -197,10 +161,10 @@ def test_returns_differ_from_rsl_rls_at_time_limits_only_by_the_value():
     rollout = filled(ppo, truncations=True)
     storage = rsl_rl_like(ppo, rollout).storage
     assert rollout.truncated.any()
-    apart = (ppo.batch(rollout)[0].returns - storage.returns.flatten()).abs().max()
+    apart = (ppo.batch(rollout)[0].value[0, 2] - storage.returns.flatten()).abs().max()
     assert apart > 1e-3
     end_in(rollout, rollout.obs[:-1])
-    torch.testing.assert_close(ppo.batch(rollout)[0].returns, storage.returns.flatten(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(ppo.batch(rollout)[0].value[0, 2], storage.returns.flatten(), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("clip_value", [True, False])
@@ -360,7 +324,7 @@ def test_somebody_elses_critic_is_the_baseline():
     ppo = small_learner()
     rollout = filled(ppo)
     batch, _ = ppo.batch(rollout, constant)
-    assert (batch.value == 0.25).all()
+    assert (batch.value[0, 1] == 0.25).all()
     before = [parameter.clone() for parameter in (*ppo.actor.parameters(), *ppo.critic.parameters())]
     metrics = ppo.update(rollout, critic=constant)
     same = [torch.equal(a, b) for a, b in zip(before, (*ppo.actor.parameters(), *ppo.critic.parameters()), strict=True)]

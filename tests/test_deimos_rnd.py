@@ -8,7 +8,7 @@ import torch
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import rnd
-from deimos.nn import fusion
+from deimos.nn import mlps
 
 CPU = torch.device("cpu")
 NUM_ENVS, CANDIDATES = 200, 20
@@ -48,9 +48,10 @@ class World:
 @pytest.mark.parametrize("kernel", [False, True])
 def test_scores_are_the_predictors_errors(monkeypatch, kernel):
     """A surprise is the mean squared error between the two networks on whitened (state, goal, candidate)."""
-    monkeypatch.setattr(fusion, "kernels_run_on", lambda device: kernel)
+    if not kernel:
+        monkeypatch.setattr(mlps, "_kernel", lambda nets: None)
     world = World()
-    assert (world.selector._fused is not None) == kernel
+    assert (world.selector._predictor._kernel is not None) == kernel
     world.update()
     selector = world.selector
     _, state, goal, candidates, _ = world.decision()

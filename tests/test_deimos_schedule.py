@@ -186,6 +186,6 @@ def test_the_baseline_stays_with_the_first():
     selector = run.loop.selector
     assert selector.switched
     assert selector.critic() == selector.parts[0].value
-    before = selector.parts[0].stack.parameters.detach().clone()
+    before = selector.parts[0].nets.parameters.clone()
     assert math.isfinite(run.iterate()["vds/loss"])
-    assert not torch.equal(before, selector.parts[0].stack.parameters)
+    assert not torch.equal(before, selector.parts[0].nets.parameters)

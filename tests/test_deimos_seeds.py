@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from deimos import GoalDirector
-from deimos.nn.networks import ManyCandidates, mlp
+from deimos.nn.networks import mlp
 from deimos.nn.seeds import derive, generator, restore
 
 USES = ("policy weights", "policy noise", "fear weights", "fear minibatches", "vds critic 0", "vds critic 1", "")
@@ -93,19 +93,3 @@ def test_a_stream_of_another_kind_of_device_continues_as_one_of_its_own():
         assert not torch.equal(numbers[-1], untouched)
     assert torch.equal(numbers[0], numbers[1])
     assert not torch.equal(numbers[0], numbers[2])
-
-
-@pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])
-@pytest.mark.parametrize("outputs", [1, 16])
-def test_candidates_are_evaluated_as_the_network_would(activation, outputs):
-    """Products shared by all candidates of a context change nothing but rounding, whatever the workspace."""
-    torch.manual_seed(0)
-    net = mlp(9, (64, 32), outputs, activation, torch.default_generator)
-    context, candidates = torch.randn(300, 6), torch.randn(300, 50, 3)
-    inputs = torch.cat([context.unsqueeze(1).expand(-1, 50, -1), candidates], dim=2)
-    with torch.no_grad():
-        expected = net(inputs)
-    for workspace in (1, 1024):
-        found = ManyCandidates(net, 3, workspace)(context, candidates)
-        # Sums of at most 64 products of numbers of order 1, in another order.
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

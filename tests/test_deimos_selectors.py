@@ -21,7 +21,7 @@ from deimos.goals.selector import Spaces
 from deimos.goals.selectors import boltzmann, cl, director, grid, learnability, mix, plr, rnd, schedule, uniform, vds
 from deimos.learn.ppo import PPOConfig
 from deimos.learn.rollout import Rollout
-from deimos.nn import fusion
+from deimos.nn import mlps
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
@@ -147,13 +147,14 @@ def test_the_batch_does_not_matter(env_name, name):
 
 @pytest.mark.parametrize("name", ALL)
 def test_a_kernel_chooses_what_products_choose(monkeypatch, env_name, name):
-    """Where worlds have kernels, a trained selector proposes the goals and scores that it proposes by torch alone."""
+    """With the kernel for CPUs, a trained selector proposes the goals and scores that it proposes by torch alone."""
     run = trained(env_name, name)[0]
     *_, (learnt, arguments) = fresh_and_trained(env_name, name)
     own = spaces(run.env, 96)
     proposals = []
     for kernels in (True, False):
-        monkeypatch.setattr(fusion, "kernels_run_on", lambda device, kernels=kernels: kernels)
+        if not kernels:
+            monkeypatch.setattr(mlps, "_kernel", lambda nets: None)
         selector = small(ALL[name]).build(own, 0)
         selector.load_state_dict(copy.deepcopy(learnt.state_dict()))
         proposals.append(selector.propose(*arguments))
@@ -214,8 +215,8 @@ def test_a_weight_that_is_not_finite_stops_the_run(env_name, name):
     selector.check()
     part = (selector.parts or (selector,))[0]
     network = (
-        part.stack.nets[0]
-        if hasattr(part, "stack")
+        part.nets.modules[0]
+        if hasattr(part, "nets")
         else part.predictor
         if hasattr(part, "predictor")
         else part.fear.network

@@ -228,11 +228,27 @@ def test_resume_of_a_finished_run_changes_no_number(undisturbed, tmp_path):
 
 
 def test_same_seed_same_run(undisturbed, tmp_path):
-    """The same seed and threads give the same run, bit for bit; another seed gives another."""
+    """The same seed gives the same run, bit for bit; another seed gives another."""
     run(CONFIG, tmp_path / "same")
     assert_same_run(tmp_path / "same", undisturbed)
     run(replace(CONFIG, seed=4), tmp_path / "other", iterations=1)
     assert rows(tmp_path / "other")[0] != rows(undisturbed)[0]
+
+
+@pytest.mark.parametrize("name", ["director", "vds"])
+def test_threads_change_no_number(name, tmp_path, monkeypatch):
+    """On one thread and on several, all of which have work, ``progress.csv`` has the same bytes."""
+    monkeypatch.setattr("deimos.nn.cpu.LEAST", 1.0)
+    config = replace(CONFIG, num_envs=1500, env_steps=48, selector=None, method={"director": "p75", "vds": "vds"}[name])
+    before, written = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 5):
+            run(replace(config, threads=threads), tmp_path / str(threads))
+            written.append((tmp_path / str(threads) / "progress.csv").read_bytes())
+    finally:
+        torch.set_num_threads(before)
+    assert written[0].count(b"\n") == 3
+    assert written[1] == written[2] == written[0]
 
 
 def test_seed_reaches_everything():

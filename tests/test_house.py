@@ -99,11 +99,7 @@ ROOMS = {  # package: those that it may import, and those that these may import
     "adapters": {"run"},
 }
 LEAVES = {"_version", "checks", "files", "plugins"}  # modules that everybody may import
-BACKENDS = {
-    "deimos/nn/fusion.py",
-    "deimos/nn/fused.py",
-    "deimos/nn/fused_critics.py",
-}  # imported by functions, where Warp is installed
+BACKENDS = {"deimos/nn/cpu.py"}  # imported by functions, where Warp is installed
 ENTRIES = {"train.py", "deimos/__main__.py", "terrain/__main__.py"}  # may import app
 
 

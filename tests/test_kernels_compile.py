@@ -12,6 +12,7 @@ from deimos import kernels
 
 HOME = Path(kernels.__file__).resolve().parent.parent
 ARCHITECTURES = (80, 90)  # A100, H100
+FOR_CPUS = {"deimos.kernels.mlp"}  # where a GPU has torch's products
 
 
 def modules_with_kernels():
@@ -21,7 +22,8 @@ def modules_with_kernels():
     return [
         name
         for name, module in modules.items()
-        if any(isinstance(value, wp.Kernel) and value.func.__module__ == name for value in vars(module).values())
+        if name not in FOR_CPUS
+        and any(isinstance(value, wp.Kernel) and value.func.__module__ == name for value in vars(module).values())
     ]
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from deimos.kernels.goals import draw_candidates
+from deimos.kernels.lanes import WIDE, lanes, threads
 from deimos.kernels.random import Purpose
 
 SIGMAS = 5.0  # a sound generator's mean is off by more than this once in 1.7 million tests
@@ -133,3 +134,12 @@ def test_draw_candidates_rejects(device, wrong, message):
     arrays = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in (right | wrong).items()}
     with pytest.raises(ValueError, match=message):
         draw_candidates(**arrays, seed=0, world_offset=0)
+
+
+def test_threads_cover_every_number(device):
+    """A thread takes one number on a GPU and where there are few, else as many as its lanes."""
+    device, cpu = wp.get_device(device), device == "cpu"
+    assert lanes(WIDE // 4 - 1, device) == 1
+    assert lanes(100, device) == (WIDE if cpu else 1)
+    assert threads(7, 100, device) == (7, -(-100 // WIDE) if cpu else 100)
+    assert threads(7, 3, device) == (7, 3)

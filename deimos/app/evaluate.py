@@ -11,6 +11,7 @@ import tyro
 
 from deimos.app import console, figures
 from deimos.checks import check_at_least
+from deimos.nn.threads import on_threads
 from deimos.run import api, audit, training
 from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig
@@ -87,12 +88,13 @@ def main(arguments: list[str], program: str) -> None:
     options: EvaluateOptions = console.parse(EvaluateOptions, arguments, program)
     folder = RunFolder.open(options.run)
     config = training.read_config(folder)
-    torch.set_num_threads(config.threads or training.cores())  # the same numbers as at the end of the run
     console.quiet_warp()
     device = training.resolve_device(options.device)
     if options.contexts or options.calibration:
         with one_stream(device):
-            _evaluate_fear(training.load(folder, replace(config, device=options.device)), folder, options)
+            trainer = training.load(folder, replace(config, device=options.device))
+            with on_threads(1):  # sums of torch's depend on its threads
+                _evaluate_fear(trainer, folder, options)
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
     env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes)

@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive
 from deimos.goals.interactions import Resolved
 from deimos.nn.adam import Adam
-from deimos.nn.fusion import fused_scores
-from deimos.nn.networks import Activation, Backprop, ManyCandidates, flatten_parameters, mlp
+from deimos.nn.losses import cross_entropy
+from deimos.nn.mlps import MLPs
+from deimos.nn.networks import Activation, mlp
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
@@ -32,8 +33,8 @@ class FearConfig:
     min_per_class: int = 1
     """Crashes and survivals that a fit must have to learn from, at least 1."""
     workspace: int = 64
-    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. One hidden layer
-    of ReLU needs none in training: a kernel scores them."""
+    """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. The kernel for
+    CPUs needs none."""
 
     def __post_init__(self) -> None:
         check_hidden("hidden", self.hidden)
@@ -60,11 +61,9 @@ class Fear(Stateful):
         self.config = config
         weights = generator(seed, "fear weights")
         self.network = mlp(state_dim + 2 * goal_dim, config.hidden, 1, config.activation, weights).to(device)
-        self._parameters, _ = flatten_parameters(self.network)
-        self._pass = Backprop(self.network)
-        self._candidates = ManyCandidates(self.network, goal_dim, config.workspace)
-        self._fused = fused_scores(self.network, goal_dim)
-        self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
+        self._nets = MLPs([self.network], workspace=config.workspace)
+        rate = torch.tensor(config.learning_rate, dtype=torch.float32, device=device)
+        self.optimizer = Adam(self._nets.parameters, self._nets.grad, rate)
         self.generator = generator(seed, "fear minibatches", device)
         self.fitted = False
         """Whether it has learnt anything yet; before, its ranking of goals would be an arbitrary bias."""
@@ -100,26 +99,23 @@ class Fear(Stateful):
         mass = mean_over_ranks(torch.stack([(weight * ~crashed).sum(), (weight * crashed).sum()]))
         weight = weight * (0.5 / mass)[crashed.long()]
         size = -(-len(inputs) // self.config.minibatches)
-        loss = torch.full((), torch.nan)
+        loss = torch.zeros((), device=target.device)
         for _ in range(self.config.epochs if epochs is None else epochs):
             order = torch.randperm(len(inputs), generator=self.generator, device=target.device)
             x, y, w = inputs[order], target[order], weight[order]
-            minibatches = zip(x.split(size), y.split(size), w.split(size), strict=True)
-            logit = torch.cat([self._learn(len(inputs) / len(part[0]), *part) for part in minibatches])
-            loss = nn.functional.binary_cross_entropy_with_logits(logit, y, w, reduction="sum")
+            loss.zero_()
+            for part in zip(x.split(size), y.split(size), w.split(size), strict=True):
+                scale = len(inputs) / len(part[0])  # makes the gradient one of a mean
+                loss += self._learn(part[0], part[1], part[2] * scale) / scale
         self.fitted = True
         return loss.item()
 
-    def _learn(self, scale: float, inputs: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        """One step of Adam on a minibatch; ``scale`` makes its gradient one of a mean. Returns the logits before it."""
-        assert self._parameters.grad is not None
-        self._parameters.grad.zero_()
-        logit = self._pass.forward(inputs).squeeze(1)
-        delta = torch.sigmoid(logit).sub_(target).mul_(weight * scale)  # derivative of the loss by the logit
-        self._pass.backward(delta.unsqueeze(1))
-        mean_over_ranks(self._parameters.grad)
+    def _learn(self, inputs: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        """One step of Adam on a minibatch; returns the loss before it."""
+        loss = self._nets.gradient(inputs, cross_entropy(target, weight))
+        mean_over_ranks(self._nets.grad)
         self.optimizer.step()
-        return logit
+        return loss[0, 0]
 
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Logits of crashing for many candidates per decision.
@@ -130,16 +126,13 @@ class Fear(Stateful):
             candidates: Possible next goals, shape (B, N, goal_dim).
 
         Returns:
-            Logits, shape (B, N); see ``ManyCandidates``.
+            Logits, shape (B, N); see ``MLPs.score``.
         """
-        context = torch.cat([state, goal], dim=1)
-        if self._fused is not None:
-            return self._fused(context, candidates)
-        return self._candidates(context, candidates).squeeze(2)
+        return self._nets.score(torch.cat([state, goal], dim=1), candidates)[0, :, :, 0]
 
     def check(self) -> None:
         """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
-        if not bool(self._parameters.isfinite().all()):
+        if not bool(self._nets.parameters.isfinite().all()):
             raise SimulationError("A weight of the fear network is not finite after a fit.")
 
 

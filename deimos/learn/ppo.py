@@ -6,8 +6,8 @@ uses the value of the one before.
 """
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,10 +15,11 @@ from torch import Tensor
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.learn.rollout import Rollout
 from deimos.nn.adam import Adam
-from deimos.nn.networks import Activation, Actor, Backprop, flatten_parameters, mlp, rows_in_cache
+from deimos.nn.losses import Surrogate, ValueLoss, log_prob
+from deimos.nn.mlps import MLPs, gradients
+from deimos.nn.networks import Activation, Actor, mlp
 from deimos.nn.random import Purpose, normals
 from deimos.nn.ranks import mean_over_ranks
-from deimos.nn.returns import value_gradient
 from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
@@ -81,40 +82,31 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions to learn from, one per row; small vectors lie along the first axis (see ``_policy_gradient``)."""
+    """Transitions to learn from, one per column: what is one per row elsewhere then lies end to end."""
 
-    obs: Tensor
-    """Shape (n, obs_dim)."""
-    action: Tensor
-    """Shape (action_dim, n)."""
-    mean: Tensor
-    """Mean of the policy that acted, shape (action_dim, n)."""
-    log_prob: Tensor
-    """Of the action under the policy that acted, shape (n,)."""
-    advantage: Tensor
-    """Normalised, shape (n,)."""
-    value: Tensor
-    """Before the update, shape (n,)."""
-    returns: Tensor
-    """Targets of the value function, shape (n,)."""
-    weight: Tensor
-    """Share in every average, shape (n,)."""
+    table: Tensor
+    """Observations, actions, means of the policy that acted, log-probability under it, normalised advantage, weight,
+    value before the update and target, shape (obs_dim + 2 action_dim + 5, n)."""
+    obs_dim: int
+    """Components of an observation."""
 
-    def shuffled(self, order: Tensor) -> "Batch":
-        """The same rows in another order."""
-        return Batch(**{
-            name: getattr(self, name)[order] if name == "obs" else getattr(self, name).index_select(-1, order)
-            for name in self.__dataclass_fields__
-        })  # fmt: skip
+    @property
+    def obs(self) -> Tensor:
+        """Observations, shape (n, obs_dim): a view."""
+        return self.table[: self.obs_dim].t()
 
-    def split(self, size: int) -> "Iterator[Batch]":
-        """Consecutive parts of ``size`` rows; the last may be shorter."""
-        for start in range(0, len(self.obs), size):
-            rows = slice(start, start + size)
-            yield Batch(**{
-                name: getattr(self, name)[rows] if name == "obs" else getattr(self, name)[..., rows]
-                for name in self.__dataclass_fields__
-            })  # fmt: skip
+    @property
+    def policy(self) -> Tensor:
+        """The data of ``losses.Surrogate``: a view."""
+        return self.table[self.obs_dim : -2].unsqueeze(0)
+
+    @property
+    def value(self) -> Tensor:
+        """The data of ``losses.ValueLoss``: a view."""
+        return self.table[-3:].unsqueeze(0)
+
+    def __getitem__(self, rows: slice) -> "Batch":
+        return Batch(self.table[:, rows], self.obs_dim)
 
 
 class PPO(Stateful):
@@ -148,12 +140,19 @@ class PPO(Stateful):
         self.actor = Actor(obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights).to(device)
         self.critic = mlp(obs_dim, config.hidden, 1, config.activation, weights).to(device)
         self.generator = generator(seed, "policy minibatches", device)
-        self._parameters, self._grads = flatten_parameters(self.actor, self.critic)
-        self.learning_rate = torch.tensor(config.learning_rate, device=device)
-        self.optimizer = Adam(self._parameters, self.learning_rate)
-        self._piece = rows_in_cache(max(config.hidden)) if device.type == "cpu" else self._size
-        self._actor_pass = Backprop(self.actor.mean)
-        self._critic_pass = Backprop(self.critic)
+        sizes = [sum(p.numel() for p in module.parameters()) for module in (self.actor, self.critic)]
+        memory = torch.zeros(2, sum(sizes), dtype=torch.float32, device=device)  # one vector: Adam makes few passes
+        self._actor, self._critic = (
+            MLPs([module], part.unsqueeze(1))
+            for module, part in zip((self.actor, self.critic), memory.split(sizes, dim=1), strict=True)
+        )
+        self._parameters, self._grad = memory
+        self.learning_rate = torch.tensor(config.learning_rate, dtype=torch.float32, device=device)
+        self.optimizer = Adam(self._parameters, self._grad, self.learning_rate)
+        shape = obs_dim + 2 * action_dim + 5, rows
+        self._batch, self._shuffled = (
+            Batch(torch.zeros(shape, dtype=torch.float32, device=device), obs_dim) for _ in range(2)
+        )
         self._sizes = num_envs, obs_dim, action_dim, device
         self._seed, self._worlds = seed, torch.arange(num_envs, device=device)
 
@@ -189,19 +188,13 @@ class PPO(Stateful):
             action: Actions, shape (n, action_dim). Written.
             mean: Means of their distribution, same shape. Written.
         """
-        mean.copy_(self._actor_pass.forward(obs))
+        mean.copy_(self._actor.forward(obs)[0])
         torch.addcmul(mean, noise, self.actor.std, out=action)
 
     @torch.no_grad()
     def value(self, obs: Tensor) -> Tensor:
-        """Values of observations of any leading shape, computed in cache-sized pieces."""
-        flat = obs.reshape(-1, obs.shape[-1])
-        value = torch.empty(len(flat), device=obs.device)
-        size = self._piece
-        for start in range(0, len(flat), size):
-            rows = slice(start, start + size)
-            value[rows] = self._critic_pass.forward(flat[rows]).squeeze(1)
-        return value.view(obs.shape[:-1])
+        """Values of observations of any leading shape."""
+        return self._critic.forward(obs.flatten(0, -2)).view(obs.shape[:-1])
 
     @torch.no_grad()
     def update(
@@ -224,14 +217,16 @@ class PPO(Stateful):
         """
         batch, explained = self.batch(rollout, critic)
         if order is None:
-            order = torch.randperm(len(batch.obs), generator=self.generator, device=batch.obs.device)
+            rows = batch.table.shape[1]
+            order = torch.randperm(rows, generator=self.generator, device=batch.table.device)
         std = self.actor.std.clone()
         value_loss = surrogate_loss = kl = math.nan
         if bool(mean_over_ranks(rollout.weight.sum()) >= self._size):
-            batch = batch.shuffled(order[: self._size * self.config.minibatches])
-            totals = torch.zeros(3, device=batch.obs.device)
+            minibatches = self._minibatches(batch, order)
+            totals = torch.zeros(3, dtype=torch.float32, device=order.device)
+            self._grad.zero_()
             for _ in range(self.config.epochs):
-                for minibatch in batch.split(self._size):
+                for minibatch in minibatches:
                     totals += self._learn(minibatch, std, learn_value=critic is None)
             value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
         return {
@@ -249,7 +244,7 @@ class PPO(Stateful):
         """Advantages, value targets and old log-probabilities of a rollout; and the share of variance explained.
 
         The networks have not changed since the rollout, so values and log-probabilities are
-        computed here at once and not step by step.
+        computed here at once and not step by step. The next call overwrites them.
         """
         value = rollout.estimate(critic or self.value)
         advantage = rollout.advantage
@@ -260,79 +255,47 @@ class PPO(Stateful):
         variance = mean_over_ranks((weight * (advantage - mean).square()).sum()) / (total - 1)
         explained = 1 - variance / (returns.var() + 1e-8)
         advantage = (advantage - mean) / (variance.sqrt() + 1e-8)
-        z = (rollout.action - rollout.mean) / self.actor.std
-        log_prob = -0.5 * z.square().sum(-1) - self._log_normaliser(self.actor.std)
-        action_dim = rollout.action.shape[-1]
-        return Batch(
-            obs=rollout.obs[:-1].flatten(0, 1),
-            action=rollout.action.view(-1, action_dim).t().contiguous(),
-            mean=rollout.mean.view(-1, action_dim).t().contiguous(),
-            log_prob=log_prob.flatten(),
-            advantage=advantage.flatten(),
-            value=value.flatten(),
-            returns=returns.flatten(),
-            weight=weight.flatten(),
-        ), explained
+        table, std = self._batch.table, self.actor.std.unsqueeze(1)
+        start, size = rollout.obs.shape[2], rollout.action.shape[2]
+        obs, action, mean, *rows = table.split([start, size, size, 1, 1, 1, 1, 1])
+        for part, source in ((obs, rollout.obs[:-1]), (action, rollout.action), (mean, rollout.mean)):
+            part.copy_(source.flatten(0, 1).t())
+        density = log_prob((action - mean) / std, std)
+        for row, source in zip(rows, (density, advantage, weight, value, returns), strict=True):
+            row.copy_(source.flatten())
+        return self._batch, explained
+
+    def _minibatches(self, batch: Batch, order: Tensor) -> list[Batch]:
+        """Parts of a batch in another order, each with weights that add up to 1."""
+        count = self.config.minibatches
+        table = self._shuffled.table[:, : self._size * count]
+        torch.index_select(batch.table, 1, order[: table.shape[1]], out=table)
+        weight = table[-3].view(count, self._size)
+        weight /= weight.sum(1, keepdim=True).clamp(min=1.0)
+        return [Batch(part, batch.obs_dim) for part in table.split(self._size, dim=1)]
 
     def _learn(self, minibatch: Batch, old_std: Tensor, *, learn_value: bool = True) -> Tensor:
-        """One step of Adam; returns value loss, surrogate loss and KL divergence, shape (3,).
-
-        On a CPU the minibatch is worked through in pieces that suit the caches; their gradients add up.
-        """
+        """One step of Adam; returns value loss, surrogate loss and KL divergence, shape (3,)."""
         config, std = self.config, self.actor.std
         assert std.grad is not None
-        assert self._parameters.grad is not None
-        self._parameters.grad.zero_()
-        minibatch = replace(minibatch, weight=minibatch.weight / minibatch.weight.sum().clamp(min=1.0))
-        losses = torch.zeros(2, device=std.device)
-        moved = torch.zeros_like(std)
-        for piece in minibatch.split(self._piece):
-            mean = self._actor_pass.forward(piece.obs).t().contiguous()
-            surrogate_loss, grad_mean, grad_std = self._policy_gradient(piece, mean)
-            self._actor_pass.backward(grad_mean.t())
-            std.grad += grad_std
-            losses[1] += surrogate_loss
-            if learn_value:
-                value = self._critic_pass.forward(piece.obs).squeeze(1)
-                value_loss, grad_value = value_gradient(
-                    value, piece.value, piece.returns, piece.weight,
-                    clip=config.clip if config.clip_value else math.inf, coef=config.value_coef,
-                )  # fmt: skip
-                self._critic_pass.backward(grad_value.unsqueeze(1))
-                losses[0] += value_loss
-            moved += (mean - piece.mean).square_() @ piece.weight
+        work = [(self._actor, minibatch.obs, Surrogate(minibatch.policy, config.clip))]
+        if learn_value:
+            clip = config.clip if config.clip_value else math.inf
+            work.append((self._critic, minibatch.obs, ValueLoss(minibatch.value, clip)))
+        surrogate, *value = gradients(*work)
         std.grad -= config.entropy_coef / std
-        ratio = old_std / std
+        self._critic.grad *= config.value_coef
+        ratio, moved = old_std / std, surrogate[0, 1:]
         kl = (0.5 * (ratio.square() + moved / std.square() - 1.0) - ratio.log()).sum()
-        mean_over_ranks(self._parameters.grad)
-        for grad in self._grads:
-            grad.mul_((config.max_grad_norm / (torch.linalg.vector_norm(grad) + 1e-6)).clamp(max=1.0))
+        mean_over_ranks(self._grad)
+        for nets in (self._actor, self._critic):
+            nets.clip_gradient(config.max_grad_norm)
         if config.desired_kl:
             self._adapt_learning_rate(mean_over_ranks(kl))
         self.optimizer.step()
         std.data.clamp_(min=1e-6)
-        return torch.cat([losses, kl.unsqueeze(0)])
-
-    def _policy_gradient(self, batch: Batch, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The clipped surrogate and its gradient with respect to mean and standard deviation.
-
-        With actions along the first axis every operation runs over long contiguous rows.
-
-        max(-A r, -A clip(r)) has the slope -A where the first is the larger or both are equal
-        (inside the clip), and 0 elsewhere; log r has the slopes z / std and (z^2 - 1) / std.
-        """
-        std = self.actor.std.unsqueeze(1)
-        clip = self.config.clip
-        z = (batch.action - mean).div_(std)
-        squares = z.square()
-        log_prob = squares.sum(0).mul_(-0.5).sub_(self._log_normaliser(self.actor.std))
-        ratio = log_prob.sub_(batch.log_prob).exp_()
-        plain = -batch.advantage * ratio
-        clipped = -batch.advantage * ratio.clamp(1.0 - clip, 1.0 + clip)
-        slope = plain * batch.weight * (plain >= clipped)  # derivative of the loss by log r
-        grad_mean = z.mul_(slope).div_(std)
-        grad_std = (squares.sub_(1.0) @ slope) / self.actor.std
-        return torch.maximum(plain, clipped) @ batch.weight, grad_mean, grad_std
+        value_loss = value[0][0, 0] if value else torch.zeros_like(kl)
+        return torch.stack([value_loss, surrogate[0, 0], kl])
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Divide by 1.5 above twice the desired divergence, multiply below half of it; no host round trip."""
@@ -341,11 +304,6 @@ class PPO(Stateful):
         low, high = LEARNING_RATE_RANGE
         raised, lowered = (rate * factor).clamp(max=high), (rate * factor).clamp(min=low)
         rate.copy_(torch.where(factor > 1, raised, torch.where(factor < 1, lowered, rate)))
-
-    @staticmethod
-    def _log_normaliser(std: Tensor) -> Tensor:
-        """Log of the integral of exp(-z^2 / 2) over all actions."""
-        return std.log().sum() + 0.5 * len(std) * math.log(2 * math.pi)
 
     def load_weights(self, state: dict) -> None:
         """Load the networks alone.

@@ -1,6 +1,4 @@
-"""Advantages of a rollout, and the loss of a value function that learns from them."""
-
-import math
+"""Advantages of a rollout."""
 
 import torch
 from torch import Tensor
@@ -53,35 +51,3 @@ def advantages(
     for t in reversed(range(len(reward) - 1)):
         advantage[t].addcmul_(continues[t], advantage[t + 1])
     return advantage
-
-
-def value_gradient(
-    value: Tensor, old_value: Tensor, returns: Tensor, weight: Tensor, *, clip: float, coef: float
-) -> tuple[Tensor, Tensor]:
-    """The clipped value loss and its gradient with respect to the value.
-
-    Where the value has moved too far and clipping makes the loss larger, the clipped loss counts,
-    and that one is flat. Inside the clip both are the same but for rounding, which must not decide.
-
-    Args:
-        value: Values, shape (..., n).
-        old_value: Values before the update, same shape.
-        returns: Their targets, same shape.
-        weight: Share of every row in the average, same shape.
-        clip: How far a value may move, positive; infinite for the plain squared error.
-        coef: What the gradient is multiplied by.
-
-    Returns:
-        The loss, shape (...), without ``coef``; and its gradient, shape (..., n), with it.
-    """
-    error = value - returns
-    loss = error.square()
-    grad = error * weight * (2.0 * coef)
-    if not math.isinf(clip):
-        step = value - old_value
-        inside = step.abs() <= clip
-        step.clamp_(-clip, clip)
-        clipped = (old_value + step).sub_(returns).square_()
-        grad *= inside | (loss >= clipped)
-        loss = torch.maximum(loss, clipped)
-    return (loss * weight).sum(-1), grad

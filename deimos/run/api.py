@@ -9,7 +9,7 @@ import torch
 
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy
-from deimos.nn.matmul import on_threads
+from deimos.nn.threads import on_threads
 from deimos.run import evaluation, training
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
@@ -64,7 +64,7 @@ def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "
     config = training.read_config(folder)
     env_config, eval_config = configure_evaluation(config, goal_period, changes)
     found = training.resolve_device(device)
-    with on_threads(config.threads or training.cores()), one_stream(found):  # the same numbers as at the run's end
+    with one_stream(found):
         return evaluate_run(folder, env_config, eval_config, found)
 
 
@@ -93,7 +93,8 @@ def evaluate_run(
     """Evaluate the folder's policy; rows of the same policy, goals and sizes are replaced, others are kept."""
     policy = load_policy(folder.path, str(device))
     known = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
-    rows = evaluation.evaluate(policy.scaled, env_config, eval_config, device, progress)
+    with on_threads(1):  # sums of torch's depend on its threads
+        rows = evaluation.evaluate(policy.scaled, env_config, eval_config, device, progress)
     rows = [row | {"weights": evaluation.weights_hash(policy.actor)} for row in rows]
     key = ("goals", "goal_period", "seed", "worlds", "steps", "weights")
     fresh = {tuple(row[name] for name in key) for row in rows}

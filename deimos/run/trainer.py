@@ -11,7 +11,7 @@ from deimos.checks import RunError, SimulationError, check_at_least, check_choic
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
-from deimos.nn.matmul import keep_freed_memory, on_threads
+from deimos.nn.threads import on_threads
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
 from deimos.run.loop import GoalLoop, spaces
@@ -46,7 +46,7 @@ class TrainConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate and learn; auto takes the GPU where there is one."""
     threads: int = 0
-    """CPU threads, at least 0; 0 takes one per core that this process may use. Part of what fixes a run's numbers."""
+    """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
 
     def __post_init__(self) -> None:
         check_at_least("num_envs", self.num_envs, 1)
@@ -87,7 +87,6 @@ class Trainer:
     """Everything that a run holds in memory, and one iteration of it."""
 
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
-        keep_freed_memory()
         self.config = config
         self.env = config.env.build(config.num_envs, device, config.seed)
         if partial := [field.name for field in self.env.layout if field.seen_by != "both"]:
@@ -109,13 +108,9 @@ class Trainer:
         self.synchronise = False
         """Whether to wait for the device at the end of every part, to tell their times apart; for benchmarks."""
 
+    @torch.no_grad()
     def collect(self) -> None:
         """Let the policy act for one rollout."""
-        with on_threads(1):
-            self._collect()
-
-    @torch.no_grad()
-    def _collect(self) -> None:
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
         clock = _Clock(self)
         ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
@@ -143,6 +138,11 @@ class Trainer:
         Raises:
             SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
         """
+        # Sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not.
+        with on_threads(1):
+            return self._iterate()
+
+    def _iterate(self) -> dict[str, float]:
         try:
             self.collect()
             self.iteration += 1
@@ -155,8 +155,7 @@ class Trainer:
             learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
             self.ppo.check()
             clock.lap("update")
-            with on_threads(1):
-                selector = self.loop.core.learn(self.rollout)
+            selector = self.loop.core.learn(self.rollout)
             self.loop.selector.check()
             clock.lap("selector")
         except SimulationError as error:

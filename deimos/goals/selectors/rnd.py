@@ -12,8 +12,9 @@ from deimos.goals import picks
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 from deimos.nn.adam import Adam
-from deimos.nn.fusion import fused_scores
-from deimos.nn.networks import Activation, Backprop, ManyCandidates, Whitening, flatten_parameters, mlp
+from deimos.nn.losses import mean_squared_error
+from deimos.nn.mlps import MLPs
+from deimos.nn.networks import Activation, mlp
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.seeds import generator
 
@@ -84,14 +85,9 @@ class RND(GoalSelector):
                 nn.init.orthogonal_(layer.weight, 2**0.5, generator=weights)
         self.target.to(spaces.device)
         self.predictor.to(spaces.device)
-        # The difference of two networks of one hidden layer is one such network, at half of the calls.
-        units = (config.target + config.predictor,)
-        self._difference = mlp(inputs, units, config.features, config.activation).to(spaces.device)
-        self._parameters, _ = flatten_parameters(self.predictor)
-        self._join()
-        self._error = ManyCandidates(self._difference, spaces.goal_dim)
-        self._target_pass, self._pass = Backprop(self.target), Backprop(self.predictor)
-        self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=spaces.device))
+        self._target, self._predictor = MLPs([self.target]), MLPs([self.predictor])
+        rate = torch.tensor(config.learning_rate, dtype=torch.float32, device=spaces.device)
+        self.optimizer = Adam(self._predictor.parameters, self._predictor.grad, rate)
         self.generator = generator(seed, "rnd minibatches", spaces.device)
         # Inputs are whitened by the moments of states, active goals and *uniform* candidates; those of the
         # chosen goals would drift with what is chosen.
@@ -101,8 +97,6 @@ class RND(GoalSelector):
         self._context = slice(0, inputs - spaces.goal_dim)
         self._goal = slice(inputs - spaces.goal_dim, inputs)
         self._clip = CLIP if config.whiten else math.inf
-        whitening = Whitening(self._mean[self._goal], self._scale[self._goal], self._clip)
-        self._fused = fused_scores(self._difference, spaces.goal_dim, whitening=whitening)
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
         """Whether it has seen anything yet; before, nothing can be whitened."""
@@ -123,21 +117,9 @@ class RND(GoalSelector):
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
         context = self._whiten(torch.cat([state, goal], dim=1), self._context)
-        if self._fused is not None:
-            return self._fused(context, candidates)
-        return self._error(context, self._whiten(candidates, self._goal)).square_().mean(2)
-
-    @torch.no_grad()
-    def _join(self) -> None:
-        """Make the network of the difference from the two; call it whenever one of them has changed."""
-        (first, last), (t_first, t_last), (p_first, p_last) = (
-            [layer for layer in net if isinstance(layer, nn.Linear)]
-            for net in (self._difference, self.target, self.predictor)
-        )
-        torch.cat([t_first.weight, p_first.weight], out=first.weight.data)
-        torch.cat([t_first.bias, p_first.bias], out=first.bias.data)
-        torch.cat([-t_last.weight, p_last.weight], dim=1, out=last.weight.data)
-        torch.sub(p_last.bias, t_last.bias, out=last.bias.data)
+        candidates = self._whiten(candidates, self._goal)
+        error = self._predictor.score(context, candidates) - self._target.score(context, candidates)
+        return error[0].square_().mean(2)
 
     def _whiten(self, inputs: Tensor, part: slice) -> Tensor:
         return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-self._clip, self._clip)
@@ -158,8 +140,8 @@ class RND(GoalSelector):
         self.fitted = True
         everything = slice(0, len(self._mean))
         inputs = self._whiten(torch.cat([context, next_goal], dim=1), everything)
-        target = self._target_pass.forward(inputs)
-        surprise = (self._pass.forward(inputs) - target).square_().mean().item()
+        target = self._target.forward(inputs)[0]
+        surprise = (self._predictor.forward(inputs)[0] - target).square_().mean().item()
         return {"rnd/surprise": surprise, "rnd/loss": self._fit(inputs, target)}
 
     def _observe(self, inputs: Tensor) -> None:
@@ -174,28 +156,19 @@ class RND(GoalSelector):
 
     def _fit(self, inputs: Tensor, target: Tensor) -> float:
         """Adam on the mean squared error; returns that of the last pass."""
-        assert self._parameters.grad is not None
         size = -(-len(inputs) // self.config.minibatches)
         total = torch.zeros((), device=inputs.device)
         for _ in range(self.config.epochs):
             total.zero_()
             order = torch.randperm(len(inputs), generator=self.generator, device=inputs.device)
             for rows in order.split(size):
-                self._parameters.grad.zero_()
-                error = self._pass.forward(inputs[rows]) - target[rows]
-                self._pass.backward(error * (2.0 / error.numel()))
-                mean_over_ranks(self._parameters.grad)
+                loss = self._predictor.gradient(inputs[rows], mean_squared_error(target[rows]))
+                mean_over_ranks(self._predictor.grad)
                 self.optimizer.step()
-                total += error.square().sum()
-        self._join()
-        return (total / (len(inputs) * self.config.features)).item()
+                total += loss[0, 0] * len(rows)
+        return (total / len(inputs)).item()
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
-        if not bool(self._parameters.isfinite().all()):
+        if not bool(self._predictor.parameters.isfinite().all()):
             raise SimulationError("A weight of the RND predictor is not finite after a fit.")
-
-    def load_state_dict(self, state: dict) -> None:
-        """See ``Stateful.load_state_dict``."""
-        super().load_state_dict(state)
-        self._join()

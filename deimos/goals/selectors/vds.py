@@ -16,14 +16,12 @@ from deimos.goals import picks
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 from deimos.nn.adam import Adam
-from deimos.nn.ensemble import Stack, deviation
-from deimos.nn.matmul import on_threads
+from deimos.nn.losses import ValueLoss
+from deimos.nn.mlps import MLPs
 from deimos.nn.networks import Activation, mlp
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.returns import advantages
 from deimos.nn.seeds import generator
-
-WORKSPACE = 2**24  # numbers that the inputs of the candidates of decisions made at once may take
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,11 +96,10 @@ class VDS(GoalSelector):
         self.num_candidates = 1 if config.rule == "uniform" else config.candidates
         inputs, device = spaces.state_dim + spaces.goal_dim, spaces.device
         streams = (generator(seed, f"vds critic {k}") for k in range(config.critics))
-        self.stack = Stack([
-            mlp(inputs, config.hidden, 1, config.activation, weights).to(device) for weights in streams
-        ])  # fmt: skip
-        self._parameters = self.stack.parameters
-        self.optimizer = Adam(self._parameters, torch.tensor(config.learning_rate, device=device))
+        self.nets = MLPs([mlp(inputs, config.hidden, 1, config.activation, weights).to(device) for weights in streams])
+        self._parameters = self.nets.parameters
+        rate = torch.tensor(config.learning_rate, dtype=torch.float32, device=device)
+        self.optimizer = Adam(self._parameters, self.nets.grad, rate)
         self.generator = generator(seed, "vds minibatches", device)
         self._known: tuple[Tensor, Tensor] | None = None  # a whole rollout's observations and their values
 
@@ -110,13 +107,7 @@ class VDS(GoalSelector):
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
         if self.config.rule == "uniform":
             return uniform_proposal(candidates, draws[:, 0])
-        count = candidates.shape[1]
-        at_once = max(1, WORKSPACE // (count * (state.shape[1] + candidates.shape[2])))
-        values = []
-        for context, options in zip(state.split(at_once), candidates.split(at_once), strict=True):
-            inputs = torch.cat([context.unsqueeze(1).expand(-1, count, -1), options], dim=2)
-            values.append(self.stack.values(inputs.flatten(0, 1)))
-        score = deviation(torch.cat(values, dim=1)).view(-1, count)
+        score = deviation(self.nets.score(state, candidates).squeeze(3))
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
 
@@ -134,7 +125,7 @@ class VDS(GoalSelector):
     def values(self, obs: Tensor) -> Tensor:
         """Values by every critic, shape (K, ...), of observations of shape (..., obs_dim)."""
         inputs = self._spaces.state_then_goal(obs).flatten(0, -2)
-        return self.stack.values(inputs).view(len(self.stack.nets), *obs.shape[:-1])
+        return self.nets.forward(inputs).view(len(self.nets), *obs.shape[:-1])
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
@@ -165,14 +156,14 @@ class VDS(GoalSelector):
             value = self.values(rollout.obs)
         else:
             own = self._spaces.state_then_goal(rollout.obs)[:, worlds].transpose(0, 1)  # (K, steps, worlds, inputs)
-            value = self.stack.values(own.flatten(1, 2)).view(own.shape[:3])
+            value = self.nets.forward(own.flatten(1, 2)).view(own.shape[:3])
         old, next_value = value.transpose(0, 1)[:-1], value.transpose(0, 1)[1:]  # (num_steps, K, worlds of each)
         reward, terminated, truncated = (
             tensor[:, worlds] for tensor in (rollout.reward, rollout.terminated, rollout.truncated)
         )
         step, world, obs = rollout.cut_off()
         if len(step):
-            final = torch.zeros(*rollout.truncated.shape, len(worlds), device=value.device)
+            final = torch.zeros(*rollout.truncated.shape, len(worlds), dtype=value.dtype, device=value.device)
             final[step, world] = self.values(obs).t()
             member = torch.arange(len(worlds), device=value.device).unsqueeze(1)
             next_value = torch.where(truncated, final[:, worlds, member], next_value)
@@ -196,24 +187,28 @@ class VDS(GoalSelector):
         weight = rollout.weight.take(place)
         if bool(mean_over_ranks(weight.sum(1).min()) < size):
             return float("nan")
-        obs = self._spaces.state_then_goal(rollout.obs[:-1]).flatten(0, 1)
-        update = self.stack.gradients(
-            obs.index_select(0, place.flatten()).view(*order.shape, -1), old.flatten(1).gather(1, order),
-            returns.flatten(1).gather(1, order), weight, self.config.clip,
-        )  # fmt: skip
-        losses = torch.zeros(len(worlds), device=old.device)
-        assert self.stack.parameters.grad is not None
-        # A thread of torch's that has had work keeps waiting for more, and would take the processor from the updates.
-        with on_threads(1):
-            for _ in range(self.config.epochs):
-                for start in range(0, minibatches * size, size):
-                    losses += update(range(start, start + size))
-                    mean_over_ranks(self.stack.parameters.grad)
-                    self.stack.clip_gradients(self.config.max_grad_norm)
-                    self.optimizer.step()
+        order, place, weight = (tensor[:, : minibatches * size] for tensor in (order, place, weight))
+        obs = self._spaces.state_then_goal(rollout.obs[:-1]).flatten(0, 1).t()
+        x = obs.index_select(1, place.reshape(-1)).view(len(obs), *place.shape).permute(1, 2, 0)
+        weight = weight.unflatten(1, (minibatches, size))
+        weight = (weight / weight.sum(2, keepdim=True).clamp(min=1.0)).flatten(1)
+        data = [weight, *(values.flatten(1).gather(1, order) for values in (old, returns))]
+        loss, losses = ValueLoss(torch.stack(data, dim=1), self.config.clip), torch.zeros_like(old[:, 0, 0])
+        for _ in range(self.config.epochs):
+            for start in range(0, minibatches * size, size):
+                part = slice(start, start + size)
+                losses += self.nets.gradient(x[:, part], loss[part]).squeeze(1)
+                mean_over_ranks(self.nets.grad)
+                self.nets.clip_gradient(self.config.max_grad_norm)
+                self.optimizer.step()
         return losses.mean().item() / (self.config.epochs * minibatches)
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
         if not bool(self._parameters.isfinite().all()):
             raise SimulationError("A weight of the VDS ensemble is not finite after a fit.")
+
+
+def deviation(values: Tensor) -> Tensor:
+    """Standard deviation over the first axis; ``Tensor.std`` takes ten times as long along a strided axis."""
+    return (values - values.mean(0)).square_().mean(0).sqrt_()

@@ -1,0 +1,152 @@
+"""What runs ``kernels.mlp`` for ``MLPs``: memory, jobs, and threads that share them."""
+
+import ctypes
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from deimos.kernels.mlp import ACTIVATIONS, STEP, Job, Mode, Shape, record
+from deimos.nn.losses import Loss, Surrogate, ValueLoss
+from deimos.nn.threads import CREW
+
+ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
+BLOCK = 3 * 2**16  # numbers in a block, 768 KiB: what a core's second cache holds
+PARTS = 16  # of the rows of all networks together, each with a gradient of its own
+LEAST = 2e6  # operations that are worth waking a thread for, about 20 us
+
+
+class Kernel:
+    """The kernel for some networks. What it computes depends on their shape and the rows, never on the threads.
+
+    Args:
+        units: Inputs, and outputs of every layer.
+        activation: One of ``ACTIVATIONS``.
+        weights: Where every layer's weights start among a network's parameters.
+        free: Where the parameters that belong to no layer lie.
+        parameters: Shape (K, numbers), float32.
+        grad: The same of the gradient, which ``gradients`` writes.
+    """
+
+    @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
+    def __init__(
+        self, units: Sequence[int], activation: str, weights: Sequence[int], free: slice,
+        parameters: Tensor, grad: Tensor,
+    ) -> None:  # fmt: skip
+        wp.init()
+        self._parameters, self._grad, self._free, self._outputs = parameters, grad, free, units[-1]
+        self._threads = torch.get_num_threads()
+        count, self._size = parameters.shape
+        shape = Shape()
+        shape.layers, shape.activation = len(units) - 1, ACTIVATIONS.index(activation)
+        shape.parameters, shape.free = self._size, free.start
+        places = {"units": units, "weight": weights, "unit": [0, *itertools.accumulate(units)]}
+        for name, values in places.items():
+            setattr(shape, name, wp.array(values, dtype=int, device="cpu"))
+        self._operations = 2 * count * sum(a * b for a, b in itertools.pairwise(units))
+        columns = 2 * units[-1] + 3  # of the largest loss
+        self._room = max(STEP, min(ROOM, BLOCK // (sum(units) + columns)) // STEP * STEP)
+        self._memory = torch.zeros(self._threads, (sum(units) + columns) * self._room, dtype=torch.float32)
+        self._gradient = torch.zeros(0)
+        self._counter = ctypes.c_int32()
+        jobs = wp.zeros(1, dtype=Job, device="cpu")
+        self._job: Any = jobs.numpy()
+        self._fill(
+            count=count, room=self._room, counter=ctypes.addressof(self._counter), memory=self._memory.data_ptr(),
+            memory_size=self._memory.shape[1], parameters=parameters.data_ptr(),
+        )  # fmt: skip
+        self._launches = [record(shape, jobs, thread) for thread in range(self._threads)]
+
+    def _fill(self, **fields: float) -> None:
+        for name, value in fields.items():
+            self._job[name] = value
+
+    def forward(self, x: Tensor, start: Tensor | None = None, shared: int = 1) -> Tensor:
+        """Outputs of all networks, shape (K, n, outputs).
+
+        Args:
+            x: Inputs, shape (n, inputs) or (K, n, inputs); the last ones, where the others' share is in ``start``.
+            start: What the first layer's sums start from instead of its biases, shape (K, n / shared, units).
+            shared: Consecutive rows that start from the same.
+        """
+        rows = x.shape[-2]
+        y = torch.empty(len(self._parameters), rows, self._outputs, dtype=torch.float32)
+        start = None if start is None else start.contiguous()
+        with CREW.lock:
+            self._prepare(Mode.FORWARD, x, y)
+            self._fill(
+                parts=-(-rows // self._room), start=0 if start is None else start.data_ptr(), shared=shared
+            )  # fmt: skip
+            _run([self], rows * self._operations)
+        return y
+
+    def _prepare(self, mode: Mode, x: Tensor, y: Tensor | None) -> None:
+        """Fill in what every job has."""
+        self._counter.value = 0
+        net = x.stride(0) if x.dim() == 3 and len(x) > 1 else 0
+        self._fill(
+            mode=mode, rows=x.shape[-2], x=x.data_ptr(), x_net=net, x_row=x.stride(-2), x_unit=x.stride(-1),
+            inputs=x.shape[-1], y=0 if y is None else y.data_ptr(), start=0,
+        )  # fmt: skip
+
+    def prepare_gradient(self, mode: Mode, x: Tensor, sums: int, data: Tensor, clip: float = 0.0) -> float:
+        """Fill in a job that adds up gradients; ``data`` are the loss's, or gradients by outputs. Gives operations."""
+        rows, count = x.shape[-2], len(self._parameters)
+        parts = min(-(-rows // self._room), max(4, PARTS // count))
+        shape = (count, max(1, parts), self._size + sums)
+        if self._gradient.shape != shape:
+            with torch.inference_mode(False):
+                self._gradient = torch.zeros(shape, dtype=torch.float32)
+        self._prepare(mode, x, data if mode == Mode.BACKWARD else None)
+        self._fill(parts=parts, gradient=self._gradient.data_ptr(), sums=sums)
+        if mode != Mode.BACKWARD:
+            self._fill(
+                data=data.data_ptr(), data_net=data.stride(0), data_column=data.stride(1), columns=data.shape[1],
+                clip=clip,
+            )  # fmt: skip
+        return 3.0 * rows * self._operations
+
+    def collect(self) -> Tensor:
+        """Write the gradient of what has been run, added up in the order of the parts; gives the loss's sums."""
+        total = self._gradient.sum(1)
+        self._grad.copy_(total[:, : self._size])
+        return total[:, self._size :]
+
+
+def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
+    """See ``mlps.gradients``."""
+    if not all(isinstance(loss, ValueLoss | Surrogate) for _, _, loss in work):
+        return [_by_outputs(*item) for item in work]
+    with CREW.lock:
+        operations = 0.0
+        for kernel, x, loss in work:
+            assert isinstance(loss, ValueLoss | Surrogate)
+            mode = Mode.VALUE if isinstance(loss, ValueLoss) else Mode.SURROGATE
+            operations += kernel.prepare_gradient(mode, x, loss.sums, loss.data, loss.clip)
+        kernels = [kernel for kernel, _, _ in work]
+        _run(kernels, operations)
+        return [kernel.collect() for kernel in kernels]
+
+
+def _by_outputs(kernel: Kernel, x: Tensor, loss: Loss) -> Tensor:
+    """The gradient of a loss that torch computes between two passes."""
+    sums, delta, free = loss(kernel.forward(x), kernel._parameters[:, kernel._free])
+    delta = delta.contiguous()
+    with CREW.lock:
+        _run([kernel], kernel.prepare_gradient(Mode.BACKWARD, x, 0, delta))
+        kernel.collect()
+    kernel._grad[:, kernel._free] = free
+    return sums
+
+
+def _run(kernels: list[Kernel], operations: float) -> None:
+    """Run what has been prepared, on as many threads as it is worth."""
+
+    def work(thread: int) -> None:
+        for kernel in kernels:
+            kernel._launches[thread].launch()  # Python's lock is free meanwhile
+
+    CREW.run(work, max(1, min(min(kernel._threads for kernel in kernels), int(operations / LEAST))))

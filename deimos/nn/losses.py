@@ -1,0 +1,119 @@
+"""Losses of networks and their gradients by the outputs, written out in torch: the reference.
+
+``kernels.mlp`` has twins of ``ValueLoss`` and ``Surrogate``, which a CPU computes while a block of rows lies in its
+caches. Tests hold these functions to autograd in float64, and the twins to them.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+"""From outputs, shape (K, n, outputs), and a network's parameters that belong to no layer, shape (K, free), to sums
+over the rows, shape (K, sums), the first of which is minimised, and its gradients by outputs and by free parameters."""
+
+
+@dataclass(frozen=True)
+class ValueLoss:
+    """The squared error of values; clipped, it does not follow a value that has moved too far already.
+
+    Where a value has moved too far and clipping makes the loss larger, the clipped loss counts, and that one is flat.
+    Inside the clip both are the same but for rounding, which must not decide. Gives one sum, the loss.
+    """
+
+    data: Tensor
+    """Weight of every row, value before the update and target, shape (K, 3, n)."""
+    clip: float
+    """How far a value may move, positive; infinite for the plain squared error."""
+
+    sums: ClassVar[int] = 1
+
+    def __getitem__(self, rows: slice) -> "ValueLoss":
+        return replace(self, data=self.data[..., rows])
+
+    def __call__(self, value: Tensor, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See ``Loss``; there is one output."""
+        weight, old, target = self.data.unbind(1)
+        value = value.squeeze(2)
+        error, step = value - target, value - old
+        held = step.clamp(-self.clip, self.clip)
+        plain, clipped = error.square(), (old + held - target).square()
+        loss = (weight * torch.maximum(plain, clipped)).sum(1, keepdim=True)
+        slope = 2.0 * weight * error * ((step == held) | (plain >= clipped))  # 0 times NaN is NaN
+        return loss, slope.unsqueeze(2), torch.zeros_like(free)
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """PPO's clipped surrogate for a Gaussian policy: outputs are its mean, free parameters its standard deviation.
+
+    Its sums are the loss and, for every action, the square of how far the mean has moved: what the KL divergence needs.
+    The slope of max(-A r, -A clip(r)) is -A where the first is the larger or both are equal (inside the clip), and 0
+    elsewhere; log r has the slopes z / std and (z^2 - 1) / std.
+    """
+
+    data: Tensor
+    """Actions, means of the policy that acted, log-probability, advantage and weight, shape (1, 2 actions + 3, n)."""
+    clip: float
+    """How far the ratio of probabilities may move, positive."""
+
+    def __getitem__(self, rows: slice) -> "Surrogate":
+        return replace(self, data=self.data[..., rows])
+
+    @property
+    def sums(self) -> int:
+        """How many sums it gives."""
+        return (self.data.shape[1] - 1) // 2
+
+    def __call__(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See ``Loss``."""
+        size = mean.shape[2]
+        action, old_mean, (old_log_prob, advantage, weight) = self.data[0].split([size, size, 3])
+        mean, std = mean[0].t(), std[0].unsqueeze(1)  # with actions along the first axis, rows lie end to end
+        z = (action - mean) / std
+        ratio = (log_prob(z, std) - old_log_prob).exp()
+        plain, clipped = -advantage * ratio, -advantage * ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
+        slope = weight * plain * (plain >= clipped)  # by log r
+        loss = weight @ torch.maximum(plain, clipped)
+        sums = torch.cat([loss.unsqueeze(0), (mean - old_mean).square() @ weight])
+        by_mean, by_std = z / std * slope, (z.square() - 1.0) @ slope / std[:, 0]
+        return sums.unsqueeze(0), by_mean.t().unsqueeze(0), by_std.unsqueeze(0)
+
+
+def log_prob(z: Tensor, std: Tensor) -> Tensor:
+    """Log of the density of a Gaussian, shape (n,), at standardised z, shape (actions, n); ``std`` is (actions, 1)."""
+    return -0.5 * z.square().sum(0) - std.log().sum() - 0.5 * len(std) * math.log(2 * math.pi)
+
+
+def cross_entropy(target: Tensor, weight: Tensor) -> Loss:
+    """The binary cross-entropy of one logit; see ``Loss``.
+
+    Args:
+        target: In [0, 1], shape (n,).
+        weight: Weight of every row, shape (n,).
+    """
+
+    def loss(logit: Tensor, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        logit = logit.squeeze(2)
+        value = nn.functional.binary_cross_entropy_with_logits(logit[0], target, weight, reduction="sum")
+        return value.view(1, 1), ((logit.sigmoid() - target) * weight).unsqueeze(2), free
+
+    return loss
+
+
+def mean_squared_error(target: Tensor) -> Loss:
+    """The mean squared error of outputs; see ``Loss``.
+
+    Args:
+        target: Shape (n, outputs).
+    """
+
+    def loss(output: Tensor, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        error = output - target
+        return error.square().mean().view(1, 1), error * (2.0 / error.numel()), free
+
+    return loss

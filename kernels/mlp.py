@@ -1,0 +1,486 @@
+"""Multilayer perceptrons on the threads of a CPU: blocks of rows pass through all layers, and back, within its caches.
+
+A block lies unit by unit: the values of one unit for all rows of the block end to end. So a vector register holds one
+unit of several rows, and a weight meets it as one number: layers of any width fill the registers, and weights and
+gradients lie as torch lays them. Products are made of tiles, as many sums at a time as fit the registers.
+
+How many those are follows from the processor that Clang compiles for and changes no bit: an output is summed over its
+inputs in their order; a gradient over 16 interleaved sets of rows, then over these by halves. This module is for CPUs
+alone; a GPU never compiles it.
+"""
+
+from enum import IntEnum
+
+import warp as wp
+
+ACTIVATIONS = ("relu", "elu", "tanh")
+STEP = 48
+"""Rows of a block are a multiple of these: three registers of the widest kind."""
+
+_FLAGS = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+wp.set_module_options({
+    "enable_backward": False,
+    # A product and a sum become one instruction. Of registers of 512 bits Clang would use half by itself.
+    "cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast -mprefer-vector-width=512",
+})  # fmt: skip
+
+
+class Mode(IntEnum):
+    """What a job does with every block of rows."""
+
+    FORWARD = 0  # write the outputs
+    BACKWARD = 1  # add up gradients, given those by the outputs
+    VALUE = 2  # add up gradients of ``losses.ValueLoss``
+    SURROGATE = 3  # add up gradients of ``losses.Surrogate``
+
+
+@wp.struct
+class Shape:
+    """What the networks have in common."""
+
+    layers: int
+    activation: int  # index in ACTIVATIONS
+    parameters: int  # of a network
+    free: int  # where the parameters that belong to no layer start
+    units: wp.array[int]  # inputs, and outputs of every layer
+    weight: wp.array[int]  # where a layer's weights start among the parameters; its biases follow them
+    unit: wp.array[int]  # where the inputs, a layer's outputs and the loss's data start among the units of a block
+
+
+@wp.struct
+class Job:
+    """One call; memory by address, so that a recorded launch serves every call. Strides are in numbers."""
+
+    mode: int
+    count: int  # networks
+    rows: int
+    parts: int  # of the rows: what a thread takes at a time
+    room: int  # rows of a whole block
+    counter: wp.uint64  # parts that have been taken, int32
+    memory: wp.uint64  # of a block for every thread
+    memory_size: int
+    parameters: wp.uint64
+    gradient: wp.uint64  # of every network and part: its parameters' and the sums of the loss
+    sums: int
+    x: wp.uint64
+    x_net: int
+    x_row: int
+    x_unit: int
+    inputs: int  # that ``x`` has
+    y: wp.uint64  # outputs, or the gradients by them, shape (count, rows, outputs)
+    data: wp.uint64  # of the loss, shape (count, columns, rows)
+    data_net: int
+    data_column: int
+    columns: int
+    clip: float
+    start: wp.uint64  # if not 0, what the first layer's sums start from, shape (count, rows / shared, units)
+    shared: int  # consecutive rows with the same start
+
+
+@wp.struct
+class Block:
+    """Some rows of one network."""
+
+    parameters: wp.uint64
+    gradient: wp.uint64
+    memory: wp.uint64
+    room: int  # numbers from a unit to the next one
+    rows: int
+    inputs: int  # of the first layer, without those whose share it starts from
+
+
+# Vectors of the compiler: of a vector that is wider than a register it makes several.
+_VECTORS = """
+typedef float Vector __attribute__((vector_size(64)));
+typedef int Whole __attribute__((vector_size(64)));
+typedef Vector Loose __attribute__((aligned(4), may_alias));
+auto at = [](const float* p) __attribute__((always_inline)) -> Loose& { return *(Loose*)p; };
+auto total = [](Vector v) __attribute__((always_inline)) {
+    typedef float Eight __attribute__((vector_size(32)));
+    typedef float Four __attribute__((vector_size(16)));
+    const Eight e = __builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7)
+                  + __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
+    const Four f = __builtin_shufflevector(e, e, 0, 1, 2, 3) + __builtin_shufflevector(e, e, 4, 5, 6, 7);
+    return (f[0] + f[2]) + (f[1] + f[3]);
+};
+"""
+
+# With x = n log 2 + r, exp(x) is 2^n exp(r), and exp(x) - 1 is 2^n (exp(r) - 1) + (2^n - 1).
+_EXP = """
+auto expm1 = [](Vector x) __attribute__((always_inline)) {
+    const Vector bounded = x < -87.0f ? Vector{} - 87.0f : x > 88.0f ? Vector{} + 88.0f : x;  // NaN stays NaN
+    const Vector shifted = bounded * 1.44269504f + 12582912.0f;  // its last bits are n
+    const Vector n = shifted - 12582912.0f;
+    const Vector r = (bounded - n * 0.693359375f) + n * 2.12194440e-4f;
+    const Vector power = (Vector)(((Whole)shifted << 23) + 0x3f800000);
+    Vector p = r * (1.0f / 5040) + (1.0f / 720);
+    p = p * r + (1.0f / 120);
+    p = p * r + (1.0f / 24);
+    p = p * r + (1.0f / 6);
+    p = p * r + 0.5f;
+    p = p * r * r + r;
+    return x > 88.0f ? Vector{} + __builtin_inff() : power * p + (power - 1.0f);
+};
+"""
+
+
+def _by_height(line: str) -> str:
+    """A switch over the heights of a tile, which the compiler must know."""
+    cases = (f"case {n}: {line.replace('N', str(n))} break;" for n in range(1, 9))
+    return "\n".join(["switch (height) {", *cases, "}"])
+
+
+_PRODUCT = """
+#if defined(__AVX512F__)
+constexpr int lanes = 16, most = 8;  // 24 sums, 3 vectors and a factor in 32 registers
+#elif defined(__AVX__)
+constexpr int lanes = 8, most = 4;  // 12 sums in 16
+#else
+constexpr int lanes = 4, most = 8;
+#endif
+typedef float Vector __attribute__((vector_size(4 * lanes)));
+typedef Vector Loose __attribute__((aligned(4), may_alias));
+auto at = [](const float* p) __attribute__((always_inline)) -> Loose& { return *(Loose*)p; };
+const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], room = b.room;
+const int skipped = layer == 0 ? ins - b.inputs : 0;
+const bool relu = shape.activation == 0, elu = shape.activation == 1, linear = layer + 1 == shape.layers;
+float* below = (float*)b.memory + shape.unit.data[layer] * room;
+float* above = (float*)b.memory + shape.unit.data[layer + 1] * room;
+const float* weight = (const float*)b.parameters + shape.weight.data[layer];
+const float* bias = weight + ins * outs;
+const float* x = back ? above : below;
+float* y = back ? below : above;
+const int depth = back ? outs : ins - skipped, width = back ? ins : outs;
+const int to_next = back ? 1 : ins, to_deeper = back ? ins : 1;  // distances of weights
+auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
+    constexpr int height = sizeof(sum) / sizeof(sum[0]);
+    float* to = y + unit * room + row;
+    #pragma unroll
+    for (int i = 0; i < height; ++i)
+        #pragma unroll
+        for (int j = 0; j < 3; ++j)
+            sum[i][j] = back ? Vector{} : skipped ? Vector(at(to + i * room + j * lanes)) : Vector{} + bias[unit + i];
+    const float* w = weight + skipped + unit * to_next;
+    const float* v = x + row;
+    for (int k = 0; k < depth; ++k, w += to_deeper, v += room) {
+        const Vector v0 = at(v), v1 = at(v + lanes), v2 = at(v + 2 * lanes);
+        #pragma unroll
+        for (int i = 0; i < height; ++i) {
+            const float factor = w[i * to_next];
+            sum[i][0] += factor * v0;
+            sum[i][1] += factor * v1;
+            sum[i][2] += factor * v2;
+        }
+    }
+    #pragma unroll
+    for (int i = 0; i < height; ++i)
+        #pragma unroll
+        for (int j = 0; j < 3; ++j) {
+            Loose& out = at(to + i * room + j * lanes);
+            const Vector s = sum[i][j], h = out;
+            if (!back) out = relu && !linear ? (s <= 0.0f ? Vector{} : s) : s;  // NaN stays NaN
+            else if (relu) out = h <= 0.0f ? Vector{} : s;
+            else out = elu ? (h <= 0.0f ? s * (h + 1.0f) : s) : s * (1.0f - h * h);
+        }
+};
+for (int row = 0; row < b.rows; row += 3 * lanes)
+    for (int unit = 0, height; unit < width; unit += height) {
+        const int tiles = (width - unit + most - 1) / most;
+        height = (width - unit + tiles - 1) / tiles;
+        """ + _by_height("{ Vector sum[N][3]; tile(sum, row, unit); }") + """
+    }
+"""  # fmt: skip
+
+
+@wp.func_native(_PRODUCT)
+def _product(shape: Shape, b: Block, layer: int, back: bool):
+    """A layer's outputs; or the gradients by its inputs times the activation's slope, which take the inputs' place."""
+    ...
+
+
+_GRADIENT = _VECTORS + """
+#if defined(__AVX512F__)
+constexpr int most = 8;
+#else
+constexpr int most = 2;
+#endif
+const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], room = b.room;
+float* gradient = (float*)b.gradient + shape.weight.data[layer];
+const float* x = (const float*)b.memory + shape.unit.data[layer] * room;
+const float* delta = (const float*)b.memory + shape.unit.data[layer + 1] * room;
+auto tile = [&](auto& sum, int unit, int in) __attribute__((always_inline)) {
+    constexpr int height = sizeof(sum) / sizeof(sum[0]);
+    const int left = ins - in;  // less than three: some sums are made twice, and dropped
+    const float* d = delta + unit * room;
+    const float* v = x + in * room;
+    const int one = left > 1 ? room : 0, two = left > 2 ? 2 * room : 0;
+    #pragma unroll
+    for (int i = 0; i < height; ++i) sum[i][0] = sum[i][1] = sum[i][2] = Vector{};
+    for (int row = 0; row < b.rows; row += 16, d += 16, v += 16) {
+        const Vector v0 = at(v), v1 = at(v + one), v2 = at(v + two);
+        #pragma unroll
+        for (int i = 0; i < height; ++i) {
+            const Vector u = at(d + i * room);
+            sum[i][0] += u * v0;
+            sum[i][1] += u * v1;
+            sum[i][2] += u * v2;
+        }
+    }
+    #pragma unroll
+    for (int i = 0; i < height; ++i) {
+        float* to = gradient + (unit + i) * ins + in;
+        to[0] += total(sum[i][0]);
+        if (left > 1) to[1] += total(sum[i][1]);
+        if (left > 2) to[2] += total(sum[i][2]);
+    }
+};
+for (int unit = 0, height; unit < outs; unit += height) {
+    const int tiles = (outs - unit + most - 1) / most;
+    height = (outs - unit + tiles - 1) / tiles;
+    for (int in = 0; in < ins; in += 3) {
+        """ + _by_height("{ Vector sum[N][3]; tile(sum, unit, in); }") + """
+    }
+}
+for (int unit = 0; unit < outs; ++unit) {
+    Vector sum = {};
+    for (int row = 0; row < b.rows; row += 16) sum += at(delta + unit * room + row);
+    gradient[ins * outs + unit] += total(sum);
+}
+"""  # fmt: skip
+
+
+@wp.func_native(_GRADIENT)
+def _add_gradient(shape: Shape, b: Block, layer: int):
+    """Add the gradient by a layer's weights and biases."""
+    ...
+
+
+_CURVE = _VECTORS + _EXP + """
+float* y = (float*)b.memory + shape.unit.data[layer + 1] * b.room;
+for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.room)
+    for (int row = 0; row < b.rows; row += 16) {
+        const Vector s = at(y + row);
+        if (shape.activation == 1) at(y + row) = s <= 0.0f ? expm1(s) : s;
+        else {
+            const Vector e = expm1(s <= 0.0f ? 2.0f * s : -2.0f * s), t = e / (e + 2.0f);
+            at(y + row) = s <= 0.0f ? t : -t;
+        }
+    }
+"""  # fmt: skip
+
+
+@wp.func_native(_CURVE)
+def _bend(shape: Shape, b: Block, layer: int):
+    """Apply ELU or tanh to a layer's outputs; ReLU costs nothing while they are in registers."""
+    ...
+
+
+# What lies in a block behind a network's outputs follows ``losses.ValueLoss``.
+_VALUE = _VECTORS + """
+float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.room;
+const float* weight = value + b.room;
+const float* old = weight + b.room;
+const float* target = old + b.room;
+Vector loss = {};
+for (int row = 0; row < b.rows; row += 16) {
+    const Vector v = at(value + row), w = at(weight + row), error = v - at(target + row), step = v - at(old + row);
+    const Vector held = step < -clip ? Vector{} - clip : step > clip ? Vector{} + clip : step;
+    const Vector kept = at(old + row) + held - at(target + row), plain = error * error, clipped = kept * kept;
+    const Vector slope = 2.0f * w * error;
+    loss += w * (plain >= clipped ? plain : clipped);
+    at(value + row) = (step == held) | (plain >= clipped) ? slope : slope * 0.0f;  // 0 times NaN is NaN
+}
+((float*)b.gradient)[shape.parameters] += total(loss);
+"""  # fmt: skip
+
+
+@wp.func_native(_VALUE)
+def _value_loss(shape: Shape, b: Block, clip: float):
+    """Replace the outputs by the gradients of ``losses.ValueLoss`` by them, and add its sum."""
+    ...
+
+
+# What lies in a block behind a network's outputs follows ``losses.Surrogate``.
+_SURROGATE = _VECTORS + _EXP + """
+const int room = b.room, actions = shape.units.data[shape.layers];
+float* mean = (float*)b.memory + shape.unit.data[shape.layers] * room;
+const float* action = mean + actions * room;
+const float* old_mean = action + actions * room;
+float* log_prob = (float*)old_mean + actions * room;
+const float* advantage = log_prob + room;
+const float* weight = advantage + room;
+float* slope = log_prob;
+const float* std = (const float*)b.parameters + shape.free;
+float* std_gradient = (float*)b.gradient + shape.free;
+float* sums = (float*)b.gradient + shape.parameters;
+float normaliser = 0.918938533f * actions;
+for (int a = 0; a < actions; ++a) normaliser += logf(std[a]);
+Vector loss = {};
+for (int row = 0; row < b.rows; row += 16) {
+    Vector squares = {};
+    for (int a = 0; a < actions; ++a) {
+        const Vector z = (at(action + a * room + row) - at(mean + a * room + row)) / std[a];
+        squares += z * z;
+    }
+    const Vector ratio = expm1(-0.5f * squares - normaliser - at(log_prob + row)) + 1.0f, gain = -at(advantage + row);
+    const Vector least = Vector{} + (1.0f - clip), most = Vector{} + (1.0f + clip);
+    const Vector held = ratio < least ? least : ratio > most ? most : ratio;
+    const Vector plain = gain * ratio, clipped = gain * held;
+    const Vector by_ratio = at(weight + row) * plain;
+    loss += at(weight + row) * (plain >= clipped ? plain : clipped);
+    at(slope + row) = plain >= clipped ? by_ratio : by_ratio * 0.0f;
+}
+sums[0] += total(loss);
+for (int a = 0; a < actions; ++a) {
+    Vector by_std = {}, moved = {};
+    for (int row = 0; row < b.rows; row += 16) {
+        Loose& m = at(mean + a * room + row);
+        const Vector z = (at(action + a * room + row) - m) / std[a], step = m - at(old_mean + a * room + row);
+        by_std += (z * z - 1.0f) * at(slope + row);
+        moved += at(weight + row) * step * step;
+        m = z / std[a] * at(slope + row);
+    }
+    std_gradient[a] += total(by_std) / std[a];
+    sums[1 + a] += total(moved);
+}
+"""  # fmt: skip
+
+
+@wp.func_native(_SURROGATE)
+def _surrogate(shape: Shape, b: Block, clip: float):
+    """Replace the outputs by the gradients of ``losses.Surrogate`` by them; add those by deviations, and its sums."""
+    ...
+
+
+@wp.func_native("return address + 4 * ((wp::uint64)i * (wp::uint64)size + (wp::uint64)j * (wp::uint64)step);")
+def _offset(address: wp.uint64, i: int, size: int, j: int, step: int) -> wp.uint64:
+    """Where number i * size + j * step lies."""
+    ...
+
+
+@wp.func_native("""
+float* to = (float*)b.memory + unit * b.room;
+for (int i = 0; i < units; ++i, to += b.room) {
+    for (int row = 0; row < rows; ++row) to[row] = ((const float*)source)[row * to_row + i * to_unit];
+    for (int row = rows; row < b.rows; ++row) to[row] = 0.0f;
+}
+""")
+def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row: int, to_unit: int):
+    """Copy units of rows into a block, and 0 behind them."""
+    ...
+
+
+@wp.func_native("""
+const float* y = (const float*)b.memory + unit * b.room;
+for (int row = 0; row < rows; ++row)
+    for (int i = 0; i < units; ++i) ((float*)to)[row * units + i] = y[i * b.room + row];
+""")
+def _write(b: Block, unit: int, units: int, rows: int, to: wp.uint64):
+    """Copy units of rows out of a block, row by row."""
+    ...
+
+
+@wp.func_native("""
+float* y = (float*)b.memory + unit * b.room;
+for (int row = 0, until; row < rows; row = until) {
+    const float* own = (const float*)start + (wp::uint64)((first + row) / shared) * units;
+    until = (first + row) / shared * shared + shared - first;
+    until = until < rows ? until : rows;
+    for (int i = 0; i < units; ++i) for (int r = row; r < until; ++r) y[i * b.room + r] = own[i];
+}
+for (int i = 0; i < units; ++i) for (int r = rows; r < b.rows; ++r) y[i * b.room + r] = 0.0f;
+""")
+def _spread(b: Block, unit: int, units: int, first: int, rows: int, start: wp.uint64, shared: int):
+    """Write what the first layer's sums start from, the same for ``shared`` consecutive rows."""
+    ...
+
+
+@wp.func_native("for (int i = 0; i < count; ++i) ((float*)address)[i] = 0.0f;")
+def _clear(address: wp.uint64, count: int): ...
+
+
+@wp.func_native("return __atomic_fetch_add((int*)counter, 1, __ATOMIC_RELAXED);")
+def _take(counter: wp.uint64) -> int:
+    """The next number, for one thread alone: Warp's own ``atomic_add`` is none on a CPU."""
+    ...
+
+
+@wp.func
+def _forward(shape: Shape, b: Block):
+    for layer in range(shape.layers):
+        _product(shape, b, layer, False)
+        if shape.activation > 0 and layer + 1 < shape.layers:
+            _bend(shape, b, layer)
+
+
+@wp.func
+def _backward(shape: Shape, b: Block):
+    """Add all gradients, given those by the outputs in the outputs' place."""
+    for step in range(shape.layers):
+        layer = shape.layers - 1 - step
+        _add_gradient(shape, b, layer)
+        if layer > 0:
+            _product(shape, b, layer, True)
+
+
+@wp.func
+def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
+    """Take some rows through a network, and back."""
+    outs, end = shape.units[shape.layers], shape.unit[shape.layers]
+    y = _offset(job.y, net, job.rows * outs, first, outs)
+    if job.start != wp.uint64(0):
+        units = shape.units[1]
+        start = _offset(job.start, net, (job.rows // job.shared) * units, 0, 0)
+        _spread(b, shape.unit[1], units, first, rows, start, job.shared)
+    x = _offset(job.x, net, job.x_net, first, job.x_row)
+    _read(b, 0, b.inputs, rows, x, job.x_row, job.x_unit)
+    _forward(shape, b)
+    if job.mode == wp.static(int(Mode.FORWARD)):
+        _write(b, end, outs, rows, y)
+        return
+    if job.mode == wp.static(int(Mode.BACKWARD)):
+        _read(b, end, outs, rows, y, outs, 1)
+    else:
+        data = _offset(job.data, net, job.data_net, first, 1)
+        _read(b, shape.unit[shape.layers + 1], job.columns, rows, data, 1, job.data_column)
+        if job.mode == wp.static(int(Mode.VALUE)):
+            _value_loss(shape, b, job.clip)
+        else:
+            _surrogate(shape, b, job.clip)
+    _backward(shape, b)
+
+
+@wp.kernel
+def _work(shape: Shape, jobs: wp.array[Job], thread: int):
+    """Take parts until there are none left: cores that others use too are not equally fast."""
+    job = jobs[0]
+    b = Block()
+    b.memory = _offset(job.memory, thread, job.memory_size, 0, 0)
+    b.room = job.room
+    b.inputs = job.inputs
+    blocks = (job.rows + job.room - 1) // job.room
+    size = shape.parameters + job.sums
+    task = _take(job.counter)
+    while task < job.count * job.parts:
+        net, part = task // job.parts, task % job.parts
+        b.parameters = _offset(job.parameters, net, shape.parameters, 0, 0)
+        b.gradient = _offset(job.gradient, task, size, 0, 0)
+        if job.mode != wp.static(int(Mode.FORWARD)):
+            _clear(b.gradient, size)
+        for block in range(part * blocks // job.parts, (part + 1) * blocks // job.parts):
+            first = block * job.room
+            rows = wp.min(job.room, job.rows - first)
+            b.rows = (rows + STEP - 1) // STEP * STEP
+            _work_on(shape, job, b, net, first, rows)
+        task = _take(job.counter)
+
+
+def record(shape: Shape, jobs: wp.array, thread: int) -> wp.Launch:
+    """A launch for one thread, to be replayed with ``launch()`` whenever ``jobs[0]`` has been filled in.
+
+    Args:
+        shape: What the networks have in common.
+        jobs: The job, shape (1,).
+        thread: Which of the threads that share the job, from 0.
+    """
+    return wp.launch(_work, dim=1, inputs=[shape, jobs, thread], device="cpu", record_cmd=True)
