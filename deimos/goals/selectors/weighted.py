@@ -70,20 +70,19 @@ class Weighted(FearSelector):
         """See ``GoalSelector.propose``."""
         chosen = super().propose(rows, state, goal, candidates, draws)
         weight = torch.ones_like(draws[:, 0])
-        uniform = (
-            draws[:, 0] < self.config.mix if chosen.probe is None else (draws[:, 0] < self.config.mix) | chosen.probe
-        )
+        top = torch.zeros_like(weight, dtype=torch.bool)
         if self.afraid:
             assert chosen.percentile is not None
             count = candidates.shape[1]
             kept = picks.kept_above(self.config.percentile, count)
             mix = self.config.probe + (1.0 - self.config.probe) * self.config.mix
-            top = chosen.percentile > 100.0 * (1.0 - kept / count)
-            weight = (mix + (1.0 - mix) * top * (count / kept)) ** -self.config.alpha
-        else:
-            uniform = torch.ones_like(uniform)
+            inside = chosen.percentile > 100.0 * (1.0 - kept / count)
+            weight = (mix + (1.0 - mix) * inside * (count / kept)) ** -self.config.alpha
+            top = draws[:, 0] >= self.config.mix
+            if chosen.probe is not None:
+                top &= ~chosen.probe
         self._sums += torch.stack([torch.ones_like(weight), weight, weight.square()]).double().sum(1)
-        return replace(chosen, weight=weight, note=2 - uniform.long())
+        return replace(chosen, weight=weight, note=1 + top.long())
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``; adds the effective sample size, as a share, and the shift of the states."""
@@ -108,10 +107,8 @@ def _state_shift(interactions: Interactions) -> float:
     sides = [state[even & own] for own in (top, ~top)]
     if min(len(side) for side in sides) < 2:
         return math.nan
-    within = sum(side.var(dim=0).diag() if len(side) <= side.shape[1] else side.t().cov() for side in sides)
+    means = [side.mean(0) for side in sides]
+    within = sum((side - mean).t() @ (side - mean) / len(side) for side, mean in zip(sides, means, strict=True))
     ridge = 1e-3 * within.diagonal().mean() + 1e-12
-    direction = torch.linalg.solve(
-        within + ridge * torch.eye(state.shape[1], dtype=state.dtype, device=state.device),
-        sides[0].mean(0) - sides[1].mean(0),
-    )
-    return auroc((state @ direction)[~even], top[~even])
+    within.diagonal().add_(ridge)
+    return auroc((state @ torch.linalg.solve(within, means[0] - means[1]))[~even], top[~even])
