@@ -1,25 +1,36 @@
-"""The file name is the registration: a module in the package of environments, selectors or robots *is* the plugin.
+"""The file name is the registration: a module in a package of plug-ins *is* the plug-in of that name.
 
-Packages outside this tree register a module through an entry-point group: ``deimos.envs``, ``deimos.selectors`` or
-``deimos.robots``; a module that is not installed does it itself, when it is imported, by ``register``.
+Packages outside this tree register a module through an entry-point group, one of ``HOLDS``; a module that is not
+installed does it itself, when it is imported, by ``register``.
 """
 
+import dataclasses
 import importlib
 import pkgutil
-import sys
+import warnings
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from types import ModuleType
+from typing import Any
 
-_registered: dict[str, dict[str, ModuleType]] = {}  # by package: what was registered in this process
+from deimos.checks import RunError
+
+HOLDS = {
+    "deimos.envs": ("dataclass", "Config"), "deimos.selectors": ("dataclass", "Config"),
+    "deimos.robots": ("function", "build"), "deimos.shapes": ("dataclass", "Shape"),
+}  # fmt: skip
+"""What every plug-in of a group holds, and its name."""
+
+_registered: dict[str, dict[str, str]] = {}  # by group: names of plug-ins and modules, in this process
 
 
 def register(package: ModuleType, name: str, module: str) -> None:
-    """Make the module of a full name, which is being imported, the plugin ``name`` of ``package`` in this process."""
-    _registered.setdefault(package.__name__, {})[name] = sys.modules[module]
+    """Make a module, by its full name, the plug-in ``name`` of ``package`` in this process."""
+    _registered.setdefault(_group(package), {})[name] = module
 
 
 def names(package: ModuleType) -> list[str]:
-    """Names of the plugins of ``package``, sorted: its public modules and what was registered."""
+    """Names of the plug-ins of ``package``, sorted: its public modules and what was registered."""
     return sorted(_own(package) | set(entry_points(group=_group(package)).names) | set(_here(package)))
 
 
@@ -27,32 +38,61 @@ def _group(package: ModuleType) -> str:
     return "deimos." + package.__name__.rpartition(".")[2]
 
 
-def _here(package: ModuleType) -> dict[str, ModuleType]:
-    return _registered.get(package.__name__, {})
+def _here(package: ModuleType) -> dict[str, str]:
+    return _registered.get(_group(package), {})
 
 
 def _own(package: ModuleType) -> set[str]:
     return {module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_")}
 
 
-def load(package: ModuleType, name: str) -> ModuleType:
-    """Import the plugin ``name`` of ``package``; its own modules come before foreign ones of the same name.
+def load(package: ModuleType, name: str, use: Callable[[ModuleType], Any] = lambda module: module) -> Any:
+    """Import the plug-in ``name`` of ``package``; its own modules come before foreign ones of the same name.
+
+    Args:
+        package: Where it is.
+        name: Its name.
+        use: What the caller makes of the module: an error in it is the plug-in's too.
+
+    Returns:
+        What ``use`` has made of it; by default the module.
 
     Raises:
         ValueError: If there is none; the message lists those that there are.
+        RunError: If it is broken.
     """
-    if name not in names(package):
+    group, own = _group(package), name in _own(package)
+    entry = None if own else next(iter(entry_points(group=group, name=name)), None)
+    module = f"{package.__name__}.{name}" if own else entry.value if entry else _here(package).get(name)
+    if module is None:
         raise ValueError(f"{package.__name__} has no '{name}'; it has: {', '.join(names(package))}.")
-    if name in _own(package):
-        return importlib.import_module(f"{package.__name__}.{name}")
-    if name in _here(package):
-        return _here(package)[name]
-    return next(iter(entry_points(group=_group(package), name=name))).load()
+    kind, held = HOLDS[group]
+    try:
+        found = entry.load() if entry else importlib.import_module(module)
+        thing = getattr(found, held, None)
+        if not (callable(thing) if kind == "function" else dataclasses.is_dataclass(thing)):
+            raise TypeError(f"it holds no {kind} {held}")
+        return use(found)
+    except Exception as error:  # a foreign file may raise anything
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise RunError(f"The plug-in '{name}' of {group}, {module}, is broken ({reason}).") from error
+
+
+def load_all(package: ModuleType, use: Callable[[ModuleType], Any] = lambda module: module) -> dict[str, Any]:
+    """``load`` for every plug-in of ``package``, by its name; warns of each that is broken, and leaves it out."""
+    found = {}
+    for name in names(package):
+        try:
+            found[name] = load(package, name, use)
+        except RunError as error:
+            warnings.warn(str(error), stacklevel=2)
+    return found
 
 
 def name_of(package: ModuleType, module: str) -> str | None:
-    """Name of the plugin of ``package`` that a module is, by its full name; ``None`` if it is none. Imports nothing."""
-    own = {f"{package.__name__}.{name}": name for name in _own(package)}
+    """Name of the plug-in of ``package`` that a module is, by its full name; ``None`` if of none. Imports nothing."""
+    parent, _, name = module.rpartition(".")
+    if parent == package.__name__ and name in _own(package):
+        return name
     foreign = {entry.module: entry.name for entry in entry_points(group=_group(package))}
-    here = {plugin.__name__: name for name, plugin in _here(package).items()}
-    return (foreign | here | own).get(module)
+    return (foreign | {value: key for key, value in _here(package).items()}).get(module)

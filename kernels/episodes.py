@@ -87,11 +87,10 @@ def make_worlds(
     return worlds
 
 
-def record(kernel: wp.Kernel, worlds: Worlds, *inputs: object) -> wp.Launch:
-    """Record a kernel over all worlds; its first argument is ``worlds``, the others are ``inputs``."""
-    return wp.launch(
-        kernel, dim=worlds.num_threads, inputs=[worlds, *inputs], device=worlds.goal.device, record_cmd=True
-    )
+def record(kernel: wp.Kernel, worlds: Worlds, *inputs: object, dim: int | tuple[int, ...] | None = None) -> wp.Launch:
+    """Record a kernel whose first argument is ``worlds``, then ``inputs``; over all worlds, or ``dim`` threads."""
+    dim = worlds.num_threads if dim is None else dim
+    return wp.launch(kernel, dim, inputs=[worlds, *inputs], device=worlds.goal.device, record_cmd=True)
 
 
 @wp.func
@@ -169,11 +168,11 @@ def end_step(env: int, crashed: wp.bool, over: wp.bool, cause: int, worlds: Worl
 
 @wp.kernel
 def _set_goals(
+    # In and out
+    worlds: Worlds,
     # In
     row: wp.array[int],
     goal: wp.array2d[float],
-    # In and out
-    worlds: Worlds,
 ):
     i = wp.tid()
     env = row[i]
@@ -200,37 +199,4 @@ def set_goals(row: wp.array, goal: wp.array, worlds: Worlds) -> wp.Launch:
     """
     require("row", row, dtype=wp.int32, shape=row.shape, like=worlds.goal)
     require("goal", goal, dtype=wp.float32, shape=(*row.shape, *worlds.goal.shape[1:]), like=row)
-    return wp.launch(_set_goals, row.shape[0], inputs=[row, goal, worlds], device=row.device, record_cmd=True)
-
-
-@wp.kernel
-def _make_relative(
-    # In
-    row: wp.array[int],
-    worlds: Worlds,
-    # In and out
-    candidate: wp.array3d[float],
-):
-    i, k = wp.tid()
-    for c in range(candidate.shape[2]):
-        candidate[i, k, c] = candidate[i, k, c] - worlds.origin[row[i], c] * worlds.goal_scale[c]
-
-
-def make_relative(row: wp.array, worlds: Worlds, candidate: wp.array) -> wp.Launch:
-    """Record expressing candidate goals as seen from the origin of each world, where there is one.
-
-    Args:
-        row: Worlds that the candidates are for, int32, shape (n,), each in [0, num_envs).
-        worlds: The worlds; only ``origin`` and ``goal_scale`` are read.
-        candidate: Scaled goals, float32, shape (n, count, goal_dim). Updated to scaled differences.
-
-    Raises:
-        ValueError: If an array has another shape, dtype or device.
-    """
-    require("row", row, dtype=wp.int32, shape=row.shape, like=worlds.goal)
-    require("worlds.origin", worlds.origin, like=worlds.goal)
-    shape = (row.shape[0], *candidate.shape[1:2], worlds.goal.shape[1])
-    require("candidate", candidate, dtype=wp.float32, shape=shape, like=row)
-    return wp.launch(
-        _make_relative, candidate.shape[:2], inputs=[row, worlds, candidate], device=row.device, record_cmd=True
-    )
+    return record(_set_goals, worlds, row, goal, dim=len(row))

@@ -1,10 +1,11 @@
 """The file name is the registration: a module in ``terrain.shapes`` is the shape of that name."""
 
-import importlib
-import pkgutil
 from collections.abc import Mapping
 from dataclasses import replace
+from types import ModuleType
 from typing import Any, get_args, get_type_hints
+
+from deimos import plugins
 
 from . import shapes
 from .shape import TileShape
@@ -39,20 +40,19 @@ def make(name: str, parameters: Mapping[str, Any] | None = None) -> TileShape:
 
 def name_of(shape: TileShape) -> str:
     """The name that ``make`` knows a shape by."""
-    stem = type(shape).__module__.rpartition(".")[2].replace("_", "-")
-    direction = getattr(shape, "direction", None)
-    return stem if direction is None else f"{stem}-{direction}"
+    stem = plugins.name_of(shapes, type(shape).__module__) or type(shape).__name__
+    return "-".join([stem.replace("_", "-"), *filter(None, [getattr(shape, "direction", None)])])
 
 
 def _defaults() -> dict[str, TileShape]:
     """Every shape with its default parameters, by its name."""
-    found: list[TileShape] = []
-    for module in pkgutil.iter_modules(shapes.__path__):
-        if not module.name.startswith("_"):
-            cls = importlib.import_module(f"{shapes.__name__}.{module.name}").Shape
-            directions = get_args(get_type_hints(cls).get("direction"))
-            found += [cls(direction=way) for way in directions] or [cls()]
-    return {name_of(shape): shape for shape in found}
+    return {name_of(shape): shape for found in plugins.load_all(shapes, _of_module).values() for shape in found}
+
+
+def _of_module(module: ModuleType) -> list[TileShape]:
+    """The shapes of a module: one for each of its directions."""
+    directions = get_args(get_type_hints(module.Shape).get("direction"))
+    return [module.Shape(direction=way) for way in directions] or [module.Shape()]
 
 
 def convert(name: str, value: Any, hint: Any) -> Any:

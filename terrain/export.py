@@ -1,6 +1,7 @@
 """What the tool writes: meshes, the height grid, a MuJoCo model."""
 
 import math
+import re
 import struct
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from .mesh import Mesh
 
 ENDINGS = (".glb", ".obj", ".ply", ".stl", ".npz", ".png")
 MJCF_FILES = ("terrain.xml", "heights.bin")
+_NOTE = "height [m] = {low!r} + {unit!r} * grey; {cell!r} m per pixel; lower left pixel at x = {x!r} m, y = {y!r} m"
+GREY_NOTE = re.compile(re.sub(r"\\{(\w+)!r\\}", r"(?P<\1>\\S+)", re.escape(_NOTE)))
+"""What a picture of heights says of itself, with the groups ``low``, ``unit``, ``cell``, ``x`` and ``y``."""
 BASE = 1.0  # [m] of solid ground below the lowest sample of a MuJoCo model
 
 _MJCF = """\
@@ -92,8 +96,13 @@ def _mesh_bytes(mesh: Mesh, ending: str) -> bytes:
     if ending == ".glb":  # glTF 2.0, section 3.4: y is up
         mesh = mesh.copy()
         mesh.vertices = np.asarray(mesh.vertices)[:, [0, 2, 1]] * [1, 1, -1]
+    if ending == ".obj":  # trimesh writes eight decimals, which are not the float32 numbers of the other formats
+        vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces) + 1
+        text = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel().tolist())
+        return (text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel().tolist())).encode()
     data = mesh.export(file_type=ending[1:])
-    return data.encode() if isinstance(data, str) else bytes(data)
+    assert isinstance(data, bytes)  # of these three formats
+    return data
 
 
 def _save_grey(path: Path, terrain: Terrain) -> None:
@@ -102,7 +111,6 @@ def _save_grey(path: Path, terrain: Terrain) -> None:
     numbers, low, unit = grey(terrain)
     notes = PngImagePlugin.PngInfo()
     x, y = terrain.corner
-    notes.add_text("Description", f"height [m] = {low!r} + {unit!r} * grey; {terrain.cell!r} m per pixel; "
-                                  f"lower left pixel at x = {x!r} m, y = {y!r} m")  # fmt: skip
+    notes.add_text("Description", _NOTE.format(low=low, unit=unit, cell=terrain.cell, x=x, y=y))
     image = Image.fromarray(numbers)
     write_whole(path, lambda file: image.save(file, format="PNG", pnginfo=notes))

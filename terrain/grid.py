@@ -33,6 +33,7 @@ class Terrain:
     """Difficulty of each level, in [0, 1], float32, shape (levels,)."""
 
     def __post_init__(self) -> None:
+        check_heights(self.heights)
         check_positive("cell", self.cell, finite=True)
         check_positive("tile", self.tile, finite=True)
         levels, columns = len(self.difficulty), len(self.shapes)
@@ -42,8 +43,6 @@ class Terrain:
                 raise ValueError(f"{name} must be float32 of shape {shape}, got {array.dtype} of shape {array.shape}.")
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite everywhere.")
-        if self.heights.ndim != 2 or min(self.heights.shape) < 2:
-            raise ValueError(f"heights must have at least 2 x 2 samples, got the shape {self.heights.shape}.")
 
     @property
     def size(self) -> tuple[float, float]:
@@ -77,7 +76,10 @@ class Terrain:
             data["corner"] = tuple(float(value) for value in data["corner"])
             return Terrain(**data | {name: float(data[name]) for name in ("cell", "tile")})
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({error}).") from error
+            raise ValueError(
+                f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({str(error).rstrip('.')}); "
+                "files of other programs are imported first: deimos terrain import."
+            ) from error
 
 
 def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
@@ -92,15 +94,22 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
     """
     check_positive("size", size, finite=True)
     samples = cells("size", size, cell) + 1
-    return Terrain(
-        heights=np.zeros((samples, samples), np.float32),
-        cell=cell,
-        corner=(-size / 2, -size / 2),
-        origins=np.zeros((1, 1, 3), np.float32),
-        shapes=("flat",),
-        tile=size,
-        difficulty=np.zeros(1, np.float32),
-    )
+    corner, origins, difficulty = (-size / 2, -size / 2), np.zeros((1, 1, 3), np.float32), np.zeros(1, np.float32)
+    return Terrain(np.zeros((samples, samples), np.float32), cell, corner, origins, ("flat",), size, difficulty)
+
+
+def check_heights(heights: np.ndarray) -> None:
+    """Raise ``ValueError`` unless ``heights`` are a grid of at least 2 x 2 finite numbers."""
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise ValueError(f"heights must have at least 2 x 2 samples, got the shape {heights.shape}.")
+    if not np.isfinite(heights).all():
+        raise ValueError("heights must be finite everywhere.")
+
+
+def on_ground(middles: np.ndarray, heights: np.ndarray, cell: float, corner: tuple[float, float]) -> np.ndarray:
+    """Points on the samples' ground, float32, shape (..., 3), above each x and y [m] of ``middles``, shape (..., 2)."""
+    i, j = np.moveaxis(np.rint((middles - corner) / cell).astype(int), -1, 0)
+    return np.concatenate([middles, heights[i, j][..., None]], axis=-1).astype(np.float32)
 
 
 def cells(name: str, length: float, cell: float) -> int:

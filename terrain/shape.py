@@ -39,6 +39,11 @@ class TileShape(abc.ABC):
         if self.platform >= self.tile:
             raise ValueError(f"platform must be smaller than tile = {self.tile:g} m, got {self.platform:g} m.")
 
+    def check_room(self, what: str, room: float) -> None:
+        """Raise ``ValueError`` unless the tile is larger than ``room`` [m], the sum that ``what`` spells out."""
+        if room >= self.tile:
+            raise ValueError(f"tile must be larger than {what} = {room:g} m, got {self.tile:g} m.")
+
     @classmethod
     def parameters(cls) -> dict[str, Any]:
         """Names and types of the fields that a caller may set: all but ``direction``, which is in the shape's name."""

@@ -10,7 +10,7 @@ from deimos.kernels.ray_cast import LARGEST
 from deimos.checks import check_at_least, check_positive, check_range
 
 from . import catalog
-from .grid import Terrain, cells
+from .grid import Terrain, cells, on_ground
 from .heightfield import rasterise
 from .mesh import Mesh, from_quads, from_triangles
 from .shape import TileShape
@@ -105,18 +105,18 @@ class Grid:
         return self.levels * tile + 2 * border + 1, self.columns * tile + 2 * border + 1
 
     @property
+    def memory(self) -> int:
+        """About how much memory the making takes [B]."""
+        nx, ny = self.num_samples
+        return BYTES_PER_SAMPLE * nx * ny + BYTES_PER_TILE * self.levels * self.columns
+
+    @property
     def centres(self) -> np.ndarray:
         """Middle of each tile at height 0 [m], shape (levels, columns, 3)."""
         level, column = np.indices((self.levels, self.columns))
         x = (level + 0.5 - self.levels / 2) * self.tile
         y = (column + 0.5 - self.columns / 2) * self.tile
         return np.stack([x, y, np.zeros_like(x)], axis=-1)
-
-    @property
-    def memory(self) -> int:
-        """About how much memory the making takes [B]."""
-        nx, ny = self.num_samples
-        return BYTES_PER_SAMPLE * nx * ny + BYTES_PER_TILE * self.levels * self.columns
 
 
 def build(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> Terrain:
@@ -137,18 +137,15 @@ def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | Non
     Raises:
         ValueError: If it would not fit into memory.
     """
-    _require_memory(grid)
+    require_memory(grid.num_samples, grid.memory, "cell", grid.cell)
     report = progress or (lambda stage, share: None)
     mesh = build_mesh(grid, report)
     heights = rasterise(
         mesh, grid.corner, grid.cell, grid.num_samples, device=device, progress=lambda share: report("rays", share)
     )
-    origins = grid.centres
-    i, j = np.moveaxis(np.rint((origins[..., :2] - grid.corner) / grid.cell).astype(int), -1, 0)
-    origins[..., 2] = heights[i, j]
+    origins = on_ground(grid.centres[..., :2], heights, grid.cell, grid.corner)
     names = tuple(catalog.name_of(shape) for shape in grid.column_shapes)
-    terrain = Terrain(heights, grid.cell, grid.corner, origins.astype(np.float32), names, grid.tile, grid.difficulty)
-    return terrain, mesh
+    return Terrain(heights, grid.cell, grid.corner, origins, names, grid.tile, grid.difficulty), mesh
 
 
 def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
@@ -172,20 +169,27 @@ def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
     return from_triangles(*append_faces([part.vertices for part in parts], [part.faces for part in parts]))
 
 
-def _require_memory(grid: Grid) -> None:
-    """Raise ``ValueError`` if a grid has too many samples, or its making would not fit into memory."""
-    most = max(grid.num_samples) - 1
+def require_memory(num_samples: tuple[int, int], need: int, name: str, cell: float) -> None:
+    """Raise ``ValueError`` if a height grid has too many samples, or its making would not fit into memory.
+
+    Args:
+        num_samples: Samples along x and y.
+        need: Memory that is needed [B].
+        name: What the caller calls ``cell``, for the message.
+        cell: Distance of two samples [m].
+    """
+    most = max(num_samples) - 1
     if most > LARGEST:
         raise ValueError(
-            f"cell must be at least {grid.cell * most / LARGEST:.3g} m for {LARGEST} cells along an axis at most, "
-            f"got {grid.cell:g} m, which makes {most}."
+            f"{name} must be at least {cell * most / LARGEST:.3g} m for {LARGEST} cells along an axis at most, "
+            f"got {cell:g} m, which makes {most}."
         )
     free = _free_memory()
-    if grid.memory > free:
-        nx, ny = grid.num_samples
+    if need > free:
+        nx, ny = num_samples
         raise ValueError(
-            f"The grid of {nx} x {ny} samples needs about {grid.memory / 2**30:.1f} GiB of memory and "
-            f"{free / 2**30:.1f} GiB are free; enlarge cell, or ask for fewer levels or columns."
+            f"The grid of {nx} x {ny} samples needs about {need / 2**30:.1f} GiB of memory and "
+            f"{free / 2**30:.1f} GiB are free; enlarge {name}, or ask for less ground."
         )
 
 

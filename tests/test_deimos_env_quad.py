@@ -1,7 +1,9 @@
 """Quad: what an environment promises, shown on the Go1 without and with its arm, and the task of the thesis."""
 
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +16,15 @@ from deimos.kernels.legged.state import COLUMNS
 from deimos.kernels.legged.step import evaluate_step
 from deimos.kernels.random import Purpose
 from deimos.terrain import Grid, Share
+from deimos.terrain.shapes.flat import Shape as Flat
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
+import deimos
 from deimos import terrain
 from deimos.checks import SimulationError
 from deimos.goals.selectors import uniform
+from deimos.learn.ppo import PPOConfig
+from deimos.run import training
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import Step
 from deimos.sim.envs import quad_arm
@@ -209,7 +215,7 @@ def test_warp_and_torch_see_one_allocation_and_views_stay(task, torch_device):
         loop.advance(last)
     assert last is first
     assert addresses == [t.data_ptr() for t in (*env.tensors.values(), *vars(last).values())]
-    assert env.tensors["qpos"].data_ptr() == env.physics.qpos.ptr
+    assert env.tensors["qpos"].data_ptr() == env.physics.arrays.qpos.ptr
 
 
 @both
@@ -657,7 +663,7 @@ def test_actions_are_what_the_joints_can_do(torch_device):
     assert env.action_bound == pytest.approx(np.abs(ends).max())
     np.testing.assert_allclose(torch.stack(env.action_range), ends.T, rtol=1e-6)
     step = env.step(torch.tensor([[1e6], [-1e6]], device=torch_device).expand(2, 12))
-    np.testing.assert_allclose(env.physics.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(env.physics.arrays.ctrl.numpy(), [high, low], rtol=0, atol=1e-6)
     np.testing.assert_allclose(step.obs[:, 36:48].cpu(), ends.T[::-1], rtol=1e-6)
 
 
@@ -713,10 +719,52 @@ def test_config_rejects_bad_values(config, message):
         Config(**config)
 
 
+def test_robots_start_on_the_terrain(torch_device, tmp_path):
+    """Ground that ends where robots start is refused with the border that it lacks; with it, none leaves at once."""
+
+    def tiles(border):
+        shape = Share(shape=Flat(tile=2.0, platform=1.0))
+        grid = Grid(shapes=(shape,), levels=3, columns=3, tile=2.0, border=border, cell=0.1)
+        terrain.build(grid).save(tmp_path / "tiles.npz")
+        return build(torch_device, num_envs=64, terrain=str(tmp_path / "tiles.npz"), stagger=False)
+
+    with pytest.raises(ValueError, match=r"terrain must reach 1.3 m .*, got 1 m; .* or its border wider by 0.3 m"):
+        tiles(border=0.0)
+    env = tiles(border=0.3)
+    step = env.step(torch.zeros(64, env.action_dim, device=torch_device))
+    assert not step.truncated.any()
+
+
+def test_a_run_keeps_its_terrain(tmp_path, monkeypatch, hills):
+    """A run resumes and is evaluated in any folder, with the terrain file gone and its own folder moved."""
+    (tmp_path / "before").mkdir()
+    (tmp_path / "after").mkdir()
+    monkeypatch.chdir(tmp_path / "before")
+    shutil.copy(hills, "mine.npz")
+    config = deimos.TrainConfig(
+        env=Config(goal_period=5, episode_steps=40, terrain="mine.npz"), method="uniform", num_envs=8, env_steps=192,
+        ppo=PPOConfig(hidden=(8,)), evaluation=False, device="cpu", threads=1,
+    )  # fmt: skip
+    run = deimos.train(config, "run")
+    run.rename(tmp_path / "after" / "run")
+    Path("mine.npz").unlink()
+    monkeypatch.chdir(tmp_path / "after")
+    trainer, folder = training.resume(Path("run"), env_steps=384)
+    assert np.array_equal(trainer.env.terrain.heights, terrain.load(hills).heights)
+    training.train(trainer, folder)
+    again, _ = training.resume(Path("run"), env_steps=576)  # once more: resuming wrote the configuration anew
+    assert again.env.terrain.shapes == ("stairs-up", "stairs-down")
+    monkeypatch.chdir(tmp_path)
+    naive, *_ = deimos.evaluate("after/run", worlds=4, steps=20)
+    assert naive["steps"] == 20
+
+
 def test_unknown_and_broken_terrains_are_refused(tmp_path):
     """A terrain that is neither a name nor a file, and a file that is not one, each give one clear line."""
-    with pytest.raises(ValueError, match=r"terrain must be flat, rough or the path of a saved terrain, got 'moon'"):
+    with pytest.raises(ValueError, match=r"terrain must be flat, rough or the path of a terrain file, got 'moon'"):
         Config(terrain="moon").load_terrain()
+    with pytest.raises(ValueError, match=r"got 'h.stl'; make one of it by: deimos terrain import h.stl --out h.npz"):
+        Config(terrain="h.stl").load_terrain()
     (tmp_path / "x.npz").write_bytes(b"no terrain")
     with pytest.raises(ValueError, match="is not a terrain file"):
         Config(terrain=str(tmp_path / "x.npz")).load_terrain()

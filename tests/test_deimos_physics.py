@@ -43,9 +43,9 @@ def place(physics, z, quat=(1, 0, 0, 0), robot=ROBOT):
     qpos = np.zeros((physics.num_envs, 7 + len(robot.pose)), np.float32)
     qpos[:, 2:7] = [z, *quat]
     qpos[:, 7:] = robot.pose
-    physics.qpos.assign(qpos)
-    physics.ctrl.assign(qpos[:, 7:])
-    physics.qvel.zero_()
+    physics.arrays.qpos.assign(qpos)
+    physics.arrays.ctrl.assign(qpos[:, 7:])
+    physics.arrays.qvel.zero_()
 
 
 def reference(physics, world=0):
@@ -58,12 +58,12 @@ def run_both(physics, targets):
     data = reference(physics)
     ours, theirs = [], []
     for target in targets:
-        physics.ctrl.assign(np.tile(target, (physics.num_envs, 1)).astype(np.float32))
+        physics.arrays.ctrl.assign(np.tile(target, (physics.num_envs, 1)).astype(np.float32))
         physics.step()
         data.ctrl[:] = target
         for _ in range(physics.config.substeps):
             mujoco.mj_step(physics.model, data)
-        ours.append(np.concatenate([physics.qpos.numpy()[0], physics.qvel.numpy()[0]]))
+        ours.append(np.concatenate([physics.arrays.qpos.numpy()[0], physics.arrays.qvel.numpy()[0]]))
         theirs.append(np.concatenate([data.qpos, data.qvel]))
     return np.array(ours), np.array(theirs)
 
@@ -88,7 +88,7 @@ def test_free_flight_agrees_with_mujoco(name, device):
     physics = make(1, device, robot=robot)
     nq, nv = physics.model.nq, physics.model.nv
     qvel = np.random.default_rng(1).normal(size=(1, nv)).astype(np.float32)
-    physics.qvel.assign(qvel)
+    physics.arrays.qvel.assign(qvel)
     ours, theirs = run_both(physics, np.hstack([wave(25, 0.4), swing(25, nv - 18)]))
     # 100 substeps, each with rounding of about 1e-7 in numbers of order 5, and forces of 30 N m/rad that bind them.
     np.testing.assert_allclose(ours[:, :nq], theirs[:, :nq], rtol=0, atol=1e-4)
@@ -116,9 +116,9 @@ def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
     physics = make(1, device, stairs)
     tilt = np.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0])
     place(physics, stairs.heights.max() + 0.45, tilt)
-    qpos = physics.qpos.numpy()
+    qpos = physics.arrays.qpos.numpy()
     qpos[0, 0] = 0.9
-    physics.qpos.assign(qpos)
+    physics.arrays.qpos.assign(qpos)
     ours, theirs = run_both(physics, np.tile(ROBOT.pose, (100, 1)))
     touched = np.flatnonzero(np.abs(np.diff(theirs[:, 21])) < 0.15)[0]  # the fall is braked
     # A fall is chaotic: contacts on the two sides of a prism's edge part ways, so only its start can be compared.
@@ -128,7 +128,7 @@ def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
     np.testing.assert_allclose(ours[:first, 3:19], theirs[:first, 3:19], rtol=0, atol=3e-2)
     low = stairs.heights.min()
     assert low < ours[-1, 2] < stairs.heights.max() + 0.45
-    assert not physics.overflow.numpy()[0] & physics.lost_contacts
+    assert not physics.arrays.overflow.numpy()[0] & physics.lost_contacts
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -138,7 +138,7 @@ def test_part_forces_carry_the_robot(name, device):
     place(physics, 0.29, robot=ROBOTS[name])
     for _ in range(150):
         physics.step()
-    force = physics.part_force.numpy()
+    force = physics.arrays.part_force.numpy()
     assert force.shape == (4, 3, 13)
     # What remains of the swaying after 3 s moves the forces by less than 2 %.
     np.testing.assert_allclose(force[:, :, 1:5].sum(axis=2), MASS[name] * 9.81, rtol=0.02)
@@ -159,7 +159,7 @@ def test_part_forces_agree_with_mujoco(device):
         expected[next(part[name] for name in names if name in part)] += wrench[0]
     assert expected[0] > 1.0
     # Five Newton iterations converge to float32's accuracy of a stiff problem.
-    np.testing.assert_allclose(physics.part_force.numpy()[0, 0], expected, rtol=1e-2, atol=0.1)
+    np.testing.assert_allclose(physics.arrays.part_force.numpy()[0, 0], expected, rtol=1e-2, atol=0.1)
 
 
 def test_reset_forgets_everything_and_touches_nobody_else(device):
@@ -168,9 +168,9 @@ def test_reset_forgets_everything_and_touches_nobody_else(device):
     for both in (physics, twin):
         place(both, 0.3)
         both.step()
-    qpos = physics.qpos.numpy()
+    qpos = physics.arrays.qpos.numpy()
     qpos[1] = np.nan
-    physics.qpos.assign(qpos)
+    physics.arrays.qpos.assign(qpos)
     for both in (physics, twin):
         both.step()
     assert np.isnan(physics.tensors["warmstart"][1].cpu().numpy()).any()
@@ -189,9 +189,9 @@ def test_identical_worlds_stay_identical(device):
     physics = make(5, device)
     place(physics, 0.3)
     for target in wave(20, 0.3):
-        physics.ctrl.assign(np.tile(target, (5, 1)).astype(np.float32))
+        physics.arrays.ctrl.assign(np.tile(target, (5, 1)).astype(np.float32))
         physics.step()
-    qpos = physics.qpos.numpy()
+    qpos = physics.arrays.qpos.numpy()
     if device == "cpu":
         np.testing.assert_array_equal(qpos, np.tile(qpos[0], (5, 1)))
     else:  # the order of contacts, and with it that of sums, is not fixed there
@@ -209,7 +209,7 @@ def test_capture_replays_the_step(device):
     for _ in range(5):
         step()
         twin.step()
-    np.testing.assert_array_equal(physics.qpos.numpy(), twin.qpos.numpy())
+    np.testing.assert_array_equal(physics.arrays.qpos.numpy(), twin.arrays.qpos.numpy())
 
 
 def test_a_long_silence_is_explained(torch_device, capsys, monkeypatch):
@@ -227,11 +227,11 @@ def test_friction_is_the_worlds_own(device):
     place(physics, 0.29)
     for _ in range(50):
         physics.step()
-    physics.qvel.assign(np.array([[1.0, *[0.0] * 17]] * 2, np.float32))
-    start = physics.qpos.numpy()[:, 0].copy()
+    physics.arrays.qvel.assign(np.array([[1.0, *[0.0] * 17]] * 2, np.float32))
+    start = physics.arrays.qpos.numpy()[:, 0].copy()
     for _ in range(50):
         physics.step()
-    way = physics.qpos.numpy()[:, 0] - start
+    way = physics.arrays.qpos.numpy()[:, 0] - start
     assert way[0] > 1.5 * way[1]
 
 
@@ -244,7 +244,7 @@ def test_payload_changes_mass_and_what_follows_from_it(device):
     place(physics, 0.29)
     for _ in range(150):
         physics.step()
-    carried = physics.part_force.numpy()[-1, :, 1:5].sum(axis=1)
+    carried = physics.arrays.part_force.numpy()[-1, :, 1:5].sum(axis=1)
     np.testing.assert_allclose(carried, (go1.MASS + payload) * 9.81, rtol=0.02)
     spec = go1.build().spec
     spec.body("trunk").mass += 1.0
@@ -268,7 +268,7 @@ def test_buffers_tell_their_use(device):
     small = make(2, device, config=PhysicsConfig(rows=8))
     place(small, 0.25)
     small.step()
-    assert np.all(small.overflow.numpy() & small.lost_contacts)
+    assert np.all(small.arrays.overflow.numpy() & small.lost_contacts)
 
 
 @pytest.mark.parametrize(
@@ -306,23 +306,23 @@ def test_buffers_hold_an_arm_that_touches_everything(device, stairs):
     place(physics, 0.1, (0, 1, 0, 0), robot=robot)  # on its back, upon the arm
     touched = set()
     for target in swing(60, 5, seed=1):
-        physics.ctrl.assign(np.tile([*ROBOT.pose, *target], (4, 1)).astype(np.float32))
+        physics.arrays.ctrl.assign(np.tile([*ROBOT.pose, *target], (4, 1)).astype(np.float32))
         physics.step()
         touched |= {physics.model.geom(geom).name for pair in physics.to_mujoco(0).contact.geom for geom in pair}
     assert {"ground", "guard_left", "guard_right", "forearm", "gripper"} <= touched
     use = physics.buffer_use()
     assert use["rows"] < use["max_rows"]
     assert use["contacts"] < use["max_contacts"]
-    assert not (physics.overflow.numpy() & physics.lost_contacts).any()
+    assert not (physics.arrays.overflow.numpy() & physics.lost_contacts).any()
 
 
 def test_to_mujoco_shows_the_state(device):
     """One world comes out as MuJoCo's own data, with the geoms where its kinematics put them."""
     physics = make(2, device)
     place(physics, 0.3)
-    qpos = physics.qpos.numpy()
+    qpos = physics.arrays.qpos.numpy()
     qpos[1, 0] = 2.0
-    physics.qpos.assign(qpos)
+    physics.arrays.qpos.assign(qpos)
     data = physics.to_mujoco(1)
     np.testing.assert_allclose(data.qpos, qpos[1], rtol=0)
     np.testing.assert_allclose(data.body("trunk").xpos, [2.0, 0.0, 0.3], rtol=0, atol=1e-6)

@@ -240,10 +240,10 @@ def test_no_geom_covers_too_many_prisms(robot, device):
                 qpos[world, :3] = x, y, ground.heights[i, j] + 0.02
                 qpos[world, 7:] = pose
                 world += 1
-    physics.qpos.assign(qpos.astype(np.float32))
+    physics.arrays.qpos.assign(qpos.astype(np.float32))
     physics.step()
-    lost = physics.overflow.numpy() & physics.lost_contacts
+    lost = physics.arrays.overflow.numpy() & physics.lost_contacts
     assert not lost.any(), np.unique(lost)
-    pressed = (physics.part_force.numpy()[0] > 0).sum(axis=0)
+    pressed = (physics.arrays.part_force.numpy()[0] > 0).sum(axis=0)
     assert np.all(pressed > 10), "every part must have been pressed on the ground"
     wp.synchronize()

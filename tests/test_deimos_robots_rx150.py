@@ -291,11 +291,11 @@ def test_no_geom_of_the_arm_covers_too_many_prisms(device):
         mujoco.mju_mat2Quat(quat, frame.ravel())
         row[3:7] = quat
     physics = Physics(robot, ground, len(trunk), torch.device(device), PhysicsConfig(substeps=1, contacts=40))
-    physics.qpos.assign(trunk)
+    physics.arrays.qpos.assign(trunk)
     physics.step()
-    lost = physics.overflow.numpy() & physics.lost_contacts
+    lost = physics.arrays.overflow.numpy() & physics.lost_contacts
     assert not lost.any(), np.unique(lost)
-    assert (physics.part_force.numpy()[0, :, 0] > 0).mean() > 0.9
+    assert (physics.arrays.part_force.numpy()[0, :, 0] > 0).mean() > 0.9
     wp.synchronize()
 
 
@@ -303,30 +303,30 @@ def test_trunk_is_held(device):
     """With the arm swinging between its limits for 2 s, a held trunk that was thrown stays where it was put."""
     robot = hold_base(rx150.build())
     physics = Physics(robot, None, 2, torch.device(device), PhysicsConfig())
-    assert physics.qpos.shape[1] == 24
-    assert physics.qvel.shape[1] == 23
+    assert physics.arrays.qpos.shape[1] == 24
+    assert physics.arrays.qvel.shape[1] == 23
     rng = np.random.default_rng(3)
     start = np.zeros((2, 24), np.float32)
     start[:, :4] = [[3.0, -2.0, robot.spawn_height, 1.0], [-40.0, 7.0, robot.spawn_height + 0.2, 1.0]]
     start[:, 7:] = robot.pose
     throw = np.zeros((2, 23), np.float32)
     throw[:, :6] = rng.uniform(-0.5, 0.5, (2, 6))
-    physics.qpos.assign(start)
-    physics.qvel.assign(throw)
+    physics.arrays.qpos.assign(start)
+    physics.arrays.qvel.assign(throw)
     data = physics.to_mujoco(0)
     low, high = np.array([joint.range for joint in robot.joints]).T
     for step in range(100):
         if step % 20 == 0:
             target = np.where(rng.random(17) < 0.5, low, high)
-        physics.ctrl.assign(np.tile(target, (2, 1)).astype(np.float32))
+        physics.arrays.ctrl.assign(np.tile(target, (2, 1)).astype(np.float32))
         physics.step()
         data.ctrl[:] = target
         mujoco.mj_step(physics.model, data, physics.config.substeps)
         # An episode is ten times as long: 2 mm and 0.5 degrees for it.
-        for qpos, origin in ((physics.qpos.numpy(), start), (data.qpos[None], start[:1])):
+        for qpos, origin in ((physics.arrays.qpos.numpy(), start), (data.qpos[None], start[:1])):
             assert np.abs(qpos[:, :3] - origin[:, :3]).max() < 2e-3 / 10
             assert 2 * np.linalg.norm(qpos[:, 4:7], axis=1).max() < np.radians(0.5) / 10
-        assert not physics.part_force.numpy().any(), "nothing touches the ground"
+        assert not physics.arrays.part_force.numpy().any(), "nothing touches the ground"
     # The arms of both simulators have gone the same way, in spite of the huge forces that hold.
-    np.testing.assert_allclose(physics.qpos.numpy()[0, 7:], data.qpos[7:], rtol=0, atol=5e-3)
+    np.testing.assert_allclose(physics.arrays.qpos.numpy()[0, 7:], data.qpos[7:], rtol=0, atol=5e-3)
     assert robot.spawn_height == robot.standing_height

@@ -657,6 +657,30 @@ def test_too_many_worlds_are_refused_before_memory_is_taken():
         training.build(TrainConfig(num_envs=2_000_000_000), torch.device("cpu"))
 
 
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (RuntimeError("the engine has lost\nits map"), "^the engine has lost its map$"),
+        (SimulationError("qpos is not finite"), "^qpos is not finite$"),
+        (RuntimeError(), "^RuntimeError$"),
+        (ValueError("goal_period must be even"), "^goal_period must be even$"),
+        (MemoryError(), r"^64 worlds could not be allocated \(MemoryError\); use fewer"),
+        (RuntimeError("Failed to allocate 9 bytes on device 'cpu'"), r"^64 worlds could not be allocated \(Failed to"),
+        (RuntimeError("CUDA out of memory"), "^64 worlds could not be allocated"),
+        (ValueError("Maximum allowed dimension exceeded"), "^64 worlds could not be allocated"),
+    ],
+)
+def test_what_stops_a_run_from_being_built_is_named(monkeypatch, error, message):
+    """Only what is for want of memory is said to be; every other reason is given as it is, in one line."""
+
+    def fail(*arguments):
+        raise error
+
+    monkeypatch.setattr(particle.Config, "build", fail)
+    with pytest.raises(RunError, match=message):
+        training.build(CONFIG, torch.device("cpu"))
+
+
 def test_a_preset_is_a_training_configuration():
     """Every environment has a preset of its own name, and every preset builds a configuration for its environment."""
     for name in plugins.names(envs):

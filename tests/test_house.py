@@ -464,11 +464,28 @@ def test_entry_point_with_a_hyphen_is_an_environment(install, tmp_path):
     assert cli.main(["train", "--resume", str(path), "--env-steps", "48"]) == 0
 
 
-def test_a_broken_plugin_stops_no_other(install):
-    """What a configuration is called is found without importing the plug-ins of others."""
-    install("deimos.envs", "broken", "raise ImportError('it needs what is not there')")
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("raise ImportError('it needs what is not there')", "ImportError: it needs what is not there"),
+        ("def", "SyntaxError: invalid syntax (other_module.py, line 1)"),
+        ("class Config: ...", "TypeError: it holds no dataclass Config"),
+    ],
+)
+@pytest.mark.parametrize(("group", "kind"), [("deimos.envs", "env"), ("deimos.selectors", "selector")])
+def test_a_broken_plugin_stops_no_other(install, tmp_path, capsys, group, kind, source, reason):
+    """It is reported by name wherever all are listed; who asks for it is told why, and all else works."""
+    install(group, "broken", source)
     assert config.kind(particle.Config()) == "particle"
     assert config.to_dict(TrainConfig())["env"]["kind"] == "particle"
+    message = f"The plug-in 'broken' of {group}, other_module, is broken ({reason})."
+    with pytest.warns(UserWarning, match=re.escape(message)):
+        assert cli.main(["train", "env:particle", *FLAGS, "--out", str(tmp_path / "run")]) == 0
+    with pytest.warns(UserWarning, match=re.escape(message)):
+        assert cli.main(["train", "--help"]) == 0
+    capsys.readouterr()
+    assert cli.main(["train", f"{kind}:broken"]) == 2
+    assert capsys.readouterr().err == f"deimos: {message}\n"
 
 
 def test_entry_point_is_a_robot(install):

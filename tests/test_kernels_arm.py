@@ -322,7 +322,7 @@ def draw(device, n, count, scale, *, arm=None, seed=3, world_offset=20, heights=
     row = wp.array(np.arange(n), dtype=wp.int32, device=device)
     scale = to_array(scale, device)
     candidate = wp.full((n, count, G), np.nan, dtype=wp.float32, device=device)
-    draw_candidates(row, world.worlds.goal_count, scale, candidate, seed=seed, world_offset=world_offset)
+    draw_candidates(row, scale, candidate, world.worlds).launch()
     first = candidate.numpy().copy()
     redraw_candidates(world.legged, world.arm, row, scale, candidate).launch()
     return first, candidate.numpy()

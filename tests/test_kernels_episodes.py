@@ -9,7 +9,6 @@ from deimos.kernels.episodes import (
     WORLDS,
     begin_episode,
     end_step,
-    make_relative,
     make_worlds,
     record,
     set_goals,
@@ -239,56 +238,6 @@ def test_set_goals_works_in_shared_memory(device):
     assert goal.tolist() == [[0.0] * 3, [5.0] * 3]
 
 
-@pytest.mark.parametrize(("num_rows", "count"), [(1, 1), (40, 7)])
-def test_make_relative_matches_reference(device, num_rows, count):
-    """From every candidate the scaled origin of its own world is subtracted."""
-    rng = np.random.default_rng(seed=num_rows)
-    x = rng.uniform(-1000, 1000, (50, 3)).astype(np.float32)
-    candidate = rng.uniform(-1.25, 1.25, (num_rows, count, 3)).astype(np.float32)
-    row = rng.permutation(50)[:num_rows]
-    result = wp.array(candidate, dtype=wp.float32, device=device)
-
-    make_relative(integers(row, device), make(50, device, scale=1e-3, origin=x), result).launch()
-
-    origin = x[row].astype(np.float64)[:, None] / 1000
-    expected = candidate - origin
-    error = np.abs(result.numpy() - expected)
-    assert np.all(error <= 1.01 * U * (2 * np.abs(origin) + np.abs(expected)))  # scale, product; difference
-
-
-def test_make_relative_from_the_middle_changes_nothing(device):
-    """Seen from an origin of 0 every goal is where it is."""
-    candidate = np.random.default_rng(seed=0).uniform(-1, 1, (2, 3, 3)).astype(np.float32)
-    result = wp.array(candidate, dtype=wp.float32, device=device)
-    make_relative(integers([0, 1], device), make(2, device, origin=np.zeros((2, 3))), result).launch()
-    np.testing.assert_array_equal(result.numpy(), candidate)
-
-
-def test_make_relative_then_set_goals_gives_the_place_back(device):
-    """A candidate place that is made relative and set as a goal becomes that place again."""
-    rng = np.random.default_rng(seed=8)
-    x = rng.uniform(-1000, 1000, (30, 3)).astype(np.float32)
-    place = rng.uniform(-1250, 1250, (30, 3))
-    candidate = wp.array((place / 1000).reshape(30, 1, 3).astype(np.float32), dtype=wp.float32, device=device)
-    worlds = make(30, device, scale=1e-3, origin=x)
-    make_relative(integers(np.arange(30), device), worlds, candidate).launch()
-    give(worlds, np.arange(30), candidate.numpy()[:, 0])
-    # The candidate rounds; the origin twice, but its scale's error returns in the quotient; then difference,
-    # quotient with the scale's error, and sum.
-    error = np.abs(worlds.goal.numpy() - place)
-    assert np.all(error <= 1.01 * U * (3 * np.abs(place) + 3 * np.abs(x) + 3 * np.abs(place - x)))
-
-
-def test_make_relative_works_in_shared_memory(device):
-    """A torch view of the candidates sees them change at the same address."""
-    candidate = wp.full((1, 2, 3), 1.0, dtype=wp.float32, device=device)
-    view = wp.to_torch(candidate)
-    worlds = make(1, device, scale=0.5, origin=[[1.0, 2.0, 4.0]])
-    make_relative(integers([0], device), worlds, candidate).launch()
-    assert view.data_ptr() == candidate.ptr
-    assert view.tolist() == [[[0.5, 0.0, -1.0]] * 2]
-
-
 def test_worlds_begin_with_nothing(device):
     """All arrays are zeros, but for the scale of goals and the faults, of which there are none."""
     worlds = make_worlds(
@@ -302,45 +251,16 @@ def test_worlds_begin_with_nothing(device):
 
 
 @pytest.mark.parametrize(
-    ("call", "wrong", "message"),
+    ("wrong", "message"),
     [
-        (set_goals, {"row": ((1, 1), wp.int64)}, r"row must be int32\(1, 1\).*got int64"),
-        (set_goals, {"goal": ((2, 3), wp.float32)}, r"goal must be float32\(1, 3\).*got float32\(2, 3\)"),
-        (set_goals, {"goal": ((1, 3), wp.float64)}, r"goal must be float32\(1, 3\).*got float64\(1, 3\)"),
-        (make_relative, {"row": ((1,), wp.int64)}, r"row must be int32\(1,\).*got int64"),
-        (
-            make_relative,
-            {"origin": ((0, 3), wp.float32)},
-            r"worlds.origin must be float32\(4, 3\).*got float32\(0, 3\)",
-        ),
-        (
-            make_relative,
-            {"candidate": ((1, 3), wp.float32)},
-            r"candidate must be float32\(1, 3, 3\).*got float32\(1, 3\)",
-        ),
-        (
-            make_relative,
-            {"candidate": ((1, 1, 4), wp.float32)},
-            r"candidate must be .*\(1, 1, 3\).*got float32\(1, 1, 4\)",
-        ),
-        (
-            make_relative,
-            {"candidate": ((2, 1, 3), wp.float32)},
-            r"candidate must be .*\(1, 1, 3\).*got float32\(2, 1, 3\)",
-        ),
+        ({"row": ((1, 1), wp.int64)}, r"row must be int32\(1, 1\).*got int64"),
+        ({"goal": ((2, 3), wp.float32)}, r"goal must be float32\(1, 3\).*got float32\(2, 3\)"),
+        ({"goal": ((1, 3), wp.float64)}, r"goal must be float32\(1, 3\).*got float64\(1, 3\)"),
     ],
 )
-def test_rejects_wrong_arguments(device, call, wrong, message):
+def test_set_goals_rejects_wrong_arguments(device, wrong, message):
     """The message names the argument, what it must be and what it was."""
-    right = {
-        "row": ((1,), wp.int32),
-        "goal": ((1, 3), wp.float32),
-        "origin": ((4, 3), wp.float32),
-        "candidate": ((1, 1, 3), wp.float32),
-    }
+    right = {"row": ((1,), wp.int32), "goal": ((1, 3), wp.float32)}
     arrays = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in (right | wrong).items()}
-    worlds = make(4, device)
-    worlds.origin = arrays["origin"]
-    arguments = (arrays["goal"], worlds) if call is set_goals else (worlds, arrays["candidate"])
     with pytest.raises(ValueError, match=message):
-        call(arrays["row"], *arguments)
+        set_goals(**arrays, worlds=make(4, device))

@@ -3,20 +3,40 @@
 import numpy as np
 import pytest
 import warp as wp
+from deimos.kernels.episodes import make_worlds, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.lanes import WIDE, lanes, threads
 from deimos.kernels.random import Purpose
 
+U = 2.0**-24  # relative error of one float32 operation
 SIGMAS = 5.0  # a sound generator's mean is off by more than this once in 1.7 million tests
 
 
-def draw(row, goal_count, scale, count, device, *, seed=0, world_offset=0):
-    """The kernel's output, float32, shape (n, count, goal_dim)."""
+def make(goal_count, device, *, goal_scale, origin=None, seed=0, world_offset=0):
+    """Worlds that have received so many goals."""
+    worlds = make_worlds(
+        len(goal_count), device, obs_dim=len(goal_scale), action_dim=1, goal_start=0, goal_scale=goal_scale,
+        goal_period=1, seed=seed, world_offset=world_offset,
+    )  # fmt: skip
+    worlds.goal_count.assign(np.asarray(goal_count, np.int32))
+    if origin is not None:
+        worlds.origin = wp.array(origin, dtype=wp.float32, device=device)
+    return worlds
+
+
+def arrays_for(row, scale, count, device):
+    """Rows, half sides and candidates, which are NaN."""
     row = wp.array(np.asarray(row, np.int32), dtype=wp.int32, device=device)
-    goal_count = wp.array(np.asarray(goal_count, np.int32), dtype=wp.int32, device=device)
     scale = wp.array(np.asarray(scale, np.float32), dtype=wp.float32, device=device)
-    candidate = wp.full((*row.shape, count, *scale.shape), np.nan, dtype=wp.float32, device=device)
-    draw_candidates(row, goal_count, scale, candidate, seed=seed, world_offset=world_offset)
+    return row, scale, wp.full((*row.shape, count, *scale.shape), np.nan, dtype=wp.float32, device=device)
+
+
+def draw(row, goal_count, scale, count, device, *, goal_scale=1.0, **more):
+    """The kernel's output, float32, shape (n, count, goal_dim)."""
+    row, scale, candidate = arrays_for(row, scale, count, device)
+    draw_candidates(
+        row, scale, candidate, make(goal_count, device, goal_scale=[goal_scale] * len(scale), **more)
+    ).launch()
     return candidate.numpy()
 
 
@@ -89,51 +109,68 @@ def test_every_goal_worlds_and_seed_differ(device):
         assert np.all(base != other)
 
 
-def test_candidates_land_in_shared_memory(device):
-    """A torch view made before the launch sees the candidates at the same address."""
-    row = wp.array([0, 1], dtype=wp.int32, device=device)
-    scale = wp.array([1.0, 1.0, 1.0], dtype=wp.float32, device=device)
-    candidate = wp.full((2, 4, 3), np.nan, dtype=wp.float32, device=device)
-    view = wp.to_torch(candidate)
-    draw_candidates(row, row, scale, candidate, seed=0, world_offset=0)
-    assert view.data_ptr() == candidate.ptr
-    assert bool((view.abs() <= 1).all())
+@pytest.mark.parametrize("count", [1, 7, 100])
+def test_candidates_are_seen_from_the_origin(device, count):
+    """From every candidate the scaled origin of its own world is subtracted; from the middle it is where it is."""
+    rng = np.random.default_rng(seed=count)
+    x = rng.uniform(-1000, 1000, (50, 3)).astype(np.float32)
+    row = rng.permutation(50)[:40]
+    given = {"goal_count": np.zeros(50), "scale": [1.25] * 3, "count": count, "device": device, "goal_scale": 1e-3}
+    candidate, result = draw(row, **given), draw(row, **given, origin=x)
+
+    origin = x[row].astype(np.float64)[:, None] / 1000
+    expected = candidate - origin
+    error = np.abs(result - expected)
+    assert np.all(error <= 1.01 * U * (2 * np.abs(origin) + np.abs(expected)))  # scale, product; difference
+    np.testing.assert_array_equal(draw(row, **given, origin=0 * x), candidate)
 
 
-def test_recorded_draw_waits_for_its_launch(device):
-    """A recorded launch writes nothing until it is replayed, and then only the rows that it is sized for."""
-    row = wp.array([0, 1], dtype=wp.int32, device=device)
-    scale = wp.array([1.0, 1.0, 1.0], dtype=wp.float32, device=device)
-    candidate = wp.full((2, 4, 3), np.nan, dtype=wp.float32, device=device)
-    launch = draw_candidates(row, row, scale, candidate, seed=0, world_offset=0, record=True)
-    assert np.isnan(candidate.numpy()).all()
-    launch.set_dim((1, 4))
+def test_candidate_that_is_set_gives_the_place_back(device):
+    """A candidate place that is seen from an origin and set as a goal becomes that place again."""
+    x = np.random.default_rng(seed=8).uniform(-1000, 1000, (30, 3)).astype(np.float32)
+    place = 1000 * draw(np.arange(30), np.zeros(30), [1.25] * 3, 1, device, goal_scale=1e-3)[:, 0].astype(np.float64)
+    worlds = make(np.zeros(30), device, goal_scale=[1e-3] * 3, origin=x)
+    row, scale, candidate = arrays_for(np.arange(30), [1.25] * 3, 1, device)
+    draw_candidates(row, scale, candidate, worlds).launch()
+    set_goals(row, wp.array(candidate.numpy()[:, 0], dtype=wp.float32, device=device), worlds).launch()
+    # The candidate rounds; the origin twice, but its scale's error returns in the quotient; then difference,
+    # quotient with the scale's error, and sum.
+    error = np.abs(worlds.goal.numpy() - place)
+    assert np.all(error <= 1.01 * U * (3 * np.abs(place) + 3 * np.abs(x) + 3 * np.abs(place - x)))
+
+
+@pytest.mark.parametrize("origin", [None, [[0.5, 0.0, 0.0]] * 2])
+def test_recorded_draw_waits_for_its_launch(device, origin):
+    """Nothing is written before the launch, and then only its rows, in the memory of an earlier torch view."""
+    arrays = arrays_for([0, 1], [1.0, 1.0, 1.0], 4, device)
+    view = wp.to_torch(arrays[2])
+    launch = draw_candidates(*arrays, make([0, 1], device, goal_scale=[1.0] * 3, origin=origin))
+    assert bool(view.isnan().all())
+    launch.set_dim((1, launch.bounds.shape[1]))
     launch.launch()
-    np.testing.assert_array_equal(candidate.numpy()[0], draw([0], [0], [1.0, 1.0, 1.0], 4, device)[0])
-    assert np.isnan(candidate.numpy()[1]).all()
+    assert view.data_ptr() == arrays[2].ptr
+    expected = draw([0], [0, 1], [1.0, 1.0, 1.0], 4, device, origin=origin)
+    np.testing.assert_array_equal(view[:1].cpu().numpy(), expected)
+    assert bool(view[1].isnan().all())
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"row": ((2,), wp.int64)}, r"row must be int32\(2,\).*got int64\(2,\)"),
-        ({"goal_count": ((5,), wp.float32)}, r"goal_count must be int32\(5,\).*got float32\(5,\)"),
         ({"scale": ((4,), wp.float32)}, r"scale must be float32\(3,\).*got float32\(4,\)"),
+        ({"candidate": ((2, 3), wp.float32)}, r"candidate must have 3 axes, got the shape \(2, 3\)"),
         ({"candidate": ((4, 7, 3), wp.float32)}, r"candidate must be float32\(2, 7, 3\).*got float32\(4, 7, 3\)"),
+        ({"candidate": ((2, 7, 4), wp.float32)}, r"candidate must be float32\(2, 7, 3\).*got float32\(2, 7, 4\)"),
         ({"candidate": ((2, 7, 3), wp.float64)}, r"candidate must be float32\(2, 7, 3\).*got float64\(2, 7, 3\)"),
     ],
 )
 def test_draw_candidates_rejects(device, wrong, message):
     """The message names the argument, what it must be and what it was."""
-    right = {
-        "row": ((2,), wp.int32),
-        "goal_count": ((5,), wp.int32),
-        "scale": ((3,), wp.float32),
-        "candidate": ((2, 7, 3), wp.float32),
-    }
+    right = {"row": ((2,), wp.int32), "scale": ((3,), wp.float32), "candidate": ((2, 7, 3), wp.float32)}
     arrays = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in (right | wrong).items()}
     with pytest.raises(ValueError, match=message):
-        draw_candidates(**arrays, seed=0, world_offset=0)
+        draw_candidates(**arrays, worlds=make(np.zeros(5), device, goal_scale=[1.0] * 3))
 
 
 def test_threads_cover_every_number(device):

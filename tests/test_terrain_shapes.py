@@ -1,6 +1,7 @@
 """Every shape of ground, by itself: its mesh, its formulas and its bounds."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -285,3 +286,23 @@ class Shape(TileShape):
     assert isinstance(shape, TileShape)
     assert build(shape, 0.5).vertices[:, 2].max() == 0.5
     assert catalog.name_of(shape) == "one-bump"
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("def", "SyntaxError: "),
+        (
+            "from deimos.terrain.shape import TileShape as Shape",
+            "TypeError: Can't instantiate abstract class TileShape",
+        ),
+    ],
+)
+def test_broken_file_stops_no_other(tmp_path, monkeypatch, source, reason):
+    """A file that is no shape, or none without parameters, is reported by its name, and all others are there."""
+    before = catalog.names()
+    (tmp_path / "crater.py").write_text(source)
+    monkeypatch.setattr(shapes, "__path__", [*shapes.__path__, str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "deimos.terrain.shapes.crater", raising=False)
+    with pytest.warns(UserWarning, match=rf"The plug-in 'crater' of deimos.shapes, .* is broken \({reason}"):
+        assert catalog.names() == before

@@ -132,7 +132,7 @@ def _train_options() -> type:
 
 def _subcommands(package: Any, *more: Any) -> Any:
     options = [
-        Annotated[plugins.load(package, name).Config, tyro.conf.subcommand(name)] for name in plugins.names(package)
+        Annotated[module.Config, tyro.conf.subcommand(name)] for name, module in plugins.load_all(package).items()
     ]
     return Union[tuple([*more, *options])]  # noqa: UP007 (a union of a computed list)
 
@@ -150,12 +150,14 @@ def _preset(name: str | None, arguments: list[str]) -> TrainConfig:
 
 
 def _check_names(arguments: list[str]) -> None:
-    """Refuse an unknown ``env:NAME`` or ``selector:NAME``; tyro would list the choices of the other.
+    """Refuse an unknown or broken ``env:NAME`` or ``selector:NAME``; tyro would list the choices of the other.
 
     Names are spelled with hyphens; tyro takes underscores too.
     """
-    for kind, names in (("env", plugins.names(envs)), ("selector", ["none", *plugins.names(selectors)])):
-        known = [f"{kind}:{name.replace('_', '-')}" for name in names]
+    for kind, package, none in (("env", envs, []), ("selector", selectors, ["none"])):
+        known = {f"{kind}:{name.replace('_', '-')}": name for name in [*none, *plugins.names(package)]}
         for argument in arguments:
             if argument.startswith(f"{kind}:") and argument.replace("_", "-") not in known:
                 raise RunError(f"There is no '{argument}'; there are: {', '.join(known)}.")
+            if (name := known.get(argument.replace("_", "-"), "none")) != "none":
+                plugins.load(package, name)  # says what is wrong with a broken one

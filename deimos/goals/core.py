@@ -93,12 +93,7 @@ class GoalCore(Stateful):
     def choose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Tensor:
         """Choose the next goals of the listed worlds, and begin their interactions.
 
-        Args:
-            rows: Worlds, int64, shape (B,), each once; nothing is pending in them.
-            state: Their states, shape (B, state_dim).
-            goal: Their goals until now, shape (B, goal_dim).
-            candidates: Independent uniform goals for each, shape (B, N, goal_dim).
-            draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4).
+        For the arguments see ``GoalSelector.propose``; each world is listed once, and nothing is pending in it.
 
         Returns:
             Goals, shape (B, goal_dim).

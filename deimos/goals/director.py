@@ -181,11 +181,7 @@ class GoalDirector:
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs; see ``load_state_dict``."""
-        return {
-            "core": self._known.state_dict(),
-            "clock": self._clock.clone(),
-            "count": self._count.clone(),
-        }
+        return {"core": self._known.state_dict(), "clock": self._clock.clone(), "count": self._count.clone()}
 
     def load_state_dict(self, state: dict, observed: Tensor, goal: Tensor) -> None:
         """Continue from ``state_dict()``.

@@ -142,15 +142,9 @@ class Interactions(Stateful):
     ) -> None:  # fmt: skip
         """Start an interaction in each listed world.
 
-        Args:
-            rows: Worlds, int64, shape (m,), each once.
-            state: States, shape (m, state_dim).
-            goal: Goals that were active until now, shape (m, goal_dim).
-            next_goal: Goals as they are issued, shape (m, goal_dim).
-            score: What the selector thinks of them, shape (m,).
-            horizon: Steps until they are over if nothing happens, at least 1, one number or int64, shape (m,).
-            probe: True where the goal was drawn uniformly, bool, shape (m,); ``None`` for nowhere.
-            note: Whole numbers below 2^24 to give back with the interaction, shape (m,); ``None`` for 0.
+        The arguments are fields of ``Resolved``, with one row for each of ``rows``, int64, shape (m,), each once. Goals
+        are those that are issued; ``horizon`` may be one number, at least 1; ``probe`` is ``None`` for nowhere, and
+        ``note`` for 0, its numbers being below 2^24.
         """
         rest = torch.zeros(len(rows), 3 + self._sizes[-1], device=score.device)
         if probe is not None:
@@ -172,10 +166,9 @@ class Interactions(Stateful):
         """
         self._pending[rows, self._next_goal] = goal
 
-    def resolved(self) -> Resolved:
-        """The interactions resolved within the window, ordered by world."""
-        at = self._marks[:, :, 2]
-        env, slot = torch.nonzero((at > 0) & (at > self.now - self.window), as_tuple=True)
+    def resolved(self, since: int = 0) -> Resolved:
+        """The interactions resolved within the window, and after step ``since``, ordered by world."""
+        env, slot = torch.nonzero(self._marks[:, :, 2] > max(since, self.now - self.window, 0), as_tuple=True)
         state, goal, next_goal, score, probe, note, reward, tracking = self._ring[env, slot].split(self._sizes, dim=1)
         crashed, issued, resolved, horizon = self._marks[env, slot].unbind(1)
         met = tracking if self._sizes[-1] else reward

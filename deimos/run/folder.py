@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,20 @@ class RunFolder:
             return json.loads((self.path / name).read_text())
         except (OSError, ValueError) as error:
             raise RunError(f"{self.path / name} cannot be read ({first_line(error)}).") from error
+
+    def keep(self, files: Mapping[str, Path]) -> dict[str, str]:
+        """Copy the files that a run is built from; gives what each copy is called, by the name that it was given by."""
+        copies = {name: name + path.suffix for name, path in files.items()}
+        for name, copy in copies.items():
+            self._copy(files[name], copy)
+        return copies
+
+    def _copy(self, source: Path, name: str) -> None:
+        try:
+            data = source.read_bytes()
+        except OSError as error:
+            raise RunError(f"{source} cannot be read ({error.strerror}).") from error
+        write_whole(self.path / name, lambda file: file.write(data))
 
     def read_csv(self, name: str) -> list[dict[str, str]]:
         """All whole rows of a CSV file; none if there is no file."""

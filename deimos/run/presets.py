@@ -17,9 +17,8 @@ from deimos.sim import envs
 def _all() -> dict[str, tuple[str, dict[str, Any]]]:
     """Environment and fields of every preset."""
     found: dict[str, tuple[str, dict[str, Any]]] = {}
-    for env in plugins.names(envs):
-        module = plugins.load(envs, env)
-        own = {spelled(env): {}} | getattr(module, "PRESETS", {})
+    for env, presets in plugins.load_all(envs, lambda module: dict(getattr(module, "PRESETS", {}))).items():
+        own = {spelled(env): {}} | presets
         found |= {spelled(name): (env, fields) for name, fields in own.items()}
     return found
 

@@ -207,7 +207,8 @@ class Trainer:
 
 def _identity(config: TrainConfig) -> dict:
     """What a checkpoint must have in common with the run that resumes from it."""
-    return {"env": to_dict(config.env), "selector": to_dict(config.goals), "num_envs": config.num_envs}
+    env = to_dict(config.env) | dict.fromkeys(config.env.files, "")  # wherever the run's copies lie
+    return {"env": env, "selector": to_dict(config.goals), "num_envs": config.num_envs}
 
 
 def _completed(identity: dict) -> dict:

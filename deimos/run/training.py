@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import shutil
 import subprocess
 import time
@@ -23,6 +24,10 @@ from deimos.run.trainer import TrainConfig, Trainer
 SCHEMA = 1  # of config.json
 CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be loaded, but not its worlds
 CHECKPOINT_SECONDS = 30.0
+_NO_MEMORY = re.compile(
+    "out of memory|allocate|alloc_failed|allowed dimension|too big|storage size|representable", re.IGNORECASE
+)
+"""How Warp, torch and NumPy each say that an array does not fit."""
 LEAST_BYTES = 100  # of any transition, and of any world
 
 
@@ -80,7 +85,7 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
     try:
         folder.write_json("config.json", {
             "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
-            "init_from": str(init_from) if init_from else None,
+            "init_from": str(init_from) if init_from else None, "files": folder.keep(config.env.files),
         })  # fmt: skip
         save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
     except RunError:
@@ -98,11 +103,11 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
     _check_memory(config)
     try:
         return Trainer(config, device)
-    except (MemoryError, RuntimeError, ValueError) as error:  # Warp, torch and NumPy each have their own
-        reason = " ".join(str(error).split())
-        if isinstance(error, ValueError) and "allowed dimension" not in reason and "too big" not in reason:
-            raise RunError(reason) from error
-        raise RunError(f"{config.num_envs} worlds could not be allocated ({reason}); use fewer (num_envs).") from error
+    except (MemoryError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, MemoryError) or _NO_MEMORY.search(reason):
+            reason = f"{config.num_envs} worlds could not be allocated ({reason}); use fewer (num_envs)."
+        raise RunError(reason) from error
 
 
 def _check_memory(config: TrainConfig) -> None:
@@ -201,8 +206,10 @@ def read_config(folder: RunFolder) -> TrainConfig:
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise RunError(f"{folder.path / 'config.json'} is not that of a run of schema {SCHEMA}.")
     try:
-        return from_dict(TrainConfig, data["config"])
-    except (KeyError, TypeError, ValueError) as error:
+        config = from_dict(TrainConfig, data["config"])
+        kept = {name: str(folder.path / copy) for name, copy in data.get("files", {}).items()}
+        return replace(config, env=replace(config.env, **kept)) if kept else config
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{folder.path / 'config.json'} does not describe a run: {error}") from error
 
 

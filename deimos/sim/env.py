@@ -8,6 +8,7 @@ resets a world and never changes a goal: ``deimos.run.loop`` does both, between 
 import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Self, final
 
@@ -72,6 +73,11 @@ class EnvConfig(abc.ABC):
             env_offset: Global number of world 0. Draws are addressed by global numbers, so two
                 environments of 1000 worlds, the second with an offset of 1000, equal one of 2000.
         """
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Files that the worlds are built from, by the field that holds the path; a run works with its own copies."""
+        return {}
 
     @property
     def largest_reward(self) -> float:

@@ -22,13 +22,7 @@ class Shared:
 
     @classmethod
     def zeros(cls, shape: int | tuple[int, ...], dtype: type, device: torch.device) -> "Shared":
-        """Allocate zeros.
-
-        Args:
-            shape: Shape of the Warp array; the tensor of a vector dtype has one more axis.
-            dtype: A Warp dtype.
-            device: Where the memory lies.
-        """
+        """Allocate zeros of a Warp dtype; where it is a vector, the tensor has one axis more than ``shape``."""
         array = wp.zeros(shape, dtype=dtype, device=warp_device(device))
         return cls(array, wp.to_torch(array))
 

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from deimos.checks import SimulationError
-from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_relative, make_worlds, record, set_goals
+from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_worlds, record, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.kernels.structs import StructTable
@@ -29,10 +29,7 @@ class WarpEnv(Env):
 
     Args:
         config: The task.
-        num_envs: Number of worlds.
-        device: Where they are simulated.
-        seed: Seed of every draw.
-        env_offset: Global number of world 0.
+        num_envs, device, seed, env_offset: See ``EnvConfig.build``.
         layout: What stands where in the observation. Goals are shown times the scale of the field ``goal``.
         goal_range: Half side of the box that goals are drawn from along every component, in physical units.
         action_dim: Components of an action.
@@ -234,13 +231,9 @@ class WarpEnv(Env):
         self._steps_in_window = self._faults_known = 0
 
     def _record_candidates(self, count: int) -> tuple[Shared, list[wp.Launch]]:
-        candidates, worlds = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device), self.worlds
-        launches = [draw_candidates(
-            self._row.array, worlds.goal_count, self._candidate_scale.array, candidates.array, seed=self._seed,
-            world_offset=self._offset, record=True,
-        )]  # fmt: skip
-        if worlds.origin.shape[0]:
-            launches.append(make_relative(self._row.array, worlds, candidates.array))
+        candidates = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device)
+        scale = self._candidate_scale.array
+        launches = [draw_candidates(self._row.array, scale, candidates.array, self.worlds)]
         if self._valid_goals:
             launches.append(self._valid_goals(candidates.array))
         return candidates, launches

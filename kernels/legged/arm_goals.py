@@ -20,8 +20,8 @@ import math
 
 import warp as wp
 
-from ..check import require, require_axes
-from ..episodes import Worlds
+from ..episodes import Worlds, record
+from ..goals import check_candidates
 from ..random import Purpose, uniform4
 from ..rotations import heading, rotate, rotate_about, rotate_by_heading
 from ..structs import StructTable
@@ -240,21 +240,12 @@ def _redraw_candidates(
         candidate[i, k, g + c] = goal[c]
 
 
-def redraw_candidates(
-    legged: LeggedWorlds, arm: Arm, row: wp.array, scale: wp.array, candidate: wp.array
-) -> wp.Launch:  # fmt: skip
+def redraw_candidates(legged: LeggedWorlds, arm: Arm, row: wp.array, scale: wp.array, candidate: wp.array) -> wp.Launch:
     """Record what puts valid goals in the place of those of ``draw_candidates`` that are not.
 
     The arm's part of such a candidate is drawn again from the same box until it is valid, which makes it uniform over
     the valid goals. What comes out depends on (seed, world, the number of the goal, k) alone where the ground is level;
-    elsewhere also on where the robot is.
-
-    Args:
-        legged: The worlds.
-        arm: The arm.
-        row: Worlds that need a goal, int32, shape (n,), each in [0, num_envs).
-        scale: Half side of the box along every component, float32, shape (goal_dim,).
-        candidate: Candidates, float32, shape (n, count, goal_dim). Updated.
+    elsewhere also on where the robot is. For ``row``, ``scale`` and ``candidate`` see ``draw_candidates``.
 
     Returns:
         The launch, a thread for each candidate of each row.
@@ -262,15 +253,6 @@ def redraw_candidates(
     Raises:
         ValueError: If an array has another shape, dtype or device.
     """
-    goal = legged.worlds.goal
-    require("row", row, dtype=wp.int32, shape=row.shape, like=goal)
-    require("scale", scale, dtype=wp.float32, shape=goal.shape[1:], like=goal)
-    require_axes("candidate", candidate, 3)
-    require("candidate", candidate, shape=(len(row), candidate.shape[1], goal.shape[1]), like=goal)
-    return wp.launch(
-        _redraw_candidates,
-        dim=candidate.shape[:2],
-        inputs=[legged.worlds, legged.params, arm, legged.ground, legged.sim, row, scale, candidate],
-        device=row.device,
-        record_cmd=True,
-    )
+    check_candidates(row, scale, candidate, legged.worlds)
+    inputs = legged.params, arm, legged.ground, legged.sim, row, scale, candidate
+    return record(_redraw_candidates, legged.worlds, *inputs, dim=candidate.shape[:2])

@@ -9,15 +9,7 @@ from .height_scan import sample_height
 from .levels import begin_path
 from .observation import write_proprioception
 from .rewards import LEG_JOINTS
-from .state import (
-    NUM_FEET,
-    Ground,
-    Joints,
-    LeggedWorlds,
-    LocomotionParams,
-    LocomotionState,
-    Simulation,
-)
+from .state import NUM_FEET, Ground, Joints, LeggedWorlds, LocomotionParams, LocomotionState, Simulation
 
 wp.set_module_options({"enable_backward": False})
 

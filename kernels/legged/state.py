@@ -192,19 +192,10 @@ def sizes(
     tiles: Sequence[int] = (1, 1), goal_dim: int = 3, num_groups: int = 2, num_terms: int = NUM_COLUMNS,
     arm_fields: int = 0,
 ) -> dict[str, int]:  # fmt: skip
-    """The sizes that the tables name.
+    """The sizes that the tables name; the legs' joints, the velocity goal's components and their terms come first.
 
-    Args:
-        num_envs: Number of worlds.
-        num_joints: Joints of a robot, those of the legs first.
-        substeps: Substeps of a control step.
-        num_points: Heights in the observation.
-        heights: Samples of the height grid along each axis, at least 2.
-        tiles: Levels and columns of the terrain.
-        goal_dim: Components of a goal, those of the velocity goal first.
-        num_groups: Groups of components, linear and yaw first.
-        num_terms: Columns of what the reward is the sum of.
-        arm_fields: Components of the observation between the last action and the heights.
+    ``heights`` are the samples of the height grid along each axis, at least 2, ``tiles`` the levels and columns of the
+    terrain, and ``arm_fields`` the components of the observation between the last action and the heights.
 
     Raises:
         ValueError: If there are less than the first ones of something.

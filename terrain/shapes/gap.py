@@ -19,11 +19,7 @@ class Shape(TileShape):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.platform + 2 * max(self.width) >= self.tile:
-            raise ValueError(
-                f"tile must be larger than platform + 2 width = {self.platform + 2 * max(self.width):g} m, "
-                f"got {self.tile:g} m."
-            )
+        self.check_room("platform + 2 width", self.platform + 2 * max(self.width))
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""

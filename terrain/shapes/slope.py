@@ -5,10 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..mesh import Mesh, from_triangles
+from ..mesh import Mesh, sheet
 from ..shape import Ramp, TileShape, at
-
-_RING = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +25,7 @@ class Shape(TileShape):
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         rise = at(self.gradient, difficulty) * (self.tile - self.platform) / 2
-        middle = -rise if self.direction == "up" else rise
-        outer, inner = _RING * self.tile / 2, _RING * self.platform / 2
-        vertices = np.concatenate([np.insert(outer, 2, 0.0, axis=1), np.insert(inner, 2, middle, axis=1)])
-        faces = [[4, 5, 6], [4, 6, 7]]
-        for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)):
-            faces += [[a, b, b + 4], [a, b + 4, a + 4]]
-        return from_triangles(vertices, np.array(faces))
+        line = np.array([-self.tile, -self.platform, self.platform, self.tile]) / 2
+        height = np.zeros((4, 4))
+        height[1:3, 1:3] = -rise if self.direction == "up" else rise
+        return sheet(line, line, height)

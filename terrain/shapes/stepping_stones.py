@@ -26,11 +26,7 @@ class Shape(TileShape):
         super().__post_init__()
         for name in ("side", "gap"):
             check_ramp(name, getattr(self, name), least=0.01)
-        if self.platform + 2 * self.rim + 4 * max(self.gap) >= self.tile:
-            raise ValueError(
-                f"tile must be larger than platform + 2 rim + 4 gap = "
-                f"{self.platform + 2 * self.rim + 4 * max(self.gap):g} m, got {self.tile:g} m."
-            )
+        self.check_room("platform + 2 rim + 4 gap", self.platform + 2 * self.rim + 4 * max(self.gap))
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""

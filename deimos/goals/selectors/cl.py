@@ -63,8 +63,7 @@ class Curriculum(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Widen the range of every group that was tracked well under the range that it has."""
-        done = interactions.resolved()
-        done = done.where(done.resolved > self._counted_at)
+        done = interactions.resolved(self._counted_at)
         self._counted_at = interactions.now
         row: dict[str, float] = {}
         for i, group in enumerate(self._groups):

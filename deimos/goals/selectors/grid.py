@@ -97,8 +97,7 @@ class Grid(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Raise the weights around the cells of goals that were tracked well."""
-        done = interactions.resolved()
-        done = done.where(done.resolved > self._learnt_at)
+        done = interactions.resolved(self._learnt_at)
         self._learnt_at = interactions.now
         if bool((self._seen > 0).all()):
             self._half.copy_(self._seen)

@@ -92,8 +92,7 @@ class PLR(GoalSelector):
         """Score what has resolved, refresh the levels that were replayed, and keep the best new ones."""
         if rollout is None:
             raise ValueError("plr scores goals by advantages, so it needs the learner's rollout, got None.")
-        done = interactions.resolved()
-        done = done.where(done.resolved > self._learnt_at)
+        done = interactions.resolved(self._learnt_at)
         loss = self._positive_value_loss(interactions, done, rollout)
         self._learnt_at = interactions.now
         self._refresh(done, loss)

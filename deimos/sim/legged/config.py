@@ -13,7 +13,7 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.legged import robots
 from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
 from deimos.sim.legged.robots import Robot
-from deimos.terrain import Terrain
+from deimos.terrain import Terrain, importing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class LocomotionConfig(EnvConfig):
     robot: str = "go1"
     """Who walks, a name of ``deimos.sim.legged.robots``."""
     terrain: str = "flat"
-    """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a saved terrain."""
+    """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a terrain file (.npz)."""
     goal_period: int = 500
     """T: steps that a goal is active, at least 1 and at most an episode."""
     episode_steps: int = 1000
@@ -79,6 +79,11 @@ class LocomotionConfig(EnvConfig):
             raise ValueError(f"friction must be a range within [0.05, inf), got {self.friction}.")
 
     @property
+    def files(self) -> dict[str, Path]:
+        """See ``EnvConfig.files``: the terrain, unless it has a name."""
+        return {} if self.terrain in ("flat", "rough") else {"terrain": Path(self.terrain).expanduser()}
+
+    @property
     def largest_reward(self) -> float:
         """See ``EnvConfig.largest_reward``: perfect tracking."""
         per_second = max(self.rewards.linear_tracking, 0.0) + max(self.rewards.yaw_tracking, 0.0)
@@ -109,9 +114,15 @@ class LocomotionConfig(EnvConfig):
             return None
         if self.terrain == "rough":
             return terrain.rough()
-        if not Path(self.terrain).is_file():
-            raise ValueError(f"terrain must be flat, rough or the path of a saved terrain, got '{self.terrain}'.")
-        return terrain.load(self.terrain)
+        path = self.files["terrain"]
+        if path.suffix.lower() in importing.OPTIONS.keys() - {".npz"}:
+            advice = f"deimos terrain import {path} --out {path.with_suffix('.npz')}"
+            raise ValueError(
+                f"terrain must be flat, rough or a terrain file, got '{path}'; make one of it by: {advice}"
+            )
+        if not path.is_file():
+            raise ValueError(f"terrain must be flat, rough or the path of a terrain file, got '{self.terrain}'.")
+        return terrain.load(path)
 
 
 def check_weights(name: str, weights: Any) -> None:

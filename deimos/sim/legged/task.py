@@ -68,10 +68,7 @@ class Locomotion(WarpEnv):
         config: The task.
         robot: Who does it.
         parts: What its goals are made of; the velocity goal comes first.
-        num_envs: Number of worlds.
-        device: Where they are simulated.
-        seed: Seed of every draw.
-        env_offset: Global number of world 0.
+        num_envs, device, seed, env_offset: See ``EnvConfig.build``.
     """
 
     config: LocomotionConfig
@@ -94,6 +91,8 @@ class Locomotion(WarpEnv):
             action_bound=max(abs(end) for joint in robot.joints for end in joint.action_range),
         )  # fmt: skip
         ground = config.load_terrain()
+        if ground:
+            _require_room(ground)
         self.terrain = ground or terrain.flat()
         self.physics = self._build_physics(ground)
         self.tensors = self.physics.tensors | self.tensors
@@ -136,28 +135,21 @@ class Locomotion(WarpEnv):
         numbers: dict[str, Any] = {name: size for name, size in sizes.items() if name != "num_envs"}
         low, high = np.array([joint.range for joint in joints]).T
         action_low, action_high = np.array([joint.action_range for joint in joints]).T
-        scale, device = [joint.action_scale for joint in joints], warp_device(self.device)
-        simulation = {name: getattr(self.physics, name) for name in tables.SIMULATION.names}
+        device = warp_device(self.device)
         return LeggedWorlds(
             sizes=sizes,
             params=self._make_params(ground),
             worlds=self.worlds,
             joints=tables.build(
-                tables.JOINTS,
-                device,
-                pose=self.robot.pose,
-                action_scale=scale,
-                low=low,
-                high=high,
-                action_low=action_low,
-                action_high=action_high,
+                tables.JOINTS, device, pose=self.robot.pose, action_scale=[joint.action_scale for joint in joints],
+                low=low, high=high, action_low=action_low, action_high=action_high,
             ),
             ground=tables.build(tables.GROUND, device, heights=land.heights, origin=land.origins),
             sensing=tables.build(tables.SENSING, device, noise=_noise(self.layout, self.parts), point=self.points),
             state=self.allocate(tables.STATE, **numbers),
             out=self.allocate(tables.STEP, resume=False, **numbers),
-            sim=tables.build(tables.SIMULATION, device, **simulation),
-        )
+            sim=self.physics.arrays,
+        )  # fmt: skip
 
     def _make_params(self, ground: Terrain | None) -> LocomotionParams:
         """What the kernels need to know."""
@@ -265,6 +257,17 @@ class Locomotion(WarpEnv):
         """See ``Env.goal_point``."""
         places = [part.points for part in self._launches if part.points]
         return places[0]()[world] if places else None
+
+
+def _require_room(ground: Terrain) -> None:
+    """Raise ``ValueError`` unless robots start on the terrain, wherever around a tile's middle they do."""
+    beyond_corner = ground.origins[..., :2] - ground.corner
+    room, need = np.minimum(beyond_corner, ground.size - beyond_corner).min(), SPAWN_RANGE + EDGE
+    if room < need - 1e-4:
+        raise ValueError(
+            f"terrain must reach {need:g} m beyond the middle of every tile, around which robots start, got "
+            f"{room:.3g} m; make its tiles larger, or its border wider by {need - room:.3g} m."
+        )
 
 
 def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:

@@ -18,6 +18,7 @@ import warp as wp
 
 from deimos.checks import check_at_least, check_positive
 from deimos.kernels.legged.contacts import CONTACTS, TERRAIN, UNWATCHED, Contacts, gather_contacts
+from deimos.kernels.legged.state import Simulation
 from deimos.sim.legged.height_field import add_height_field
 from deimos.sim.legged.robots import CONTACT_STIFFNESS, ROBOT_BIT, TERRAIN_BIT, VISUAL_GROUP, Robot
 from deimos.sim.shared import Shared, warp_device
@@ -81,18 +82,8 @@ class Physics:
 
     model: "mujoco.MjModel"
     """The model with its visual geoms, for rendering and viewers."""
-    qpos: wp.array
-    """Positions, float32, shape (num_envs, nq)."""
-    qvel: wp.array
-    """Velocities, float32, shape (num_envs, nv)."""
-    ctrl: wp.array
-    """Target angles [rad], float32, shape (num_envs, nu)."""
-    torque: wp.array
-    """Torques of the joints in the last substep [N m], float32, shape (num_envs, nu)."""
-    part_force: wp.array
-    """Normal forces between each part of the robot and the terrain, float32, shape (substeps, num_envs, parts)."""
-    overflow: wp.array
-    """Bits of what ran out since they were last cleared, int32, shape (num_envs,)."""
+    arrays: Simulation
+    """What the simulator has for the kernels; torques are those of the last substep."""
     lost_contacts: int
     """The bits of ``overflow`` that mean that a contact or a constraint was left out."""
     tensors: dict[str, torch.Tensor]
@@ -115,7 +106,8 @@ class Physics:
         if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
             raise ValueError(
                 f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
-                f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}."
+                f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}, or import it with "
+                f"--resolution {FINEST_CELL}."
             )
         self.config = config
         self.num_envs = num_envs
@@ -144,8 +136,9 @@ class Physics:
             if payload is not None:
                 self._set_payload(model, payload)
         data = self._data
-        self.qpos, self.qvel, self.ctrl, self.torque = data.qpos, data.qvel, data.ctrl, data.actuator_force
-        self.overflow = data.overflow
+        self.arrays = Simulation()
+        self.arrays.qpos, self.arrays.qvel, self.arrays.ctrl = data.qpos, data.qvel, data.ctrl
+        self.arrays.torque, self.arrays.overflow = data.actuator_force, data.overflow
         bits = mjw.OverflowType
         self.lost_contacts = int(
             bits.NEFC | bits.NJMAX_NNZ | bits.BROADPHASE | bits.NARROWPHASE | bits.CCD | bits.HFIELD | bits.EPA_HORIZON
@@ -186,16 +179,16 @@ class Physics:
                 part[model.geom(name).id] = index
         data, device = self._data, warp_device(self.device)
         shape = (self.config.substeps, self.num_envs, len(robot.parts))
-        self.part_force = wp.zeros(shape, dtype=wp.float32, device=device)
+        self.arrays.part_force = wp.zeros(shape, dtype=wp.float32, device=device)
         self._peak = Shared.zeros(2, wp.int32, self.device)
         contacts = Contacts()
         contacts.count = data.nacon
         contacts.world, contacts.geom, contacts.dim = data.contact.worldid, data.contact.geom, data.contact.dim
         contacts.row, contacts.force = data.contact.efc_address, data.efc.force
         contacts.geom_part = wp.array(part, dtype=wp.int32, device=device)
-        contacts.part_force, contacts.peak = self.part_force, self._peak.array
+        contacts.part_force, contacts.peak = self.arrays.part_force, self._peak.array
         CONTACTS.require(
-            "contacts", contacts, self.part_force, num_envs=self.num_envs, num_geoms=model.ngeom, substeps=shape[0],
+            "contacts", contacts, contacts.part_force, num_envs=self.num_envs, num_geoms=model.ngeom, substeps=shape[0],
             parts=shape[2], buffer=self.max_contacts, edges=contacts.row.shape[1], rows=contacts.force.shape[1],
         )  # fmt: skip
         self._contacts = contacts
@@ -206,7 +199,7 @@ class Physics:
         Meant to be captured, see ``Captured``. Positions of bodies and geoms lag ``qpos`` by a substep.
         """
         with _device(self.device):
-            self.part_force.zero_()
+            self.arrays.part_force.zero_()
             for substep in range(self.config.substeps):
                 self._mjw.step(self._model, self._data)
                 gather_contacts(self._contacts, substep=substep)
@@ -250,9 +243,9 @@ class Physics:
     def to_mujoco(self, world: int) -> "mujoco.MjData":
         """One world as MuJoCo's own data on ``model``, for rendering, viewers and tests; reads the device."""
         data = self._mujoco.MjData(self.model)
-        data.qpos[:] = self.qpos.numpy()[world]
-        data.qvel[:] = self.qvel.numpy()[world]
-        data.ctrl[:] = self.ctrl.numpy()[world]
+        data.qpos[:] = self.arrays.qpos.numpy()[world]
+        data.qvel[:] = self.arrays.qvel.numpy()[world]
+        data.ctrl[:] = self.arrays.ctrl.numpy()[world]
         data.qacc_warmstart[:] = self._data.qacc_warmstart.numpy()[world]
         self._mujoco.mj_forward(self.model, data)
         return data
@@ -288,7 +281,7 @@ def _with_ground(robot: "mujoco.MjSpec", terrain: Terrain | None) -> "mujoco.MjS
     if terrain is None:
         ground = spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 0.05))
     else:
-        ground = add_height_field(spec, terrain.heights, terrain.cell, terrain.corner)
+        ground = add_height_field(spec, terrain)
     ground.contype, ground.conaffinity, ground.condim = TERRAIN_BIT, ROBOT_BIT, 1
     ground.solref = CONTACT_STIFFNESS
     _dress(spec, ground)

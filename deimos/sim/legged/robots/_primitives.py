@@ -37,18 +37,10 @@ def add_collision(
     import mujoco
 
     geom = body.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_SPHERE if end is None else mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=(radius, 0.0, 0.0),
-        group=COLLISION_GROUP,
-        contype=contype,
-        conaffinity=conaffinity,
-        condim=1,
-        friction=(1.0, 0.005, 0.0001),
-        solref=CONTACT_STIFFNESS,
-        mass=0.0,
-        rgba=(0.9, 0.3, 0.2, 0.4),
-    )
+        name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE if end is None else mujoco.mjtGeom.mjGEOM_CAPSULE,
+        size=(radius, 0.0, 0.0), group=COLLISION_GROUP, contype=contype, conaffinity=conaffinity, condim=1,
+        friction=(1.0, 0.005, 0.0001), solref=CONTACT_STIFFNESS, mass=0.0, rgba=(0.9, 0.3, 0.2, 0.4),
+    )  # fmt: skip
     _place(geom, start, end)
     return geom
 
@@ -61,15 +53,9 @@ def add_visual(
     import mujoco
 
     geom = body.add_geom(
-        type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"),
-        size=(*size, 0.0, 0.0)[:3],
-        quat=quat,
-        group=VISUAL_GROUP,
-        contype=0,
-        conaffinity=0,
-        mass=0.0,
-        rgba=rgba,
-    )
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"), size=(*size, 0.0, 0.0)[:3], quat=quat,
+        group=VISUAL_GROUP, contype=0, conaffinity=0, mass=0.0, rgba=rgba,
+    )  # fmt: skip
     _place(geom, pos, end)
 
 

@@ -69,17 +69,11 @@ def build(*, stiffness: float = STIFFNESS, damping: float = DAMPING, action_scal
 
     joints = tuple(
         Joint(
-            name=f"{leg}_{joint}",
-            pose=(_left(leg) if joint == "hip" else 1) * POSE[joint],
-            range=RANGE[joint],
-            action_scale=action_scale,
-            stiffness=stiffness,
-            damping=damping,
-            max_torque=MAX_TORQUE[joint],
+            name=f"{leg}_{joint}", pose=(_left(leg) if joint == "hip" else 1) * POSE[joint], range=RANGE[joint],
+            action_scale=action_scale, stiffness=stiffness, damping=damping, max_torque=MAX_TORQUE[joint],
         )
-        for leg in LEGS
-        for joint in JOINTS
-    )
+        for leg in LEGS for joint in JOINTS
+    )  # fmt: skip
     spec = mujoco.MjSpec()
     spec.modelname = "go1"
     spec.compiler.degree = False

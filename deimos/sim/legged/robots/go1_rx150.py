@@ -150,16 +150,11 @@ def mount(robot: Robot) -> Robot:
     _add_collisions(spec, trunk)
     joints = tuple(
         Joint(
-            name=name,
-            pose=POSE[i],
-            action_scale=ACTION_SCALE,
-            range=_limits(i),
-            stiffness=STIFFNESS[i],
-            damping=DAMPING[i],
-            max_torque=MAX_TORQUE[i],
+            name=name, pose=POSE[i], range=_limits(i), action_scale=ACTION_SCALE,
+            stiffness=STIFFNESS[i], damping=DAMPING[i], max_torque=MAX_TORQUE[i],
         )
         for i, name in enumerate(JOINTS)
-    )
+    )  # fmt: skip
     add_actuators(spec, joints)
     mounted = (MOUNT[0] + OFFSETS[0][0], MOUNT[1] + OFFSETS[0][1], MOUNT[2] + OFFSETS[0][2])
     axes = tuple(_axis(i) for i in range(len(JOINTS)))
@@ -187,12 +182,7 @@ def _add_links(trunk: "mujoco.MjsBody") -> None:
         body = body.add_body(name=BODIES[i], pos=OFFSETS[i])
         add_inertia(body, *LINKS[i])
         body.add_joint(
-            name=joint,
-            axis=_axis(i),
-            range=_limits(i),
-            limited=True,
-            armature=ARMATURE[i],
-            damping=(DRAG[i], 0.0, 0.0),
+            name=joint, axis=_axis(i), range=_limits(i), limited=True, armature=ARMATURE[i], damping=(DRAG[i], 0.0, 0.0)
         )
         _dress(body)
     body.add_site(name="end_effector", pos=OFFSETS[-1], group=VISUAL_GROUP)
