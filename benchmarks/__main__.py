@@ -10,7 +10,7 @@ import torch
 import tyro
 import warp as wp
 
-from benchmarks import commits, director, particle, quad, terrain, training
+from benchmarks import commits, director, learner, particle, quad, terrain, training
 from benchmarks.timing import wide_console
 from deimos.checks import RunError, check_at_least
 from deimos.run.trainer import TrainConfig
@@ -24,7 +24,7 @@ from reproduction.thesis import TABLE_4_1
 class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
-    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain", "director", "commits"]]
+    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain", "director", "learner", "commits"]]
     """What to measure."""
     against: str = "HEAD"
     """The other commit of ``commits``: this checkout's training beside it, in processes of their own."""
@@ -59,6 +59,10 @@ def run(options: BenchOptions) -> dict[str, Any]:
     if options.what == "commits":
         results["commits"] = commits.measure(options.against, options.rounds, options.threads or cores())
         commits.show(results["commits"], options.against)
+        return _write(results, options.json)
+    if options.what == "learner":
+        results["learner"] = learner.measure(options.rounds)
+        learner.show(results["learner"])
         return _write(results, options.json)
     with one_stream(device):
         if options.what in measure:

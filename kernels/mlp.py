@@ -113,12 +113,8 @@ auto expm1 = [](Vector x) __attribute__((always_inline)) {
     const Vector n = shifted - 12582912.0f;
     const Vector r = (bounded - n * 0.693359375f) + n * 2.12194440e-4f;
     const Vector power = (Vector)(((Whole)shifted << 23) + 0x3f800000);
-    Vector p = r * (1.0f / 5040) + (1.0f / 720);
-    p = p * r + (1.0f / 120);
-    p = p * r + (1.0f / 24);
-    p = p * r + (1.0f / 6);
-    p = p * r + 0.5f;
-    p = p * r * r + r;
+    Vector p = ((r * (1.0f / 5040) + (1.0f / 720)) * r + (1.0f / 120)) * r + (1.0f / 24);
+    p = ((p * r + (1.0f / 6)) * r + 0.5f) * r * r + r;
     return x > 88.0f ? Vector{} + __builtin_inff() : power * p + (power - 1.0f);
 };
 """
@@ -154,12 +150,11 @@ const int depth = back ? outs : ins - skipped, width = back ? ins : outs;
 const int to_next = back ? 1 : ins, to_deeper = back ? ins : 1;  // distances of weights
 auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
     constexpr int height = sizeof(sum) / sizeof(sum[0]);
-    float* to = y + unit * room + row;
+    float* const to = y + unit * room + row;
     #pragma unroll
-    for (int i = 0; i < height; ++i)
-        #pragma unroll
-        for (int j = 0; j < 3; ++j)
-            sum[i][j] = back ? Vector{} : skipped ? Vector(at(to + i * room + j * lanes)) : Vector{} + bias[unit + i];
+    for (int n = 0; n < 3 * height; ++n)
+        sum[n / 3][n % 3] = back ? Vector{} : skipped ? Vector(at(to + n / 3 * room + n % 3 * lanes))
+                                 : Vector{} + bias[unit + n / 3];
     const float* w = weight + skipped + unit * to_next;
     const float* v = x + row;
     for (int k = 0; k < depth; ++k, w += to_deeper, v += room) {
@@ -173,15 +168,13 @@ auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
         }
     }
     #pragma unroll
-    for (int i = 0; i < height; ++i)
-        #pragma unroll
-        for (int j = 0; j < 3; ++j) {
-            Loose& out = at(to + i * room + j * lanes);
-            const Vector s = sum[i][j], h = out;
-            if (!back) out = relu && !linear ? (s <= 0.0f ? Vector{} : s) : s;  // NaN stays NaN
-            else if (relu) out = h <= 0.0f ? Vector{} : s;
-            else out = elu ? (h <= 0.0f ? s * (h + 1.0f) : s) : s * (1.0f - h * h);
-        }
+    for (int n = 0; n < 3 * height; ++n) {
+        Loose& out = at(to + n / 3 * room + n % 3 * lanes);
+        const Vector s = sum[n / 3][n % 3], h = out;
+        if (!back) out = relu && !linear ? (s <= 0.0f ? Vector{} : s) : s;  // NaN stays NaN
+        else if (relu) out = h <= 0.0f ? Vector{} : s;
+        else out = elu ? (h <= 0.0f ? s * (h + 1.0f) : s) : s * (1.0f - h * h);
+    }
 };
 for (int row = 0; row < b.rows; row += 3 * lanes)
     for (int unit = 0, height; unit < width; unit += height) {
@@ -195,7 +188,6 @@ for (int row = 0; row < b.rows; row += 3 * lanes)
 @wp.func_native(_PRODUCT)
 def _product(shape: Shape, b: Block, layer: int, back: bool):
     """A layer's outputs; or the gradients by its inputs times the activation's slope, which take the inputs' place."""
-    ...
 
 
 _GRADIENT = _VECTORS + """
@@ -252,7 +244,6 @@ for (int unit = 0; unit < outs; ++unit) {
 @wp.func_native(_GRADIENT)
 def _add_gradient(shape: Shape, b: Block, layer: int):
     """Add the gradient by a layer's weights and biases."""
-    ...
 
 
 _CURVE = _VECTORS + _EXP + """
@@ -272,15 +263,12 @@ for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.room)
 @wp.func_native(_CURVE)
 def _bend(shape: Shape, b: Block, layer: int):
     """Apply ELU or tanh to a layer's outputs; ReLU costs nothing while they are in registers."""
-    ...
 
 
-# What lies in a block behind a network's outputs follows ``losses.ValueLoss``.
+# The data of a loss lie behind the outputs, column by column as ``losses`` has them.
 _VALUE = _VECTORS + """
 float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.room;
-const float* weight = value + b.room;
-const float* old = weight + b.room;
-const float* target = old + b.room;
+const float *weight = value + b.room, *old = weight + b.room, *target = old + b.room;
 Vector loss = {};
 for (int row = 0; row < b.rows; row += 16) {
     const Vector v = at(value + row), w = at(weight + row), error = v - at(target + row), step = v - at(old + row);
@@ -297,22 +285,15 @@ for (int row = 0; row < b.rows; row += 16) {
 @wp.func_native(_VALUE)
 def _value_loss(shape: Shape, b: Block, clip: float):
     """Replace the outputs by the gradients of ``losses.ValueLoss`` by them, and add its sum."""
-    ...
 
 
-# What lies in a block behind a network's outputs follows ``losses.Surrogate``.
 _SURROGATE = _VECTORS + _EXP + """
 const int room = b.room, actions = shape.units.data[shape.layers];
 float* mean = (float*)b.memory + shape.unit.data[shape.layers] * room;
-const float* action = mean + actions * room;
-const float* old_mean = action + actions * room;
-float* log_prob = (float*)old_mean + actions * room;
-const float* advantage = log_prob + room;
-const float* weight = advantage + room;
-float* slope = log_prob;
+float *action = mean + actions * room, *old_mean = action + actions * room, *log_prob = old_mean + actions * room;
+float *advantage = log_prob + room, *weight = advantage + room, *slope = log_prob;  // by log r
 const float* std = (const float*)b.parameters + shape.free;
-float* std_gradient = (float*)b.gradient + shape.free;
-float* sums = (float*)b.gradient + shape.parameters;
+float *std_gradient = (float*)b.gradient + shape.free, *sums = (float*)b.gradient + shape.parameters;
 float normaliser = 0.918938533f * actions;
 for (int a = 0; a < actions; ++a) normaliser += logf(std[a]);
 Vector loss = {};
@@ -325,8 +306,7 @@ for (int row = 0; row < b.rows; row += 16) {
     const Vector ratio = expm1(-0.5f * squares - normaliser - at(log_prob + row)) + 1.0f, gain = -at(advantage + row);
     const Vector least = Vector{} + (1.0f - clip), most = Vector{} + (1.0f + clip);
     const Vector held = ratio < least ? least : ratio > most ? most : ratio;
-    const Vector plain = gain * ratio, clipped = gain * held;
-    const Vector by_ratio = at(weight + row) * plain;
+    const Vector plain = gain * ratio, clipped = gain * held, by_ratio = at(weight + row) * plain;
     loss += at(weight + row) * (plain >= clipped ? plain : clipped);
     at(slope + row) = plain >= clipped ? by_ratio : by_ratio * 0.0f;
 }
@@ -349,25 +329,22 @@ for (int a = 0; a < actions; ++a) {
 @wp.func_native(_SURROGATE)
 def _surrogate(shape: Shape, b: Block, clip: float):
     """Replace the outputs by the gradients of ``losses.Surrogate`` by them; add those by deviations, and its sums."""
-    ...
 
 
 @wp.func_native("return address + 4 * ((wp::uint64)i * (wp::uint64)size + (wp::uint64)j * (wp::uint64)step);")
 def _offset(address: wp.uint64, i: int, size: int, j: int, step: int) -> wp.uint64:
     """Where number i * size + j * step lies."""
-    ...
 
 
 @wp.func_native("""
-float* to = (float*)b.memory + unit * b.room;
-for (int i = 0; i < units; ++i, to += b.room) {
-    for (int row = 0; row < rows; ++row) to[row] = ((const float*)source)[row * to_row + i * to_unit];
-    for (int row = rows; row < b.rows; ++row) to[row] = 0.0f;
+float* y = (float*)b.memory + unit * b.room;
+for (int i = 0; i < units; ++i, y += b.room) {
+    for (int row = 0; row < rows; ++row) y[row] = ((const float*)source)[row * to_row + i * to_unit];
+    for (int row = rows; row < b.rows; ++row) y[row] = 0.0f;
 }
 """)
 def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row: int, to_unit: int):
     """Copy units of rows into a block, and 0 behind them."""
-    ...
 
 
 @wp.func_native("""
@@ -377,22 +354,21 @@ for (int row = 0; row < rows; ++row)
 """)
 def _write(b: Block, unit: int, units: int, rows: int, to: wp.uint64):
     """Copy units of rows out of a block, row by row."""
-    ...
 
 
 @wp.func_native("""
 float* y = (float*)b.memory + unit * b.room;
-for (int row = 0, until; row < rows; row = until) {
-    const float* own = (const float*)start + (wp::uint64)((first + row) / shared) * units;
-    until = (first + row) / shared * shared + shared - first;
-    until = until < rows ? until : rows;
-    for (int i = 0; i < units; ++i) for (int r = row; r < until; ++r) y[i * b.room + r] = own[i];
+for (int row = 0, until; row < b.rows; row = until) {
+    const int group = (first + row) / shared, end = (group + 1) * shared - first;
+    until = row >= rows ? b.rows : end < rows ? end : rows;
+    for (int i = 0; i < units; ++i) {
+        const float value = row < rows ? ((const float*)start)[group * units + i] : 0.0f;
+        for (int r = row; r < until; ++r) y[i * b.room + r] = value;
+    }
 }
-for (int i = 0; i < units; ++i) for (int r = rows; r < b.rows; ++r) y[i * b.room + r] = 0.0f;
 """)
 def _spread(b: Block, unit: int, units: int, first: int, rows: int, start: wp.uint64, shared: int):
     """Write what the first layer's sums start from, the same for ``shared`` consecutive rows."""
-    ...
 
 
 @wp.func_native("for (int i = 0; i < count; ++i) ((float*)address)[i] = 0.0f;")
@@ -402,15 +378,6 @@ def _clear(address: wp.uint64, count: int): ...
 @wp.func_native("return __atomic_fetch_add((int*)counter, 1, __ATOMIC_RELAXED);")
 def _take(counter: wp.uint64) -> int:
     """The next number, for one thread alone: Warp's own ``atomic_add`` is none on a CPU."""
-    ...
-
-
-@wp.func
-def _forward(shape: Shape, b: Block):
-    for layer in range(shape.layers):
-        _product(shape, b, layer, False)
-        if shape.activation > 0 and layer + 1 < shape.layers:
-            _bend(shape, b, layer)
 
 
 @wp.func
@@ -434,7 +401,10 @@ def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
         _spread(b, shape.unit[1], units, first, rows, start, job.shared)
     x = _offset(job.x, net, job.x_net, first, job.x_row)
     _read(b, 0, b.inputs, rows, x, job.x_row, job.x_unit)
-    _forward(shape, b)
+    for layer in range(shape.layers):
+        _product(shape, b, layer, False)
+        if shape.activation > 0 and layer + 1 < shape.layers:
+            _bend(shape, b, layer)
     if job.mode == wp.static(int(Mode.FORWARD)):
         _write(b, end, outs, rows, y)
         return
@@ -476,11 +446,5 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
 
 
 def record(shape: Shape, jobs: wp.array, thread: int) -> wp.Launch:
-    """A launch for one thread, to be replayed with ``launch()`` whenever ``jobs[0]`` has been filled in.
-
-    Args:
-        shape: What the networks have in common.
-        jobs: The job, shape (1,).
-        thread: Which of the threads that share the job, from 0.
-    """
+    """A launch for one of the threads that share ``jobs[0]``, to be replayed whenever that has been filled in."""
     return wp.launch(_work, dim=1, inputs=[shape, jobs, thread], device="cpu", record_cmd=True)

@@ -9,7 +9,7 @@ from deimos.terrain import presets
 from torch import nn
 
 from benchmarks import __main__ as benchmarks
-from benchmarks import commits, director, flops, particle, quad, terrain, timing, training
+from benchmarks import commits, director, flops, learner, particle, quad, terrain, timing, training
 from deimos.checks import RunError
 from deimos.goals.methods import method
 from deimos.goals.selectors import rnd, vds
@@ -184,3 +184,19 @@ def test_a_run_that_fails_is_said():
     """An option that a version does not know ends the comparison with what it said."""
     with pytest.raises(RunError, match=r"train\.py .* failed: .*nonsense"):
         commits.compare(commits.HOME, 1, 1, {"bad": ["--nonsense", "1"]})
+
+
+def test_the_learner_is_measured(capsys):
+    """Kernel and torch are timed on the same minibatch, with and without a busy core, beside a large product."""
+    case = learner.Case("tiny", 5, (8,), 2, 3, "elu", 100)
+    # Of a row: the actor's products are 5 x 8 and 8 x 2, a critic's 5 x 8 and 8 x 1; the first needs two passes.
+    assert learner.operations(case) == 2 * 100 * ((2 * 40 + 3 * 16) + 3 * (2 * 40 + 3 * 8))
+    rows = learner.measure(1, [case])
+    assert [(row["by"], row["busy core"]) for row in rows] == [
+        ("kernel", False), ("torch", False), ("kernel", True), ("torch", True),
+    ]  # fmt: skip
+    for row in rows:
+        assert row["ms"] * row["GFLOP/s"] == pytest.approx(learner.operations(case) / 1e6)
+        assert 0 < row["share"] < 10
+    learner.show(rows)
+    assert "tiny, a core busy" in capsys.readouterr().out

@@ -181,6 +181,25 @@ def test_a_loop_without_gradients_may_continue_with_them():
     theirs.step()
 
 
+@pytest.mark.parametrize("name", ["p75", "rnd", "learnability"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_host_may_compute_in_float64(name, dtype):
+    """Where the default is float64 it chooses and learns, from states of either kind."""
+    torch.set_default_dtype(torch.float64)
+    try:
+        goals, generator = GoalDirector(name, 4, learn_every=8), torch.Generator().manual_seed(0)
+        never, goal = torch.zeros(300, dtype=torch.bool), torch.zeros(300, 2, dtype=dtype)
+        for t in range(40):
+            state = torch.randn(300, 3, generator=generator, dtype=dtype)
+            candidates = torch.randn(300, 10, 2, generator=generator, dtype=dtype)
+            goal = goals.step(state, goal, state[:, 0] > 1.0, never, candidates).goal
+            assert goal.dtype == dtype, t
+    finally:
+        torch.set_default_dtype(torch.float32)
+    selector = goals.selector
+    assert selector.fitted if name == "rnd" else selector.fear.fitted
+
+
 def test_a_curriculum_tells_its_range():
     """Candidates are the caller's, so the range that they shall come from can be asked for, and it grows."""
     goals = GoalDirector("cl", PERIOD, learn_every=10)

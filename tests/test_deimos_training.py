@@ -251,6 +251,20 @@ def test_threads_change_no_number(name, tmp_path, monkeypatch):
     assert written[1] == written[2] == written[0]
 
 
+@pytest.mark.parametrize("name", ["p75", "rnd", "vds"])
+def test_the_hosts_default_dtype_changes_no_number(name):
+    """Where torch's default is float64, a trainer is built and learns in float32, with the same numbers."""
+    config, found = replace(CONFIG, selector=None, method=name), []
+    for dtype in (torch.float32, torch.float64):
+        torch.set_default_dtype(dtype)
+        try:
+            trainer = training.Trainer(config, torch.device("cpu"))
+            found.append([str(trainer.iterate()) for _ in range(4)])
+        finally:
+            torch.set_default_dtype(torch.float32)
+    assert found[0] == found[1]
+
+
 def test_seed_reaches_everything():
     """The seed decides the weights of every network, their noise and order of learning, and the worlds and goals."""
     one, other = (training.Trainer(replace(CONFIG, seed=seed), torch.device("cpu")) for seed in (3, 4))

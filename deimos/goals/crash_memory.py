@@ -35,8 +35,8 @@ class CrashMemory(Stateful):
 
     def __init__(self, capacity: int, period: int, width: int, device: torch.device, seed: int) -> None:
         self._period = period
-        self._crash = torch.zeros(capacity, width, device=device)
-        self._partners = torch.zeros(capacity, PARTNERS, width, device=device)
+        self._crash = torch.zeros(capacity, width, dtype=torch.float32, device=device)
+        self._partners = torch.zeros(capacity, PARTNERS, width, dtype=torch.float32, device=device)
         self._issued = torch.zeros(capacity, dtype=torch.int64, device=device)
         self.stored = 0
         """Crashes stored so far, those that have made way included."""
@@ -90,7 +90,7 @@ class CrashMemory(Stateful):
         order = torch.randperm(len(youngest), generator=self.generator, device=rows.device)
         youngest = youngest[order[:YOUNGEST]]
         age = self._issued.amax() - issued  # only how they compare matters, and the newest weighs 1
-        weight = torch.exp2(age / (-HALF_LIFE * self._period))
+        weight = torch.exp2(age.float() / (-HALF_LIFE * self._period))
         present = PRESENT if len(youngest) else 0.0
         partners = weight.repeat_interleave(PARTNERS) * ((1.0 - present) / PARTNERS)
         fresh = (weight.sum() * present / max(1, len(youngest))).expand(len(youngest))

@@ -99,7 +99,7 @@ class Fear(Stateful):
         mass = mean_over_ranks(torch.stack([(weight * ~crashed).sum(), (weight * crashed).sum()]))
         weight = weight * (0.5 / mass)[crashed.long()]
         size = -(-len(inputs) // self.config.minibatches)
-        loss = torch.zeros((), device=target.device)
+        loss = torch.zeros((), dtype=torch.float32, device=target.device)
         for _ in range(self.config.epochs if epochs is None else epochs):
             order = torch.randperm(len(inputs), generator=self.generator, device=target.device)
             x, y, w = inputs[order], target[order], weight[order]

@@ -59,7 +59,7 @@ def percentile(score: Tensor, pick: Tensor) -> Tensor:
     Whatever the scores, a uniform pick has 50 on average.
     """
     own = take(score, pick).unsqueeze(1)
-    return ((score < own).sum(1) + (score <= own).sum(1)) * (50.0 / score.shape[1])
+    return ((score < own).sum(1) + (score <= own).sum(1)).float() * (50.0 / score.shape[1])
 
 
 def in_proportion(weight: Tensor, draw: Tensor) -> Tensor:

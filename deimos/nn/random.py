@@ -72,5 +72,6 @@ def normals(seed: int, purpose: int, world: Tensor, count: Tensor, size: int) ->
         for first, second in ((u0, u1), (u2, u3)):
             radius = torch.log1p(-first).mul_(-2.0).sqrt_()  # 1 - u is never 0
             angle = second.mul_(2.0 * math.pi)
-            numbers += [angle.cos().mul_(radius), angle.sin().mul_(radius)]
-    return torch.stack(numbers[:size], dim=-1)
+            wanted = (torch.cos, torch.sin)[: max(0, size - len(numbers))]
+            numbers += [turn(angle).mul_(radius) for turn in wanted]
+    return torch.stack(numbers, dim=-1)

@@ -65,7 +65,7 @@ class Novelty(FearSelector):
         p = self.calibration.probability(logits[head, torch.arange(len(head), device=head.device)])
         weight = p * (1.0 - p)
         if self.rnd.fitted:
-            rank = self.rnd.surprise(state, goal, candidates).argsort(dim=1).argsort(dim=1) + 1
+            rank = self.rnd.surprise(state, goal, candidates).argsort(dim=1).argsort(dim=1).float() + 1.0
             weight = weight * (rank / candidates.shape[1]) ** self.config.eta
         return super().ranking(state, goal, candidates, weight, draws)
 

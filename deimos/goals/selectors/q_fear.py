@@ -50,7 +50,8 @@ class QFear(director.Director):
         super().__init__(config, spaces, seed)
         self._sizes = [spaces.state_dim, spaces.goal_dim, spaces.goal_dim]
         # Of the latest decision of every world: state, goal until then, and the most feared candidate.
-        self._worst = torch.full((spaces.num_envs, sum(self._sizes)), torch.nan, device=spaces.device)
+        shape = spaces.num_envs, sum(self._sizes)
+        self._worst = torch.full(shape, torch.nan, dtype=torch.float32, device=spaces.device)
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""

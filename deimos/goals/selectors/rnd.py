@@ -91,9 +91,11 @@ class RND(GoalSelector):
         self.generator = generator(seed, "rnd minibatches", spaces.device)
         # Inputs are whitened by the moments of states, active goals and *uniform* candidates; those of the
         # chosen goals would drift with what is chosen.
-        self._uniform = torch.full((spaces.num_envs, spaces.goal_dim), torch.nan, device=spaces.device)
+        shape = spaces.num_envs, spaces.goal_dim
+        self._uniform = torch.full(shape, torch.nan, dtype=torch.float32, device=spaces.device)
         self._moments = torch.zeros(3, inputs, dtype=torch.float64, device=spaces.device)  # count, sum, of squares
-        self._mean, self._scale = torch.zeros(inputs, device=spaces.device), torch.ones(inputs, device=spaces.device)
+        self._mean = torch.zeros(inputs, dtype=torch.float32, device=spaces.device)
+        self._scale = torch.ones_like(self._mean)
         self._context = slice(0, inputs - spaces.goal_dim)
         self._goal = slice(inputs - spaces.goal_dim, inputs)
         self._clip = CLIP if config.whiten else math.inf
@@ -112,7 +114,7 @@ class RND(GoalSelector):
 
     def watch(self, rows: Tensor, candidates: Tensor) -> None:
         """Note what uniform goals look like; for the arguments see ``propose``."""
-        self._uniform[rows] = candidates[:, 0]
+        self._uniform[rows] = candidates[:, 0].float()
 
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
@@ -157,7 +159,7 @@ class RND(GoalSelector):
     def _fit(self, inputs: Tensor, target: Tensor) -> float:
         """Adam on the mean squared error; returns that of the last pass."""
         size = -(-len(inputs) // self.config.minibatches)
-        total = torch.zeros((), device=inputs.device)
+        total = torch.zeros((), dtype=torch.float32, device=inputs.device)
         for _ in range(self.config.epochs):
             total.zero_()
             order = torch.randperm(len(inputs), generator=self.generator, device=inputs.device)

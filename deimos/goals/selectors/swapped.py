@@ -38,8 +38,10 @@ class Swapped(director.Director):
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         super().__init__(config, spaces, seed)
-        self._state = torch.zeros(spaces.num_envs, spaces.state_dim, device=spaces.device)
-        self._goal = torch.zeros(spaces.num_envs, spaces.goal_dim, device=spaces.device)
+        sizes = spaces.state_dim, spaces.goal_dim
+        self._state, self._goal = (
+            torch.zeros(spaces.num_envs, size, dtype=torch.float32, device=spaces.device) for size in sizes
+        )
         self._count = 0  # decisions seen so far
 
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
