@@ -47,7 +47,7 @@ class GoalCore(Stateful):
             spaces.num_envs, spaces.state_dim, spaces.goal_dim, capacity, window, spaces.device,
             groups=0 if spaces.groups == (slice(None),) else len(spaces.groups),
         )  # fmt: skip
-        self.weight = torch.ones(spaces.num_envs, device=spaces.device)
+        self.weight = torch.ones(spaces.num_envs, dtype=torch.float32, device=spaces.device)
         """Weight of the transitions under the active goal in everything learnt, at least 0, shape (num_envs,)."""
         self.percentile = torch.full_like(self.weight, 50.0)
         """Percentile of the active goal's fear among the candidates that it was chosen from, in [0, 100], shape
