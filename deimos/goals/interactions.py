@@ -193,6 +193,15 @@ class Interactions(Stateful):
         state, goal, next_goal, *_ = known.split(self._sizes, dim=1)
         return torch.cat([pending, env]), state, goal, next_goal
 
+    @property
+    def latest_state(self) -> Tensor:
+        """State at the latest decision of every world, on the step ``issued_at``, shape (num_envs, state_dim)."""
+        return self._pending[:, : self._sizes[0]]
+
+    def followed(self, done: Resolved) -> Tensor:
+        """True where an interaction was survived and led to the latest decision of its world, bool, shape (n,)."""
+        return ~done.crashed & (self.issued_at[done.env] == done.resolved)
+
     def without_scores(self) -> "Interactions":
         """The same interactions for a selector that did not choose these goals: it sees no scores."""
         view = copy.copy(self)
