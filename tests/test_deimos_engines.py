@@ -247,7 +247,7 @@ def test_a_world_that_is_not_finite_stays_so_and_says_nothing(tmp_path, monkeypa
 
 def test_the_native_engine_is_for_cpus():
     """On CUDA it says which engine is."""
-    with pytest.raises(ValueError, match="^engine must be warp on cuda:0, got native; take --env.engine warp, or --device cpu"):
+    with pytest.raises(ValueError, match=r"^engine must be warp on cuda:0, got native; take --env\.engine warp, or --dev"):
         engines.build("native", go1.build(), None, 1, torch.device("cuda", 0), PhysicsConfig())
 
 
