@@ -36,7 +36,7 @@ CRASHING = {
 """Of particles, so fast that there are crashes to learn from; some commands need a fear network."""
 TRAINING = {
     "--num-envs": "16", "--env-steps": "48", "--env.goal-period": "5", "--eval.worlds": "8", "--eval.steps": "100",
-    "--eval.adversary-steps": "20", "--eval.adversary-patience": "1", "--threads": "1", "--device": "cpu",
+    "--eval.adversary-steps": "20", "--threads": "1", "--device": "cpu",
 }  # fmt: skip
 BUDGETS = {
     "train": TRAINING,
@@ -48,11 +48,11 @@ BUDGETS = {
 """By command: what its options become. Those of ``evaluate`` only where the page gives them."""
 SMALL = {
     "num_envs": 16, "env_steps": 48, "threads": 1,
-    "eval": EvalConfig(worlds=8, steps=200, adversary_steps=20, adversary_patience=1),
+    "eval": EvalConfig(worlds=8, steps=200, adversary_steps=20),
 }  # fmt: skip
 """The same for ``deimos.TrainConfig(...)`` in Python."""
 
-STUDY_EVAL = "eval = { worlds = 8, steps = 200, adversary_steps = 20, adversary_patience = 1 }"
+STUDY_EVAL = "eval = { worlds = 8, steps = 200, adversary_steps = 20 }"
 """The same in a study's file."""
 
 ELSEWHERE = {

@@ -44,7 +44,7 @@ def train(config: TrainConfig | None = None, out: Path | str | None = None) -> P
 
 
 def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "auto", **changes: Any) -> list[dict]:
-    """Evaluate the policy of a run against uniform goals (Naive) and against a freshly trained Adversary.
+    """Evaluate the policy of a run against uniform goals (Naive) and against attackers.
 
     Args:
         run: The run's folder; its ``evaluation.json`` gains the rows.
@@ -53,7 +53,7 @@ def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "
         changes: Fields of ``EvalConfig`` that differ from the run's, such as ``worlds``, ``steps`` or ``seed``.
 
     Returns:
-        A row for each kind of goals; see ``evaluation.evaluate``.
+        A row for uniform goals and one for each attacker; see ``evaluation.evaluate``.
 
     Raises:
         RunError: If it is not a run folder, or a value is not allowed.
