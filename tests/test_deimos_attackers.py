@@ -8,11 +8,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.run import attackers
 from deimos.run.attack import Explorer, argmax_director, attacker, learn_fear, names, quality, uniform_goals
 from deimos.run.attackers import search
+from deimos.run.attackers.pooled import make_pool
 from deimos.run.attackers.scripted import Scripted
 from deimos.run.evaluation import EvalConfig, _identities, evaluate, make_target
 from deimos.sim.envs import particle
@@ -20,7 +22,7 @@ from deimos.sim.envs import particle
 CPU = torch.device("cpu")
 VARIANTS = ["absolute", "directional", "relative"]
 SMALL = EvalConfig(
-    worlds=60, steps=600, attackers=tuple(names()), adversary_steps=300, oracle_worlds=8,
+    worlds=60, steps=600, adversary_steps=300, oracle_worlds=8,
     fear=FearConfig(epochs=10, min_per_class=1),
 )  # fmt: skip
 
@@ -36,15 +38,17 @@ def blind(variant="directional"):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_nobody_crashes_a_policy_that_stays(variant):
+def test_nobody_crashes_a_policy_that_stays(tmp_path, variant):
     """A policy that stays at the origin never crashes; attackers that would have to learn from crashes say so."""
-    rows = evaluate(stay, particle.Config(variant=variant), SMALL, CPU)
+    config, pool = particle.Config(variant=variant), tmp_path / "pool.pt"
+    make_pool([make_target(blind(variant), config, SMALL, CPU)], pool)
+    rows = evaluate(stay, config, replace(SMALL, attackers=tuple(names()), pool=pool), CPU)
     assert [row["goals"] for row in rows] == ["naive", *names()]
     assert [row["crashes"] for row in rows] == [0] * len(rows)
-    learn = [row for row in rows if "adversary_crashes" in row]
+    learn = [row for row in rows if "adversary_crashes" in row and row["goals"] != "pooled"]
     assert [row["adversary_crashes"] for row in learn] == [0] * len(learn)
     assert {row["goals"]: row["uninformed"] for row in rows[1:]} == dict.fromkeys(names(), True) | {
-        "scripted": False, "oracle": False,
+        "scripted": False, "oracle": False, "pooled": False,
     }  # fmt: skip
 
 
@@ -152,6 +156,50 @@ def test_search_in_no_box_is_argmax():
     arguments = (rows, env.state(env.obs), env.goal, env.sample_goals(rows, 300).clone(), env.draw(rows))
     chosen = search.Search(search.Config(), env, fear).propose(*arguments)
     assert torch.equal(chosen.goal, argmax_director(env, fear).propose(*arguments).goal)
+
+
+def test_a_pool_attacks_policies_that_it_has_not_seen(tmp_path):
+    """A network that has seen some policies crash crashes another; all meet the same network, which the file fixes."""
+    config, pool = particle.Config(), tmp_path / "pool.pt"
+    facts = make_pool([make_target(policy, config, SMALL, CPU) for policy in (stay, blind())], pool)
+    alone = [learn_fear(make_target(policy, config, SMALL, CPU), 300, own_goals=True)[1] for policy in (stay, blind())]
+    assert facts["adversary_interactions"] == sum(each["adversary_interactions"] for each in alone)
+    assert facts["adversary_crashes"] == alone[1]["adversary_crashes"] > 0
+    assert facts["adversary_auroc"] > 0.7
+
+    def slower(obs):
+        return 0.6 * blind()(obs)
+
+    sizes = replace(SMALL, attackers=("pooled",), pool=pool, steps=1000)
+    naive, attacked = evaluate(slower, config, sizes, CPU)
+    assert attacked["crash_rate"] > 1.2 * naive["crash_rate"] > 0
+    assert attacked["adversary_crashes"] == facts["adversary_crashes"]
+    before = _identities(config, sizes)
+    make_pool([make_target(blind(), config, SMALL, CPU)], pool)
+    after = _identities(config, sizes)
+    assert before[0] == after[0]
+    assert before[1] != after[1]
+
+
+def test_a_pool_is_refused_in_one_line(tmp_path):
+    """None, one of another environment, one that is not there, and policies that never crash."""
+    config, pool = particle.Config(), tmp_path / "pool.pt"
+    with pytest.raises(ValueError, match="pool must be a file of deimos pool for the attacker pooled, got none"):
+        EvalConfig(attackers=("pooled",))
+    sizes = replace(SMALL, attackers=("pooled",), pool=pool)
+    with pytest.raises(RunError, match=r"pool.pt cannot be read \(No such file"):
+        evaluate(stay, config, sizes, CPU)
+    with pytest.raises(RunError, match="None of the policies crashed"):
+        make_pool([make_target(stay, config, SMALL, CPU)], pool)
+    make_pool([make_target(blind(), config, SMALL, CPU)], pool)
+    with pytest.raises(RunError, match=r"pool\.pt is of other observations"):
+        evaluate(stay, replace(config, max_speed=20.0), sizes, CPU)
+    other = make_target(blind(), replace(config, max_speed=20.0), SMALL, CPU)
+    with pytest.raises(RunError, match="observe different things"):
+        make_pool([make_target(blind(), config, SMALL, CPU), other], pool)
+    pool.write_bytes(b"broken")
+    with pytest.raises(RunError, match=r"pool\.pt"):
+        evaluate(stay, config, sizes, CPU)
 
 
 def test_setting_tells_attackers_apart():

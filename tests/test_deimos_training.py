@@ -529,7 +529,7 @@ CONFIGS = {
             hidden=(3, 2, 1), activation="elu", init_std=0.7,
         ),
         eval=EvalConfig(
-            worlds=3, steps=99, seed=0, adversary_steps=4, attackers=("oracle",), oracle_worlds=2,
+            worlds=3, steps=99, seed=0, adversary_steps=4, attackers=("oracle",), oracle_worlds=2, pool=Path("pool.pt"),
             fear=FearConfig(
                 hidden=(9, 9, 9), activation="elu", learning_rate=1.0, epochs=1, minibatches=1, min_per_class=9,
                 workspace=1,

@@ -42,6 +42,7 @@ BUDGETS = {
     "train": TRAINING,
     "resume": {"--env-steps": "192"},
     "evaluate": {"--oracle-worlds": "4", "--calibration": "100", "--contexts": "2"},
+    "pool": {"--worlds": "16", "--adversary-steps": "60"},
     "study run": {"--methods": "uniform p25", "--num-envs": "16", "--env-steps": "48", "--threads": "1"},
     "play": {"--seconds": "0.2", "--fps": "10", "--width": "64", "--height": "48"},
 }

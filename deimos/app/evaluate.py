@@ -21,7 +21,7 @@ from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
-_CHANGES = ("worlds", "steps", "seed", "attackers", "oracle_worlds")
+_CHANGES = ("worlds", "steps", "seed", "attackers", "pool", "oracle_worlds")
 _AUDITS = ("contexts", "calibration")
 _AUDIT = (
     ("AUROC within contexts (0.5: chance, 1: perfect)", "auroc"),
@@ -53,6 +53,8 @@ class EvaluateOptions:
     """Where to simulate; auto takes the GPU where there is one."""
     attackers: tuple[str, ...] | None = None
     """Attackers beside those that the run was set up with, by name: argmax-long, oracle, ..."""
+    pool: Path | None = None
+    """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
     oracle_worlds: int | None = None
     """Worlds that meet an attacker that tries its goals in clones. By default as the run was set up."""
     calibration: int = 0

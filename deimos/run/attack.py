@@ -9,6 +9,7 @@ import abc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -46,6 +47,8 @@ class Target:
     """Seed of the worlds that it is evaluated in, and of an attacker's own draws."""
     fear: FearConfig
     """A fear network, and how it learns."""
+    pool: Path | None = None
+    """The file of ``pooled``."""
     progress: Callable[[float], None] = lambda share: None
     """Called now and then with the share of the preparation that is done."""
 
@@ -65,6 +68,9 @@ class AttackerConfig(abc.ABC):
 
     few_worlds: ClassVar[bool] = False
     """Whether a goal costs so much that it meets ``EvalConfig.oracle_worlds`` worlds only."""
+
+    needs_pool: ClassVar[bool] = False
+    """Whether it is made from the file ``EvalConfig.pool``."""
 
     @abc.abstractmethod
     def prepare(self, target: Target) -> Attack:
@@ -105,18 +111,33 @@ def argmax_director(env: Env, fear: Fear) -> director.Director:
 
 
 def learn_fear(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, dict[str, Any]]:
-    """Train a fear network on a finished policy.
-
-    Args:
-        target: The policy.
-        steps: Steps of every world that are learnt from, at least 1.
-        own_goals: Whether every other goal is the network's own argmax, as far as it has learnt by then. Uniform goals
-            show few crashes of a safe policy, its own choices alone no survivals. False for uniform goals alone.
+    """Train a fear network on a finished policy; for the arguments see ``collect``.
 
     Returns:
         The network, and ``adversary_steps``, ``adversary_interactions``, ``adversary_crashes``, ``adversary_auroc`` (on
         every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``uninformed``: whether
         it has learnt nothing, for want of a crash or of a survival, so that goals are uniform.
+    """
+    fear, data = collect(target, steps, own_goals=own_goals)
+    fear.fit(learnt_from(data))
+    fear.check()
+    return fear, {
+        "adversary_steps": steps, "adversary_interactions": len(data), "adversary_crashes": int(data.crashed.sum()),
+        "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)), "uninformed": not fear.fitted,
+    }  # fmt: skip
+
+
+def collect(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, Resolved]:
+    """Let a policy act, to learn from what happens.
+
+    Args:
+        target: The policy.
+        steps: Steps of every world, at least 1.
+        own_goals: Whether every other goal is a network's own argmax, as far as it has learnt by then. Uniform goals
+            show few crashes of a safe policy, its own choices alone no survivals. False for uniform goals alone.
+
+    Returns:
+        The network, which has learnt nothing yet without goals of its own, and all interactions.
     """
     env = target.build(target.worlds, target.seed + 1)
     fear = Fear(target.fear, env.state_dim, env.goal_dim, env.device, target.seed)
@@ -129,18 +150,13 @@ def learn_fear(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, di
         if t % pause == 0:
             target.progress(t / steps)
             if own_goals:
-                fear.fit(_learnt_from(loop.outcomes()), epochs=1)
+                fear.fit(learnt_from(loop.outcomes()), epochs=1)
     env.check()
-    data = loop.outcomes()
-    fear.fit(_learnt_from(data))
-    fear.check()
-    return fear, {
-        "adversary_steps": steps, "adversary_interactions": len(data), "adversary_crashes": int(data.crashed.sum()),
-        "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)), "uninformed": not fear.fitted,
-    }  # fmt: skip
+    return fear, loop.outcomes()
 
 
-def _learnt_from(data: Resolved) -> Resolved:
+def learnt_from(data: Resolved) -> Resolved:
+    """What a network may learn from: all but every fifth world."""
     return data.where(data.env % HELD_OUT != 0)
 
 

@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import check_at_least, check_range
+from deimos.checks import RunError, check_at_least, check_range
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
@@ -48,6 +49,8 @@ class EvalConfig:
     take a multiple of it, the same for every policy."""
     fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32, min_per_class=1))
     """The fear network of an attacker."""
+    pool: Path | None = None
+    """File of the attacker ``pooled``, which ``deimos pool`` makes."""
     oracle_worlds: int = 200
     """Worlds, at least 1 and of the others, that meet an attacker that tries its goals in clones: N T steps a goal."""
 
@@ -56,7 +59,8 @@ class EvalConfig:
             check_at_least(name, getattr(self, name), 1)
         check_range("seed", self.seed, 0, 2**32 - 2)
         for name in self.attackers:
-            attacker(name)
+            if attacker(name).needs_pool and self.pool is None:
+                raise ValueError(f"pool must be a file of deimos pool for the attacker {name}, got none.")
         if len(set(self.attackers)) < len(self.attackers):
             raise ValueError(f"attackers must be different, got {', '.join(self.attackers)}.")
 
@@ -107,15 +111,25 @@ def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
     return [
         {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed,
          "worlds": config.worlds_against(goals), "steps": config.steps}
-        | ({} if goals == "naive" else {"adversary_setting": _setting(shared, config.adversary_steps, goals)})
+        | ({} if goals == "naive" else {"adversary_setting": _setting(shared, config, goals)})
         for goals in ("naive", *config.attackers)
     ]  # fmt: skip
 
 
-def _setting(shared: dict, steps: int, name: str) -> str:
+def _setting(shared: dict, config: EvalConfig, name: str) -> str:
     """A hash of all that fixes how an attacker was made, but for the policy."""
-    made = shared | {"adversary_steps": steps, "attacker": name} | to_dict(attacker(name))
+    made = shared | {"adversary_steps": config.adversary_steps, "attacker": name} | to_dict(attacker(name))
+    if attacker(name).needs_pool:
+        assert config.pool is not None
+        made["pool"] = hashlib.sha256(_read(config.pool)).hexdigest()
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RunError(f"{path} cannot be read ({error.strerror}).") from error
 
 
 def evaluate(
@@ -164,6 +178,7 @@ def make_target(policy: Policy, env_config: EnvConfig, config: EvalConfig, devic
     return Target(
         policy=policy, build=lambda worlds, seed: quiet.build(worlds, device, seed), worlds=config.worlds,
         steps=config.adversary_steps, seed=config.seed, fear=config.fear,
+        pool=config.pool,
     )  # fmt: skip
 
 
