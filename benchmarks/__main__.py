@@ -10,7 +10,7 @@ import torch
 import tyro
 import warp as wp
 
-from benchmarks import commits, director, learner, particle, quad, terrain, training
+from benchmarks import commits, director, engines, learner, particle, quad, terrain, training
 from benchmarks.timing import wide_console
 from deimos.checks import RunError, check_at_least
 from deimos.run.trainer import TrainConfig
@@ -24,7 +24,9 @@ from reproduction.thesis import TABLE_4_1
 class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
-    what: tyro.conf.Positional[Literal["particle", "quad", "quad-arm", "terrain", "director", "learner", "commits"]]
+    what: tyro.conf.Positional[
+        Literal["particle", "quad", "quad-arm", "engines", "terrain", "director", "learner", "commits"]
+    ]
     """What to measure."""
     against: str = "HEAD"
     """The other commit of ``commits``: this checkout's training beside it, in processes of their own."""
@@ -55,7 +57,10 @@ def run(options: BenchOptions) -> dict[str, Any]:
     results: dict[str, Any] = {
         "versions": provenance(), "threads": torch.get_num_threads(), "device": str(device),
     }  # fmt: skip
-    measure = {"particle": measure_particle, "terrain": measure_terrain, "director": measure_director}
+    measure = {
+        "particle": measure_particle, "engines": measure_engines, "terrain": measure_terrain,
+        "director": measure_director,
+    }  # fmt: skip
     if options.what == "commits":
         results["commits"] = commits.measure(options.against, options.rounds, options.threads or cores())
         commits.show(results["commits"], options.against)
@@ -101,6 +106,13 @@ def measure_legged(name: str, rounds: int, device: torch.device) -> dict[str, An
     quad.print_env(name, results["env"])
     results["training"] = quad.measure_training(name, device, 3 * rounds)
     training.print_training(f"{name}, flat, T = {quad.PERIOD}", results["training"])
+    return results
+
+
+def measure_engines(rounds: int, device: torch.device) -> dict[str, Any]:
+    """The engines of the legged environments beside each other."""
+    results = engines.measure(device, rounds)
+    engines.show(results)
     return results
 
 

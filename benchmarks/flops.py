@@ -46,7 +46,7 @@ def of_selector(selector: SelectorConfig, ppo: PPOConfig, env: Env) -> float:
         return decisions * scoring(context, goal, fear.hidden, 1, candidates) + fit
     if isinstance(selector, rnd.Config):
         nets = [forward(context + goal, (units,), selector.features) for units in (selector.target, selector.predictor)]
-        both = (selector.target + selector.predictor,)  # scored together, as one network of that width
+        both = (selector.target + selector.predictor,)  # as one network of that width
         score = scoring(context, goal, both, selector.features, selector.candidates)
         return decisions * (score + (nets[0] + TRAINING * nets[1]) * selector.epochs)
     if isinstance(selector, vds.Config):

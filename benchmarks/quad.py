@@ -15,7 +15,7 @@ from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import vds
 from deimos.run.presets import preset
 from deimos.sim.legged.config import LocomotionConfig
-from deimos.sim.legged.engines.mujoco_warp import Captured
+from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.task import Locomotion
 from reproduction.thesis import TABLE_4_1
 
@@ -29,7 +29,7 @@ SETTLE = 50  # control steps before anything is timed: robots that have landed t
 
 
 def measure_env(name: str, device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[str, Any]:
-    """Control steps per second of ``env.step`` and of the captured substeps alone, on flat and on rough ground.
+    """Control steps per second of ``env.step`` and of mujoco-warp's captured substeps alone, on flat and rough ground.
 
     Both run in the same environment in turn, so that the robots of both are in the same poses.
     """
@@ -37,7 +37,7 @@ def measure_env(name: str, device: torch.device, rounds: int, num_envs: int = WO
     assert isinstance(config, LocomotionConfig)
     work: dict[str, Callable[[], Any]] = {}
     for ground in ("flat", "rough"):
-        env = replace(config, terrain=ground).build(num_envs, device, seed=0)
+        env = replace(config, terrain=ground, engine="warp").build(num_envs, device, seed=0)
         assert isinstance(env, Locomotion)
         action = torch.zeros(num_envs, env.action_dim, device=device)
         for _ in range(SETTLE):

@@ -1,6 +1,7 @@
 """The file name is the registration: a module in a package of plug-ins *is* the plug-in of that name.
 
-Packages outside this tree register a module through an entry-point group, one of ``HOLDS``.
+Packages outside this tree register a module through an entry-point group, one of ``HOLDS``; a module that is not
+installed does it itself, when it is imported, by ``register``.
 """
 
 import dataclasses
@@ -21,14 +22,25 @@ HOLDS = {
 }  # fmt: skip
 """What every plug-in of a group holds, and its name."""
 
+_registered: dict[str, dict[str, str]] = {}  # by group: names of plug-ins and modules, in this process
+
+
+def register(package: ModuleType, name: str, module: str) -> None:
+    """Make a module, by its full name, the plug-in ``name`` of ``package`` in this process."""
+    _registered.setdefault(_group(package), {})[name] = module
+
 
 def names(package: ModuleType) -> list[str]:
-    """Names of the plug-ins of ``package``, sorted: its public modules and the registered entry points."""
-    return sorted(_own(package) | set(entry_points(group=_group(package)).names))
+    """Names of the plug-ins of ``package``, sorted: its public modules and what was registered."""
+    return sorted(_own(package) | set(entry_points(group=_group(package)).names) | set(_here(package)))
 
 
 def _group(package: ModuleType) -> str:
     return "deimos." + package.__name__.rpartition(".")[2]
+
+
+def _here(package: ModuleType) -> dict[str, str]:
+    return _registered.get(_group(package), {})
 
 
 def _own(package: ModuleType) -> set[str]:
@@ -52,9 +64,9 @@ def load(package: ModuleType, name: str, use: Callable[[ModuleType], Any] = lamb
     """
     group, own = _group(package), name in _own(package)
     entry = None if own else next(iter(entry_points(group=group, name=name)), None)
-    if not own and entry is None:
+    module = f"{package.__name__}.{name}" if own else entry.value if entry else _here(package).get(name)
+    if module is None:
         raise ValueError(f"{package.__name__} has no '{name}'; it has: {', '.join(names(package))}.")
-    module = entry.value if entry else f"{package.__name__}.{name}"
     kind, held = HOLDS[group]
     try:
         found = entry.load() if entry else importlib.import_module(module)
@@ -83,4 +95,5 @@ def name_of(package: ModuleType, module: str) -> str | None:
     parent, _, name = module.rpartition(".")
     if parent == package.__name__ and name in _own(package):
         return name
-    return next((entry.name for entry in entry_points(group=_group(package)) if entry.module == module), None)
+    foreign = {entry.module: entry.name for entry in entry_points(group=_group(package))}
+    return (foreign | {value: key for key, value in _here(package).items()}).get(module)

@@ -49,7 +49,7 @@ def main() -> None:
         falls += int(fallen.sum())
     upright, leans = torch.tensor([1.0, 0.0, 0.0]).expand(5, 3), torch.linspace(0, LARGEST, 5).unsqueeze(1)
     print(f"{falls} falls. Fear of leaning, from upright:")
-    for angle, fear in zip(leans[:, 0], director.fear(upright, torch.zeros(5, 1), leans), strict=True):
+    for angle, fear in zip(leans[:, 0], director.fear(upright, torch.zeros(5, 1), leans).probability, strict=True):
         print(f"{angle:.1f} rad  {fear:.2f}")
 
 

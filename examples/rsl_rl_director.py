@@ -51,7 +51,7 @@ def main() -> None:
     OnPolicyRunner(env, config).learn(args.iterations)
     edge, speeds = torch.tensor([0.9, 0.0]).expand(5, 2), torch.linspace(-1, 1, 5).unsqueeze(1)
     print("Fear of a new speed for a cart that stands 0.1 m from the end of the track:")
-    for speed, fear in zip(speeds[:, 0], env.director.fear(edge, torch.zeros(5, 1), speeds), strict=True):
+    for speed, fear in zip(speeds[:, 0], env.director.fear(edge, torch.zeros(5, 1), speeds).probability, strict=True):
         print(f"{speed:+.1f} m/s  {fear:.2f}")
 
 

@@ -1,6 +1,7 @@
 """Fixtures of all tests: the devices that they run on, and the reference of every random draw."""
 
 import contextlib
+from collections import namedtuple
 from importlib.util import find_spec
 
 import numpy as np
@@ -26,6 +27,17 @@ def device(request):
     """Name of a device; on CUDA, torch and Warp run on one stream for as long as the test lasts."""
     with one_stream(torch.device(request.param)):
         yield request.param
+
+
+Simulator = namedtuple("Simulator", ["engine", "device"])
+
+
+@pytest.fixture(params=[("warp", name) for name in DEVICES] + [("native", "cpu")], ids="-".join)
+def simulator(request):
+    """An engine for robots and a device that it knows, for torch."""
+    engine, name = request.param
+    with one_stream(torch.device(name)):
+        yield Simulator(engine, torch.device(name))
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from deimos.terrain import presets
 from torch import nn
 
 from benchmarks import __main__ as benchmarks
-from benchmarks import commits, director, flops, learner, particle, quad, terrain, timing, training
+from benchmarks import commits, director, engines, flops, learner, particle, quad, terrain, timing, training
 from deimos.checks import RunError
 from deimos.goals.methods import method
 from deimos.goals.selectors import rnd, vds
@@ -94,6 +94,21 @@ def test_methods_that_are_timed_exist():
     """Both tables of methods hold Uniform, which the others are compared with."""
     assert "uniform" in training.METHODS_TIMED
     assert "uniform" in quad.METHODS_TIMED
+
+
+def test_engines_are_measured(capsys):
+    """Both engines step in turn on both grounds, with the native one's bare steps, and every ratio is of two times."""
+    result = engines.measure(CPU, 2, num_envs=2)
+    names = {f"{name}, {ground}" for name in ("native", "bare native", "mujoco-warp") for ground in ("flat", "rough")}
+    assert result["us on the clock"].keys() == result["us of all cores"].keys() == names
+    assert all(value > 0 for value in result["us on the clock"].values())
+    ratios = [value for value in result.values() if isinstance(value, float)]
+    assert len(ratios) == 6
+    assert all(value > 0 for value in ratios)
+    engines.show(result)
+    assert "2 robots that walk" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="device must be cpu for the native engine, got cuda"):
+        engines.measure(torch.device("cuda"), 1)
 
 
 def test_quad_is_measured(capsys):

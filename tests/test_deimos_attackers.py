@@ -91,7 +91,7 @@ def test_scripted_is_uniform_where_nobody_knows_better():
 
 
 @pytest.mark.parametrize(
-    ("name", "steps"), [("argmax", 300), ("argmax-long", 1200), ("search", 1200), ("oracle", 1200)]
+    ("name", "steps"), [("argmax", 300), ("argmax-long", 1200), ("q-fear", 1200), ("search", 1200), ("oracle", 1200)]
 )
 def test_every_policy_costs_the_same(name, steps):
     """What an attacker may learn from is as much for a policy that never crashes as for one that does all the time."""
@@ -110,6 +110,17 @@ def test_the_thesis_adversary_learns_from_uniform_goals():
     naive = evaluate(blind(), config, replace(SMALL, seed=SMALL.seed + 1, attackers=()), CPU)[0]
     assert facts["adversary_interactions"] == naive["interactions"]
     assert facts["adversary_crashes"] == naive["interaction_crashes"]
+
+
+def test_q_fear_sees_beyond_a_goal():
+    """Where no goal can crash a policy within its T steps, it asks for speed towards the wall that is next."""
+    config = particle.Config(goal_period=10)  # at 10 u a step nobody crosses the 250 u that are left
+    target = make_target(blind(), config, replace(SMALL, worlds=300, adversary_steps=500), CPU)
+    env, rows = config.build(200, CPU, 3), torch.arange(200)
+    still = torch.tensor([0.0, 0.0, 0.0, 0.75, 0.0, 0.0, 0.0, 0.0, 0.0]).expand(200, 9)
+    arguments = (rows, still, still[:, :3], env.sample_goals(rows, 100).clone(), env.draw(rows))
+    speed = attacker("q-fear").prepare(target).selector(env).propose(*arguments).goal[:, 0]
+    assert speed.mean() > 0.7
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

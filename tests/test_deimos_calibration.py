@@ -50,7 +50,7 @@ def test_known_probabilities_are_recovered():
     score = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
     calibration = Calibration()
     raw = evaluate(calibration.probability(score), held_out.crashed)
-    calibration.set_share(fear.share)
+    calibration.set_share(train.crashed.float().mean().item())
     corrected = evaluate(calibration.probability(score), held_out.crashed)
     calibration.fit(score[:10_000] + calibration.prior, held_out.crashed[:10_000], steps=20)
     probability = calibration.probability(score[10_000:])

@@ -23,6 +23,7 @@ OURS = {
         variant="relative", spawn_range=50.0, time_limit=30, stagger_goals=True, crash_penalty=2.0
     ),
     "quad": quad.Config(),
+    "quad on mujoco-warp": quad.Config(engine="warp"),
     "quad-arm": quad_arm.Config(),
 }
 
@@ -36,7 +37,7 @@ def test_our_environments_keep_the_contract(torch_device, name):
 def test_the_unit_of_the_penalty_is_matching_the_goal():
     """A crash penalty of one costs what a step at the goal gives: 1 for a particle, for robots their tracking terms."""
     units = {name: config.largest_reward for name, config in OURS.items()}
-    assert units.pop("quad") == pytest.approx(0.02 * (1.0 + 0.5))
+    assert units.pop("quad") == units.pop("quad on mujoco-warp") == pytest.approx(0.02 * (1.0 + 0.5))
     assert units.pop("quad-arm") == pytest.approx(0.02 * (1.0 + 0.5 + 0.5 + 0.5))
     assert set(units.values()) == {1.0}
 

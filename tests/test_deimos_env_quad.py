@@ -30,7 +30,7 @@ from deimos.sim.env import Step
 from deimos.sim.envs import quad_arm
 from deimos.sim.envs.quad import Config
 from deimos.sim.legged import robots
-from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
+from deimos.sim.legged.engines import PhysicsConfig
 
 U = 2.0**-24
 POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)
@@ -52,8 +52,13 @@ def hills(tmp_path_factory):
 
 def build(device, num_envs=6, seed=0, env_offset=0, task="quad", **config):
     """An environment with short goals and episodes unless told otherwise."""
-    config = TASKS[task](**({"goal_period": 5, "episode_steps": 40} | config))
+    config = TASKS[task](**({"goal_period": 5, "episode_steps": 40, "engine": "warp"} | config))
     return config.build(num_envs, device, seed, env_offset)
+
+
+def build_on(simulator, **options):
+    """The same with an engine, on a device that it knows."""
+    return build(simulator.device, engine=simulator.engine, **options)
 
 
 def build_loop(env, candidates=3):
@@ -165,17 +170,16 @@ def test_tracking_is_the_reward_terms_unweighted(torch_device):
     assert bool(((step.tracking >= 0) & (step.tracking <= 1)).all())
 
 
-def test_crash_is_the_trunk_on_the_ground(torch_device):
+def test_crash_is_the_trunk_on_the_ground(simulator):
     """A robot dropped on its back crashes when the trunk touches the ground, not before; one that stands does not."""
-    env = build(torch_device, num_envs=2, episode_steps=500, goal_period=500).config.for_evaluation().build(
-        2, torch_device, 0
-    )  # fmt: skip
+    config = Config(episode_steps=500, goal_period=500, engine=simulator.engine).for_evaluation()
+    env = config.build(2, simulator.device, 0)
     qpos = env.tensors["qpos"]
     qpos[0, 2] = 0.5
-    qpos[0, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0], device=torch_device)
+    qpos[0, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0], device=simulator.device)
     crashed_at, stood = None, True
     for t in range(60):
-        step = env.step(torch.zeros(2, 12, device=torch_device))
+        step = env.step(torch.zeros(2, 12, device=simulator.device))
         stood &= not bool(step.terminated[1])
         if bool(step.terminated[0]) and crashed_at is None:
             crashed_at = t
@@ -188,31 +192,31 @@ def test_crash_is_the_trunk_on_the_ground(torch_device):
 
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("effort", [0.0, 1.0])
-def test_a_robot_that_lies_on_its_side_has_crashed(torch_device, side, effort):
+def test_a_robot_that_lies_on_its_side_has_crashed(simulator, side, effort):
     """Whatever its legs do: it falls on its hips, which are parts of the base (thesis, 4.1.2: "any part" of it)."""
-    config = Config(goal_period=500).for_evaluation()
-    env, rng = config.build(32, torch_device, 0), np.random.default_rng(0)
+    config = Config(goal_period=500, engine=simulator.engine).for_evaluation()
+    env, rng = config.build(32, simulator.device, 0), np.random.default_rng(0)
     yaw, roll = rng.uniform(0, 2 * np.pi, 32) / 2, side * np.pi / 4
     c, s, a, b = np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
     qpos = env.tensors["qpos"]
     qpos[:, 2] = 0.25
     qpos[:, 3:7] = torch.tensor(np.stack([c * a, c * b, s * b, s * a], axis=1), dtype=torch.float32)
     env.tensors["qvel"].zero_()
-    crashed = torch.zeros(32, dtype=torch.bool, device=torch_device)
+    crashed = torch.zeros(32, dtype=torch.bool, device=simulator.device)
     for _ in range(50):
-        crashed |= env.step(actions(32, torch_device, scale=effort)).terminated
+        crashed |= env.step(actions(32, simulator.device, scale=effort)).terminated
     assert bool(crashed.all())
 
 
 @both
-def test_warp_and_torch_see_one_allocation_and_views_stay(task, torch_device):
+def test_warp_and_torch_see_one_allocation_and_views_stay(task, simulator):
     """Every tensor keeps its address over steps, goals and resets, and a step gives back the very same views."""
-    env = build(torch_device, task=task, episode_steps=6)
+    env = build_on(simulator, task=task, episode_steps=6)
     loop = build_loop(env)
-    first = env.step(actions(6, torch_device, task=task))
+    first = env.step(actions(6, simulator.device, task=task))
     addresses = [t.data_ptr() for t in (*env.tensors.values(), *vars(first).values())]
     for _ in range(12):
-        last = env.step(actions(6, torch_device, task=task))
+        last = env.step(actions(6, simulator.device, task=task))
         loop.advance(last)
     assert last is first
     assert addresses == [t.data_ptr() for t in (*env.tensors.values(), *vars(last).values())]
@@ -220,10 +224,10 @@ def test_warp_and_torch_see_one_allocation_and_views_stay(task, torch_device):
 
 
 @both
-def test_reset_of_one_world_leaves_the_others(task, torch_device, hills):
+def test_reset_of_one_world_leaves_the_others(task, simulator, hills):
     """Resetting world 0 changes world 0 and no bit of any other, now and over the steps that follow."""
-    env, twin = (build(torch_device, task=task, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
-    action = actions(6, torch_device, task=task)
+    env, twin = (build_on(simulator, task=task, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
+    action = actions(6, simulator.device, task=task)
     for _ in range(8):
         env.step(action)
         twin.step(action)
@@ -238,16 +242,16 @@ def test_reset_of_one_world_leaves_the_others(task, torch_device, hills):
 
 
 @both
-def test_copied_worlds_are_exact_clones(task, torch_device):
+def test_copied_worlds_are_exact_clones(task, simulator):
     """Clones, also into another environment, continue exactly as their originals, warm starts and payloads included."""
     config = {"noise": False, "push_interval": 0.0, "episode_steps": 300, "goal_period": 100}
-    origin, env = build(torch_device, task=task, **config), build(torch_device, task=task, seed=3, **config)
-    action = actions(6, torch_device, task=task)
+    origin, env = build_on(simulator, task=task, **config), build_on(simulator, task=task, seed=3, **config)
+    action = actions(6, simulator.device, task=task)
     for _ in range(9):
         origin.step(action)
     source, target = rows_of(origin, 4, 1), rows_of(env, 0, 5)
     env.copy_worlds(source, target, origin)
-    everyone = actions(6, torch_device, task=task, seed=1)
+    everyone = actions(6, simulator.device, task=task, seed=1)
     everyone[target] = action[source]
     for _ in range(12):
         for name, tensor in env.tensors.items():
@@ -257,12 +261,12 @@ def test_copied_worlds_are_exact_clones(task, torch_device):
 
 
 @both
-def test_resume_is_exact(task, torch_device, hills):
+def test_resume_is_exact(task, simulator, hills):
     """A new environment with the saved state continues bit for bit, over goals, pushes, crashes, resets and levels."""
     config = {"terrain": hills, "push_interval": 0.2}
-    env = build(torch_device, task=task, **config)
+    env = build_on(simulator, task=task, **config)
     loop = build_loop(env)
-    action = actions(6, torch_device, task=task)
+    action = actions(6, simulator.device, task=task)
     for _ in range(30):
         loop.advance(env.step(action))
     saved = loop.state_dict()
@@ -271,7 +275,7 @@ def test_resume_is_exact(task, torch_device, hills):
         step = env.step(action)
         loop.advance(step)
         expected.append(tensors_of(env, step))
-    resumed_env = build(torch_device, task=task, **config)
+    resumed_env = build_on(simulator, task=task, **config)
     resumed = build_loop(resumed_env)
     resumed.load_state_dict(saved)
     for want in expected:
@@ -282,18 +286,20 @@ def test_resume_is_exact(task, torch_device, hills):
 
 
 @both
-def test_reports_are_the_same_after_a_resume(task, torch_device, hills):
+def test_reports_are_the_same_after_a_resume(task, simulator, hills):
     """What a log gets of the steps after a resume is what it would have got of an uninterrupted run, buffers too."""
-    env = build(torch_device, task=task, terrain=hills)
-    assert env.report()["row_use"] == env.report()["contact_use"] == 0, "nothing has been simulated yet"
-    action = actions(6, torch_device, task=task)
+    env = build_on(simulator, task=task, terrain=hills)
+    buffers = {"warp": ["contact_use", "row_use"], "native": []}[simulator.engine]
+    assert [name for name in env.report() if name.endswith("_use")] == buffers
+    assert all(env.report()[name] == 0 for name in buffers), "nothing has been simulated yet"
+    action = actions(6, simulator.device, task=task)
     reports = []
     for _ in range(12):
         env.step(action)
     env.check()
     env.report()
     saved = env.state_dict()
-    resumed = build(torch_device, task=task, terrain=hills)
+    resumed = build_on(simulator, task=task, terrain=hills)
     resumed.load_state_dict(saved)
     for world in (env, resumed):
         for _ in range(3):
@@ -301,17 +307,17 @@ def test_reports_are_the_same_after_a_resume(task, torch_device, hills):
         world.check()
         reports.append(world.report())
     assert reports[0] == reports[1]
-    assert 0 < reports[0]["row_use"] < 1
+    assert all(0 < reports[0][name] < 1 for name in buffers)
 
 
 @both
-def test_two_shards_equal_the_whole(task, torch_device, hills):
+def test_two_shards_equal_the_whole(task, simulator, hills):
     """Two environments of 4 worlds, the second with an offset of 4, do what one of 8 does, bit for bit."""
     config = {"terrain": hills, "push_interval": 0.2}
-    whole = build(torch_device, task=task, num_envs=8, **config)
-    shards = [build(torch_device, task=task, num_envs=4, env_offset=offset, **config) for offset in (0, 4)]
+    whole = build_on(simulator, task=task, num_envs=8, **config)
+    shards = [build_on(simulator, task=task, num_envs=4, env_offset=offset, **config) for offset in (0, 4)]
     loops = [build_loop(env) for env in (whole, *shards)]
-    action = actions(8, torch_device, task=task)
+    action = actions(8, simulator.device, task=task)
     for _ in range(50):
         loops[0].advance(whole.step(action))
         for i, shard in enumerate(shards):
@@ -350,9 +356,9 @@ def test_first_goals_fill_the_asked_share_of_the_range(torch_device):
     assert bool((largest > 0.9 * torch.tensor([0.1, 1.0, 0.5], device=torch_device)).all())
 
 
-def test_randomisation_is_drawn_per_world(torch_device, uniform_reference):
+def test_randomisation_is_drawn_per_world(simulator, uniform_reference):
     """Friction and payload are functions of the seed and the world's number, in their ranges; evaluation has none."""
-    env = build(torch_device, num_envs=40, seed=5, env_offset=100)
+    env = build_on(simulator, num_envs=40, seed=5, env_offset=100)
     u = uniform_reference(5, Purpose.FRICTION, 100 + np.arange(40), 0)
     model = env.physics.model
     friction = env.physics.tensors["geom_friction"].cpu().numpy()
@@ -366,7 +372,7 @@ def test_randomisation_is_drawn_per_world(torch_device, uniform_reference):
     assert quiet == replace(
         Config(), levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
     )
-    assert "geom_friction" not in quiet.build(2, torch_device, 0).tensors
+    assert "geom_friction" not in replace(quiet, engine=simulator.engine).build(2, simulator.device, 0).tensors
 
 
 def test_noise_is_uniform_and_keyed(torch_device):
@@ -538,11 +544,11 @@ def test_walking_off_the_terrain_cuts_the_episode_off(torch_device, hills):
 
 @both
 @pytest.mark.parametrize(("name", "index", "value"), [("qpos", 8, math.nan), ("qvel", 0, 1e6), ("qvel", 12, math.inf)])
-def test_a_broken_world_is_reset_and_touches_nobody(task, torch_device, hills, name, index, value):
+def test_a_broken_world_is_reset_and_touches_nobody(task, simulator, hills, name, index, value):
     """NaN or a huge speed in one world: it is flagged, cut off and begins anew, and no bit of the others changes."""
-    env, twin = (build(torch_device, task=task, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
+    env, twin = (build_on(simulator, task=task, terrain=hills, episode_steps=200, goal_period=100) for _ in range(2))
     loops = [build_loop(e) for e in (env, twin)]
-    action = actions(6, torch_device, task=task, scale=0.2)
+    action = actions(6, simulator.device, task=task, scale=0.2)
     for _ in range(4):
         for e, loop in zip((env, twin), loops, strict=True):
             loop.advance(e.step(action))

@@ -28,7 +28,8 @@ SCALE = torch.tensor([2.0, 2.0, 0.25, 1.0, 1.0, 1.0])
 
 def build(device, num_envs=6, seed=0, env_offset=0, **config):
     """An environment with short goals and episodes unless told otherwise."""
-    return Config(**({"goal_period": 5, "episode_steps": 40} | config)).build(num_envs, device, seed, env_offset)
+    config = {"goal_period": 5, "episode_steps": 40, "engine": "warp"} | config
+    return Config(**config).build(num_envs, device, seed, env_offset)
 
 
 def actions(num_envs, device, seed=0, scale=0.6):
@@ -146,7 +147,7 @@ def test_goals_are_valid_and_cover_the_shell(torch_device):
     counts = np.histogramdd(goals[:, 3:], bins=4, range=[(-1, 1)] * 3)[0]
     assert counts[:, 2:].min() > 0.9 * 100_000 / 64
     # The velocity goals are what Quad's are.
-    twin = quad.Config(goal_period=5, episode_steps=40).build(200, torch_device, 0)
+    twin = quad.Config(goal_period=5, episode_steps=40, engine="warp").build(200, torch_device, 0)
     assert torch.equal(env.sample_goals(rows_of(env), 7)[..., :3], twin.sample_goals(rows_of(twin), 7))
 
 

@@ -200,7 +200,7 @@ def test_the_audit_is_exact():
     trainer.ppo.actor.forward = follow  # a deterministic policy whose outcome can be worked out
     trainer.ppo.actor.std.data.fill_(0.0)
     clones = Clones(lambda count: config.env.build(count, CPU, 0), trainer.ppo.actor)
-    state, _, candidates, survived = _next_contexts(trainer, _Explorer(trainer), clones)
+    _, state, _, candidates, survived = _next_contexts(trainer, _Explorer(trainer), clones)
     crashed = survived < config.env.goal_period
     velocity, position = state[:, None, 0:3] * 20.0, state[:, None, 3:6] * 1000.0
     velocity = velocity.expand(-1, CANDIDATES, -1).clone()

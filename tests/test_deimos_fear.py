@@ -125,7 +125,7 @@ def test_the_loss_is_the_balanced_cross_entropy():
 @pytest.mark.parametrize("crashes", [0, 31, 200 - 31, 200])
 def test_too_few_of_a_class_teach_nothing(crashes):
     """Below ``min_per_class`` crashes or survivals nothing is learnt and the loss is NaN."""
-    fear = make()
+    fear = make(min_per_class=32)
     before = [parameter.clone() for parameter in fear.network.parameters()]
     assert math.isnan(fear.fit(interactions(torch.arange(200) < crashes)))
     assert not fear.fitted

@@ -120,9 +120,9 @@ def test_it_learns_fear_and_tells_it_calibrated():
     selector = goals.selector
     logit = selector.fear.network(torch.cat([state, goal, new], dim=1)).squeeze(1).detach()
     expected = torch.sigmoid((logit + selector.calibration.prior) / selector.calibration.temperature)
-    torch.testing.assert_close(goals.fear(state, goal, new), expected, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(goals.fear(state, goal, new).probability, expected, rtol=1e-4, atol=1e-6)
     window = goals.interactions.resolved()
-    told = goals.fear(window.state, window.goal, window.next_goal)
+    told = goals.fear(window.state, window.goal, window.next_goal).probability
     assert abs(told.mean() - window.crashed.float().mean()) < 0.1
     assert told[window.crashed].mean() > told[~window.crashed].mean() + 0.1
 
@@ -131,10 +131,11 @@ def test_fear_is_found_in_mixed_and_blind_selectors():
     """A Mix has the fear of its method, and a state-blind one says the same whatever the state."""
     theirs = trained(config=mix.Config(base="p75"), steps=48)
     arguments = torch.zeros(2, 6), torch.zeros(2, 3), torch.zeros(2, 3)
-    assert theirs.goals.fear(*arguments).shape == (2,)
+    assert theirs.goals.fear(*arguments).probability.shape == (2,)
     blind = director.Config(candidates=20, control="state-blind", fear=FearConfig(min_per_class=8))
     theirs = trained(config=blind, steps=48)
-    assert torch.equal(theirs.goals.fear(*arguments), theirs.goals.fear(arguments[0] + 3.0, *arguments[1:]))
+    told = [theirs.goals.fear(state, *arguments[1:]).probability for state in (arguments[0], arguments[0] + 3.0)]
+    assert torch.equal(*told)
 
 
 def test_it_resumes_bit_for_bit():
@@ -180,6 +181,25 @@ def test_a_loop_without_gradients_may_continue_with_them():
     theirs.step()
 
 
+@pytest.mark.parametrize("name", ["p75", "rnd", "learnability"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_host_may_compute_in_float64(name, dtype):
+    """Where the default is float64 it chooses and learns, from states of either kind."""
+    torch.set_default_dtype(torch.float64)
+    try:
+        goals, generator = GoalDirector(name, 4, learn_every=8), torch.Generator().manual_seed(0)
+        never, goal = torch.zeros(300, dtype=torch.bool), torch.zeros(300, 2, dtype=dtype)
+        for t in range(40):
+            state = torch.randn(300, 3, generator=generator, dtype=dtype)
+            candidates = torch.randn(300, 10, 2, generator=generator, dtype=dtype)
+            goal = goals.step(state, goal, state[:, 0] > 1.0, never, candidates).goal
+            assert goal.dtype == dtype, t
+    finally:
+        torch.set_default_dtype(torch.float32)
+    selector = goals.selector
+    assert selector.fitted if name == "rnd" else selector.fear.fitted
+
+
 def test_a_curriculum_tells_its_range():
     """Candidates are the caller's, so the range that they shall come from can be asked for, and it grows."""
     goals = GoalDirector("cl", PERIOD, learn_every=10)
@@ -205,7 +225,8 @@ sys.modules.update(dict.fromkeys(absent))  # importing them fails
 from deimos import GoalDirector, load_policy
 assert callable(load_policy)
 no = torch.zeros(4, dtype=torch.bool)
-for name in ("p75", "uniform", "rnd", "cl", "learnability", "band", "boltzmann", "grid", "mix", "state-blind"):
+for name in ("p75", "uniform", "rnd", "cl", "learnability", "band", "boltzmann", "grid", "mix", "state-blind",
+             "swapped", "weighted", "fear-novelty", "q-fear", "penalty-10", "rnd-raw", "p75-literal"):
     goals = GoalDirector(name, goal_period=2, total_steps=100)
     for t in range(50):
         crash = no.clone()

@@ -152,11 +152,12 @@ def test_parts_of_a_loss_are_those_of_its_rows():
     data, x = transitions().float(), torch.randn(ROWS, 8)
     actor, critic = learners()
     totals = []
-    for parts in ((slice(0, ROWS),), (slice(0, 333), slice(333, ROWS))):
+    for parts in ((slice(0, ROWS),), (slice(0, 333), slice(333, ROWS)), (slice(0, ROWS, 2), slice(1, ROWS, 2))):
         total = [0.0, 0.0]
         for rows in parts:
             gradients((actor, x[rows], surrogate(data)[rows]), (critic, x[rows], value_loss(data)[rows]))
             total = [total[0] + actor.grad, total[1] + critic.grad]
         totals.append(total)
-    for whole, added in zip(*totals, strict=True):
-        torch.testing.assert_close(added, whole, rtol=1e-4, atol=1e-6)
+    for whole, *added in zip(*totals, strict=True):
+        for total in added:
+            torch.testing.assert_close(total, whole, rtol=1e-4, atol=1e-6)

@@ -2,7 +2,9 @@
 
 import copy
 import os
+import signal
 import threading
+import time
 
 import pytest
 import torch
@@ -12,10 +14,10 @@ from deimos.nn.adam import Adam
 from deimos.nn.losses import ValueLoss
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Actor, mlp
-from deimos.nn.threads import on_threads
+from deimos.nn.threads import Crew, on_threads
 
 # Depths; widths that fill no register, some, and all; few and many inputs and outputs.
-SHAPES = [(5, 7, 1), (12, 64, 64, 3), (11, 50, 33, 9, 6), (3, 130, 2), (48, 512, 256, 128, 12)]
+SHAPES = [(5, 7, 1), (12, 64, 64, 3), (11, 50, 33, 9, 6), (3, 130, 2), (48, 1100, 256, 128, 12)]
 ROWS = [1, 47, 500]  # less than a register, not a multiple of its lanes, more than a block
 BACKENDS = ["kernel", "torch"]
 
@@ -199,6 +201,26 @@ def test_a_fork_has_threads_of_its_own():
     assert torch.equal(built.forward(x), expected)
 
 
+@pytest.mark.parametrize("where", ["working", "waiting"])
+def test_an_interrupt_leaves_no_thread_behind(where):
+    """Ctrl-C while it works or waits is raised once all threads are done, and they work again afterwards."""
+    crew, finished = Crew(), []
+
+    def work(i):
+        if i == (0 if where == "working" else 1):
+            os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.05 * (i > 0))
+        finished.append(i)
+
+    with pytest.raises(KeyboardInterrupt):
+        crew.run(work, 4)
+    assert {1, 2, 3} <= set(finished)
+    for count in (4, 2, 4):
+        done = []
+        crew.run(done.append, count)
+        assert sorted(done) == list(range(count))
+
+
 def test_the_hosts_default_dtype_does_not_matter():
     """In a host whose default is float64, networks and their gradients have float32 and the same bits."""
 
@@ -210,6 +232,9 @@ def test_the_hosts_default_dtype_does_not_matter():
         return built.forward(x), built.grad, built.parameters, built.score(x[:, :3], x.view(10, 1, 5)[..., 3:])
 
     expected = results()
+    built = build(networks((5, 16, 2), 1))
+    x = torch.rand(10, 5)
+    assert torch.equal(built.forward(x.double()), built.forward(x))
     torch.set_default_dtype(torch.float64)
     try:
         found = results()
@@ -278,12 +303,12 @@ def test_begun_without_gradients_it_continues_with_them():
         (torch.zeros(4, 8), r"x must have the shape \(n, 9\) or \(2, n, 9\), got \(4, 8\)"),
         (torch.zeros(3, 4, 9), r"x must have the shape .* got \(3, 4, 9\)"),
         (torch.zeros(9), r"x must have the shape .* got \(9,\)"),
-        (torch.zeros(4, 9, dtype=torch.float64), "x must be float32 on cpu, got float64 on cpu"),
+        (torch.zeros(4, 9, device="meta"), "x must be on cpu, got it on meta"),
     ],
 )
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_other_inputs_are_refused(backend, x, message):
-    """Inputs of another shape or dtype raise ``ValueError``, forwards and backwards, before anything is computed."""
+    """Inputs of another shape or device raise ``ValueError``, forwards and backwards, before anything is computed."""
     built = build(networks((9, 16, 1), 2), backend)
     with pytest.raises(ValueError, match=message):
         built.forward(x)
@@ -299,14 +324,6 @@ def test_scores_check_their_shapes(backend):
     for context, candidates in (((4, 6), (2, 100, 3)), ((4, 5), (4, 100, 3)), ((4, 6), (4, 100, 2))):
         with pytest.raises(ValueError, match=r"must have the shapes \(B, [67]\) and \(B, N, [32]\)"):
             built.score(torch.zeros(*context), torch.zeros(*candidates))
-
-
-def test_the_rule_of_the_kernel():
-    """It takes every activation, depth and number of outputs up to the widest layer; wider ones are torch's."""
-    assert MLPs(networks((3, mlps.WIDEST, 2), 1, "tanh"))._kernel is not None
-    wide = MLPs(networks((3, mlps.WIDEST + 1, 2), 1))
-    assert wide._kernel is None
-    assert wide.forward(torch.zeros(2, 3)).shape == (1, 2, 2)
 
 
 def test_without_warp_torch_does_it(monkeypatch):

@@ -12,7 +12,9 @@ import warp as wp
 from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
-from deimos.sim.legged.engines.mujoco_warp import Captured, Physics, PhysicsConfig
+from deimos.sim.legged import engines
+from deimos.sim.legged.engines import PhysicsConfig
+from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.robots import go1
 from deimos.sim.legged.robots import go1_rx150 as rx150
 
@@ -30,10 +32,11 @@ def stairs():
     )  # fmt: skip
 
 
-def make(n, device, terrain=None, robot=ROBOT, **options):
+def make(n, simulator, terrain=None, robot=ROBOT, **options):
     """Worlds with robots in their default pose, high above the ground."""
+    engine, device = simulator
     config = options.pop("config", PhysicsConfig())
-    physics = Physics(robot, terrain, n, torch.device(device), config, **options)
+    physics = engines.build(engine, robot, terrain, n, torch.device(device), config, **options)
     place(physics, 5.0, robot=robot)
     return physics
 
@@ -82,10 +85,10 @@ def swing(steps, joints, seed=0):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_free_flight_agrees_with_mujoco(name, device):
+def test_free_flight_agrees_with_mujoco(name, simulator):
     """Half a second of tumbling with moving legs and an arm at its limits: every angle to 1e-4, as float32 allows."""
     robot = ROBOTS[name]
-    physics = make(1, device, robot=robot)
+    physics = make(1, simulator, robot=robot)
     nq, nv = physics.model.nq, physics.model.nv
     qvel = np.random.default_rng(1).normal(size=(1, nv)).astype(np.float32)
     physics.arrays.qvel.assign(qvel)
@@ -96,10 +99,10 @@ def test_free_flight_agrees_with_mujoco(name, device):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_standing_agrees_with_mujoco(name, device):
+def test_standing_agrees_with_mujoco(name, simulator):
     """Set down on flat ground, swaying, an arm swinging between its limits: base to a millimetre, joints to 5 mrad."""
     robot = ROBOTS[name]
-    physics = make(1, device, robot=robot)
+    physics = make(1, simulator, robot=robot)
     place(physics, robot.standing_height, robot=robot)
     nq, joints = physics.model.nq, physics.model.nu - 12
     ours, theirs = run_both(physics, np.hstack([wave(50, 0.1), swing(50, joints, seed=1)]))
@@ -111,9 +114,9 @@ def test_standing_agrees_with_mujoco(name, device):
     assert at_limit.any(axis=0).sum() >= min(joints, 3), "the arm must have been at its limits"
 
 
-def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
+def test_fall_on_stairs_agrees_with_mujoco(simulator, stairs):
     """Dropped askew onto stairs: the same until shortly after the first contacts; later on the stairs, nothing lost."""
-    physics = make(1, device, stairs)
+    physics = make(1, simulator, stairs)
     tilt = np.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0])
     place(physics, stairs.heights.max() + 0.45, tilt)
     qpos = physics.arrays.qpos.numpy()
@@ -132,9 +135,9 @@ def test_fall_on_stairs_agrees_with_mujoco(device, stairs):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_part_forces_carry_the_robot(name, device):
+def test_part_forces_carry_the_robot(name, simulator):
     """Standing still, the feet's normal forces add up to the weight, and no other part touches the ground."""
-    physics = make(3, device, robot=ROBOTS[name])
+    physics = make(3, simulator, robot=ROBOTS[name])
     place(physics, 0.29, robot=ROBOTS[name])
     for _ in range(150):
         physics.step()
@@ -145,9 +148,9 @@ def test_part_forces_carry_the_robot(name, device):
     assert not force[:, :, [0, *range(5, 13)]].any()
 
 
-def test_part_forces_agree_with_mujoco(device):
+def test_part_forces_agree_with_mujoco(simulator):
     """Lying on its back: the normal force on every part is that of MuJoCo C in the same state."""
-    physics = make(1, device, config=PhysicsConfig(substeps=1))
+    physics = make(1, simulator, config=PhysicsConfig(substeps=1))
     place(physics, 0.049, (0, 1, 0, 0))
     data = reference(physics)
     physics.step()
@@ -162,9 +165,9 @@ def test_part_forces_agree_with_mujoco(device):
     np.testing.assert_allclose(physics.arrays.part_force.numpy()[0, 0], expected, rtol=1e-2, atol=0.1)
 
 
-def test_reset_forgets_everything_and_touches_nobody_else(device):
+def test_reset_forgets_everything_and_touches_nobody_else(simulator):
     """A masked reset takes a NaN world back to the start, warm start too, and leaves the others bit for bit."""
-    physics, twin = (make(4, device) for _ in range(2))
+    physics, twin = (make(4, simulator) for _ in range(2))
     for both in (physics, twin):
         place(both, 0.3)
         both.step()
@@ -174,7 +177,7 @@ def test_reset_forgets_everything_and_touches_nobody_else(device):
     for both in (physics, twin):
         both.step()
     assert np.isnan(physics.tensors["warmstart"][1].cpu().numpy()).any()
-    mask = wp.array([False, True, False, False], dtype=wp.bool, device=device)
+    mask = wp.array([False, True, False, False], dtype=wp.bool, device=str(simulator.device))
     for both in (physics, twin):
         both.reset(mask)
         both.step()
@@ -184,24 +187,24 @@ def test_reset_forgets_everything_and_touches_nobody_else(device):
         np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-def test_identical_worlds_stay_identical(device):
+def test_identical_worlds_stay_identical(simulator):
     """Worlds do not depend on their number: equal states give equal motion, bit for bit, on a CPU."""
-    physics = make(5, device)
+    physics = make(5, simulator)
     place(physics, 0.3)
     for target in wave(20, 0.3):
         physics.arrays.ctrl.assign(np.tile(target, (5, 1)).astype(np.float32))
         physics.step()
     qpos = physics.arrays.qpos.numpy()
-    if device == "cpu":
+    if simulator.device.type == "cpu":
         np.testing.assert_array_equal(qpos, np.tile(qpos[0], (5, 1)))
     else:  # the order of contacts, and with it that of sums, is not fixed there
         np.testing.assert_allclose(qpos, np.tile(qpos[0], (5, 1)), atol=1e-3)
 
 
-def test_capture_replays_the_step(device):
+def test_capture_replays_the_step(simulator):
     """A captured step does what the launches do, and the launches are made once."""
-    physics, twin = (make(2, device) for _ in range(2))
-    step = Captured(physics.step, torch.device(device))
+    physics, twin = (make(2, simulator) for _ in range(2))
+    step = physics.record_step(lambda: None, lambda: None)
     for both in (physics, twin):
         for tensor in both.tensors.values():
             tensor.zero_()
@@ -214,7 +217,7 @@ def test_capture_replays_the_step(device):
 
 def test_compiling_is_said_only_where_it_happens(torch_device, capsys, monkeypatch, tmp_path):
     """A first run that compiles says so; one that is only slow, or finds its kernels compiled, says nothing."""
-    monkeypatch.setattr("deimos.sim.legged.engines.mujoco_warp.PATIENCE", 0.001)
+    monkeypatch.setattr("deimos.sim.legged.engines.captured.PATIENCE", 0.001)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
 
     @wp.kernel(module="unique")
@@ -234,9 +237,9 @@ def test_compiling_is_said_only_where_it_happens(torch_device, capsys, monkeypat
     assert capsys.readouterr().err == ""
 
 
-def test_friction_is_the_worlds_own(device):
+def test_friction_is_the_worlds_own(simulator):
     """On its own slippery feet a sliding robot slides farther than one with grip, by what friction brakes."""
-    physics = make(2, device, friction=np.array([0.2, 1.0]))
+    physics = make(2, simulator, friction=np.array([0.2, 1.0]))
     place(physics, 0.29)
     for _ in range(50):
         physics.step()
@@ -248,10 +251,10 @@ def test_friction_is_the_worlds_own(device):
     assert way[0] > 1.5 * way[1]
 
 
-def test_payload_changes_mass_and_what_follows_from_it(device):
+def test_payload_changes_mass_and_what_follows_from_it(simulator):
     """A payload adds to the base's mass, scales its inertia, and is carried by the feet; sensitivities are MuJoCo's."""
     payload = np.array([-1.0, 0.0, 1.0])
-    physics = make(3, device, payload=payload)
+    physics = make(3, simulator, payload=payload)
     mass = physics.tensors["body_mass"].cpu().numpy()
     np.testing.assert_allclose(mass.sum(axis=1), go1.build().spec.compile().body_mass.sum() + payload, rtol=1e-6)
     place(physics, 0.29)
@@ -270,7 +273,7 @@ def test_payload_changes_mass_and_what_follows_from_it(device):
 
 def test_buffers_tell_their_use(device):
     """The peak of contacts and rows is counted, and too few rows set a bit that means lost contacts."""
-    physics = make(2, device)
+    physics = make(2, ("warp", device))
     place(physics, 0.05, (0, 1, 0, 0))
     physics.step()
     use = physics.buffer_use()
@@ -278,7 +281,7 @@ def test_buffers_tell_their_use(device):
     # Four feet with four rows each, a head and four hips, ten capsules with two contacts each, and twelve limits.
     assert 0 < use["rows"] <= use["max_rows"] == 4 * 4 + 5 + 10 * 2 + 12
     assert physics.buffer_use()["rows"] == 0  # since the last call
-    small = make(2, device, config=PhysicsConfig(rows=8))
+    small = make(2, ("warp", device), config=PhysicsConfig(rows=8))
     place(small, 0.25)
     small.step()
     assert np.all(small.arrays.overflow.numpy() & small.lost_contacts)
@@ -296,12 +299,12 @@ def test_buffers_tell_their_use(device):
 )
 def test_losses_are_explained(device, bits, message):
     """Every bit that means a lost contact has its name, its reason and what helps, and the solver's bits have none."""
-    assert re.search(message, make(2, device).explain_loss(bits))
+    assert re.search(message, make(2, ("warp", device)).explain_loss(bits))
 
 
-def test_every_loss_has_an_explanation(device):
+def test_every_loss_has_an_explanation(simulator):
     """No single bit of those that mean a lost contact is left without words."""
-    physics = make(1, device)
+    physics = make(1, simulator)
     bits = [1 << i for i in range(16) if physics.lost_contacts & 1 << i]
     assert len(bits) == 7
     assert all(physics.explain_loss(bit) for bit in bits)
@@ -310,12 +313,14 @@ def test_every_loss_has_an_explanation(device):
 def test_buffers_hold_an_arm_that_touches_everything(device, stairs):
     """The buffers hold the arm's contacts with ground and guards, and an arm that swings into both loses none."""
     robot = ROBOTS["go1_rx150"]
-    physics = make(4, device, robot=robot)
+    physics = make(4, ("warp", device), robot=robot)
     # Beside the Go1's 53: five limits, two capsules on the ground and on two guards, twice each, and on a ball.
     among_itself = 2 * 2 * 2 + 2
     assert physics.max_rows == 53 + 5 + 2 * 2 + among_itself
     # On a height field four fifths of what four contacts of each need: four rows for four feet, one for 17 others.
-    assert make(1, device, stairs, robot).max_rows == math.ceil(0.8 * (4 * 4 * 4 + 17 * 4 + 12 + 5 + among_itself))
+    assert make(1, ("warp", device), stairs, robot).max_rows == math.ceil(
+        0.8 * (4 * 4 * 4 + 17 * 4 + 12 + 5 + among_itself)
+    )
     place(physics, 0.1, (0, 1, 0, 0), robot=robot)  # on its back, upon the arm
     touched = set()
     for target in swing(60, 5, seed=1):
@@ -329,9 +334,9 @@ def test_buffers_hold_an_arm_that_touches_everything(device, stairs):
     assert not (physics.arrays.overflow.numpy() & physics.lost_contacts).any()
 
 
-def test_to_mujoco_shows_the_state(device):
+def test_to_mujoco_shows_the_state(simulator):
     """One world comes out as MuJoCo's own data, with the geoms where its kinematics put them."""
-    physics = make(2, device)
+    physics = make(2, simulator)
     place(physics, 0.3)
     qpos = physics.arrays.qpos.numpy()
     qpos[1, 0] = 2.0

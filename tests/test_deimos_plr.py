@@ -212,18 +212,18 @@ def test_nothing_is_replayed_before_the_buffer_is_filled():
     assert abs((~proposal.probe).float().mean().item() - 0.7) < 4 * (0.7 * 0.3 / n) ** 0.5
     assert torch.equal(proposal.note > 0, ~proposal.probe)
     assert torch.equal(proposal.score.isnan(), proposal.probe)
-    assert proposal.learn is None
+    assert proposal.weight is None
 
 
 def test_the_robust_learner_takes_replayed_goals_only():
     """With ``robust`` the learner may use exactly what follows a replayed goal, from the first decision on."""
     loop = Loop(robust=True, replay=0.5)
     arguments = [torch.arange(4), torch.zeros(4, 4), torch.zeros(4, 2), loop.random(4, 6, 2), loop.random(4, 4)]
-    assert not loop.selector.propose(*arguments).learn.any()
+    assert not loop.selector.propose(*arguments).weight.any()
     while not loop.selector.replaying:
         loop.update()
     arguments[4][:, 1] = torch.tensor([0.0, 0.49, 0.51, 0.9])
-    assert loop.selector.propose(*arguments).learn.tolist() == [True, True, False, False]
+    assert loop.selector.propose(*arguments).weight.tolist() == [1, 1, 0, 0]
 
 
 def test_it_needs_the_learners_rollout():

@@ -1,4 +1,4 @@
-"""The committed policy of docs/results/quad_arm_stand still stands and reaches."""
+"""The committed policy of docs/results/quad_arm_stand still stands and reaches, on either engine."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +15,11 @@ from deimos.run.presets import preset
 HOME = Path(__file__).parent.parent / "docs" / "results" / "quad_arm_stand"
 
 
-@pytest.fixture(scope="module")
-def reached():
+@pytest.fixture(scope="module", params=["warp", "native"])
+def reached(request):
     """Four goals of two seconds for 48 robots under Naive goals that the policy was not evaluated on before."""
     policy = deimos.load_policy(HOME)
-    config = replace(preset("quad-arm-stand").env, goal_period=100).for_evaluation()
+    config = replace(preset("quad-arm-stand").env, goal_period=100, engine=request.param).for_evaluation()
     env = config.build(48, torch.device("cpu"), seed=7)
     assert policy.layout == env.layout
     return play(env, policy.scaled, uniform.Config().build(spaces(env), 0), 400)

@@ -9,8 +9,8 @@ from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
 from deimos import plugins
-from deimos.sim.legged import robots
-from deimos.sim.legged.engines.mujoco_warp import Physics, PhysicsConfig
+from deimos.sim.legged import engines, robots
+from deimos.sim.legged.engines import PhysicsConfig
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1
 
 HFIELD_BIT = 32  # of mujoco-warp's overflow: a geom covered more prisms than are tested
@@ -224,7 +224,9 @@ def test_no_geom_covers_too_many_prisms(robot, device):
     rolls = [(0, 0), (np.pi, 0), (np.pi / 2, 0), (-np.pi / 2, 0), (0, np.pi / 2), (0, 0.6)]  # roll, pitch
     poses = [robot.pose, [0.0, 1.57, -0.9] * 4]  # standing, and with legs stretched along the ground
     n = len(yaws) * len(rolls) * len(poses)
-    physics = Physics(robot, ground, n, torch.device(device), PhysicsConfig(substeps=1, contacts=200, rows=600))
+    physics = engines.build(
+        "warp", robot, ground, n, torch.device(device), PhysicsConfig(substeps=1, contacts=200, rows=600)
+    )
     qpos, world = np.zeros((n, 19)), 0
     half = ground.size[0] / 2 - 1.2
     rng = np.random.default_rng(2)

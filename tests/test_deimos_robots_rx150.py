@@ -8,7 +8,8 @@ import warp as wp
 from deimos.terrain import Grid, Share, build
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
-from deimos.sim.legged.engines.mujoco_warp import Physics, PhysicsConfig
+from deimos.sim.legged import engines
+from deimos.sim.legged.engines import PhysicsConfig
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1
 from deimos.sim.legged.robots import go1_rx150 as rx150
 from deimos.sim.legged.robots._primitives import hold_base
@@ -290,7 +291,9 @@ def test_no_geom_of_the_arm_covers_too_many_prisms(device):
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, frame.ravel())
         row[3:7] = quat
-    physics = Physics(robot, ground, len(trunk), torch.device(device), PhysicsConfig(substeps=1, contacts=40))
+    physics = engines.build(
+        "warp", robot, ground, len(trunk), torch.device(device), PhysicsConfig(substeps=1, contacts=40)
+    )
     physics.arrays.qpos.assign(trunk)
     physics.step()
     lost = physics.arrays.overflow.numpy() & physics.lost_contacts
@@ -302,7 +305,7 @@ def test_no_geom_of_the_arm_covers_too_many_prisms(device):
 def test_trunk_is_held(device):
     """With the arm swinging between its limits for 2 s, a held trunk that was thrown stays where it was put."""
     robot = hold_base(rx150.build())
-    physics = Physics(robot, None, 2, torch.device(device), PhysicsConfig())
+    physics = engines.build("warp", robot, None, 2, torch.device(device), PhysicsConfig())
     assert physics.arrays.qpos.shape[1] == 24
     assert physics.arrays.qvel.shape[1] == 23
     rng = np.random.default_rng(3)

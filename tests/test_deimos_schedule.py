@@ -156,12 +156,12 @@ def test_a_mix_has_its_share_of_uniform_goals(recorders, share):
 def test_the_uniform_goals_of_a_mix_are_not_replayed_ones(recorders):
     """A learner that may learn from its method's goals alone learns from no uniform one."""
     selector = mix.Config(base="noted", share=0.5).build(SPACES, 0)
-    selector.parts[0].proposal["learn"] = torch.ones(4000, dtype=torch.bool)
+    selector.parts[0].proposal["weight"] = torch.ones(4000)
     generator = torch.Generator().manual_seed(0)
     arguments = [torch.randn(4000, *shape, generator=generator) for shape in ((9,), (3,), (5, 3))]
     proposal = selector.propose(torch.arange(4000), *arguments, torch.rand(4000, 4, generator=generator))
-    assert torch.equal(proposal.learn, ~proposal.probe)
-    assert 0 < proposal.learn.sum() < 4000
+    assert torch.equal(proposal.weight, (~proposal.probe).float())
+    assert 0 < proposal.weight.sum() < 4000
 
 
 def test_a_mix_is_its_method_in_all_else():

@@ -1,4 +1,4 @@
-"""The committed policy of docs/results/quad_flat still walks."""
+"""The committed policy of docs/results/quad_flat still walks, on either engine."""
 
 from pathlib import Path
 
@@ -14,11 +14,11 @@ from deimos.sim.envs import quad
 HOME = Path(__file__).parent.parent / "docs" / "results" / "quad_flat"
 
 
-@pytest.fixture(scope="module")
-def walked():
+@pytest.fixture(scope="module", params=["warp", "native"])
+def walked(request):
     """Six seconds of 48 robots under Naive goals at T2, in a task that the policy was not evaluated on before."""
     policy = deimos.load_policy(HOME)
-    env = quad.Config().for_evaluation().with_goal_period(100).build(48, torch.device("cpu"), seed=7)
+    env = quad.Config(engine=request.param).for_evaluation().with_goal_period(100).build(48, torch.device("cpu"), 7)
     assert policy.layout == env.layout
     return play(env, policy.scaled, uniform.Config().build(spaces(env), 0), 300)
 

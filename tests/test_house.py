@@ -450,7 +450,8 @@ def test_file_name_is_the_registration(package):
 def test_unknown_plugin_is_refused():
     """Asking for a plugin that is not there lists those that are."""
     with pytest.raises(
-        ValueError, match=r"deimos\.goals\.selectors has no 'nope'; it has: boltzmann, cl, director, .*, uniform, vds\."
+        ValueError,
+        match=r"deimos\.goals\.selectors has no 'nope'; it has: boltzmann, cl, director, .*, uniform, vds, weighted\.",
     ):
         plugins.load(selectors, "nope")
 

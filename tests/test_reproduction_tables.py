@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deimos.checks import RunError
 from deimos.goals.fear import FearConfig
 from deimos.goals.selectors import director
 from deimos.learn.ppo import PPOConfig
@@ -16,7 +17,7 @@ from deimos.run.folder import RunFolder
 from deimos.sim.envs.particle import Config
 from deimos.study import plan
 from deimos.study.results import Results
-from reproduction import oracle_table, particle_population, quad_rough
+from reproduction import fear_table, oracle_table, particle_population, quad_rough
 
 
 def row(environment, seed, goals="naive", **values):
@@ -142,7 +143,35 @@ def test_table_of_the_oracle_asks_every_rule(tmp_path, monkeypatch):
     assert oracle_table.spread(np.array([0.1, 0.2, 0.6])) == "0.2000 (0.1000-0.6000)"
 
 
-@pytest.mark.parametrize("module", [oracle_table, particle_population, quad_rough])
+def test_table_of_fear_trains_and_audits(tmp_path, monkeypatch, capsys):
+    """A method is trained once, audited five times, kept in the file, and has a line in the table."""
+    audits = iter([RunError("all are safe"), *[{"auroc": x, "contexts": 300} for x in (0.6, 0.8, 0.9, 0.9)]])
+
+    def audit(trainer, contexts):
+        assert (contexts, trainer.config.env.variant) == (200, "directional")
+        found = next(audits)
+        if isinstance(found, RunError):
+            raise found
+        return found
+
+    monkeypatch.setattr(fear_table, "VARIANTS", {"directional": 480})
+    monkeypatch.setattr(fear_table, "audit_fear", audit)
+    file = tmp_path / "new" / "rows.csv"
+    command = [str(file), "--seeds", "1", "--methods", "p75", "--variants", "directional"]
+    for _ in range(2):  # the second time all is there
+        monkeypatch.setattr("sys.argv", ["fear_table", *command])
+        fear_table.main()
+    (row,) = fear_table.read(file)
+    assert row["auroc"] == "nan 0.6 0.8 0.9 0.9"
+    assert row["contexts"] == "0 200 200 200 200"
+    assert 0.0 < float(row["fitted"]) <= 1.0
+    assert 50.0 <= float(row["percentile"]) < 87.5
+    printed = capsys.readouterr().out
+    assert "0.800" in printed
+    assert "1 of 4" in printed
+
+
+@pytest.mark.parametrize("module", [fear_table, oracle_table, particle_population, quad_rough])
 def test_commands_explain_themselves(module, monkeypatch, capsys):
     """Each is a command that names its way to be called."""
     monkeypatch.setattr("sys.argv", ["it", "--help"])

@@ -1,7 +1,7 @@
 """``deimos evaluate``: the policy of a run under Naive and attackers, or its fear network against what happened."""
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +15,7 @@ from deimos.checks import RunError, check_at_least
 from deimos.nn.threads import on_threads
 from deimos.run import api, audit, training
 from deimos.run.config import kind
-from deimos.run.evaluation import EvalConfig, evaluate_run
+from deimos.run.evaluation import EvalConfig, elsewhere, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.env import EnvConfig
@@ -33,6 +33,15 @@ _AUDIT = (
     ("after iteration", "iteration"),
 )
 _QUALITIES = {"auroc": "AUROC (0.5: chance, 1: perfect)", "brier": "Brier score", "ece": "expected calibration error"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Elsewhere:
+    """What the policy is evaluated in, where that is not what it was trained in."""
+
+    engine: Literal["warp", "native"] | None = None
+    """What simulates legged robots. By default as in training; the other one shows what the policy is worth in another
+    simulator, beside what it did in its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +64,8 @@ class EvaluateOptions:
     """Attackers beside those that the run was set up with, by name: argmax-long, oracle, ..."""
     pool: Path | None = None
     """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
+    env: Elsewhere = field(default_factory=Elsewhere)
+    """What the policy is evaluated in."""
     oracle_worlds: int | None = None
     """Worlds that meet an attacker that tries its goals in clones. By default as the run was set up."""
     calibration: int = 0
@@ -69,6 +80,7 @@ class EvaluateOptions:
             check_at_least(name, getattr(self, name), 0)
         asked = [name for name in _AUDITS if getattr(self, name)]
         others = [name for name in (*_CHANGES, "goal_period") if getattr(self, name) is not None] + asked[1:]
+        others += ["env.engine"] if self.env.engine else []
         if asked and others:
             raise ValueError(
                 f"{asked[0]} evaluates the fear network of the run as it was trained and cannot be combined with "
@@ -93,7 +105,7 @@ def main(arguments: list[str], program: str) -> None:
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
     changes["attackers"] = tuple(dict.fromkeys((*config.eval.attackers, *changes.get("attackers", ()))))
-    env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes)
+    env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes, options.env.engine)
     with one_stream(device):
         show_evaluation(folder, config, env_config, eval_config, device)
     print(folder.path)
@@ -112,7 +124,7 @@ def show_evaluation(
     with console.progress("evaluating") as report:
         rows = evaluate_run(folder, env_config, eval_config, device, report)
     figures.draw_summary(folder, title(config))  # before anything is printed: whoever reads it may be gone
-    print(describe(rows))
+    print(describe(rows, elsewhere(folder, rows)))
 
 
 def _evaluate_fear(trainer: Trainer, folder: RunFolder, options: EvaluateOptions) -> None:

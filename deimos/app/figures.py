@@ -129,7 +129,8 @@ def _bars(axes: "Axes", rows: list[dict]) -> None:
     """Shares of goals that ended in a crash, with the score where there is one: large evaluations first."""
     groups: dict[tuple, list[dict]] = {}
     for row in sorted(rows, key=lambda row: -row["worlds"] * row["steps"]):
-        groups.setdefault((row["worlds"], row["steps"], row["goal_period"], row["seed"]), []).append(row)
+        alike = tuple(row.get(name) for name in ("worlds", "steps", "goal_period", "seed", "engine"))
+        groups.setdefault(alike, []).append(row)
     shown = list(groups.values())[:MOST_EVALUATIONS]
     width = min(BAR, 0.9 / max(map(len, shown)))
     attackers = dict.fromkeys(row["goals"] for group in shown for row in group if row["goals"] != "naive")

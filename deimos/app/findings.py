@@ -1,7 +1,7 @@
 """What an evaluation has found, in words: a table in full words and units, and a sentence that says what it means."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from deimos.app.console import number, table
@@ -21,16 +21,19 @@ _LINES = (
 )
 
 
-def describe(rows: list[dict]) -> str:
+def describe(rows: list[dict], elsewhere: Sequence[dict] = ()) -> str:
     """A title, a table and a sentence on the rows of one evaluation; what no row has is left out.
 
     Args:
         rows: Those that ``deimos.run.evaluation.evaluate`` gives.
+        elsewhere: Those of the same evaluation on another engine, which the table has too.
     """
-    lines = [("goals that ended in a crash", [percent(row["crash_rate"]) for row in rows])]
-    lines += [(label, [known(row.get(key)) for row in rows]) for label, key in _LINES]
-    lines += _per_part(rows)
-    header, names = zip(("", ""), *[heading(row["goals"]) for row in rows], strict=True)
+    columns = [*rows, *elsewhere]
+    lines = [("simulated by", [known(row.get("engine"), str) for row in columns])]
+    lines += [("goals that ended in a crash", [percent(row["crash_rate"]) for row in columns])]
+    lines += [(label, [known(row.get(key)) for row in columns]) for label, key in _LINES]
+    lines += _per_part(columns)
+    header, names = zip(("", ""), *[heading(row["goals"]) for row in columns], strict=True)
     shown = [[label, *values] for label, values in lines if any(value != "-" for value in values)]
     return f"Evaluation: {conditions(rows[0])}\n\n{table(header, [names, *shown])}\n\n{conclude(rows)}"
 
@@ -42,7 +45,8 @@ def heading(goals: str) -> tuple[str, str]:
 
 def conditions(row: dict) -> str:
     """What an evaluation was made under."""
-    return f"{row['worlds']:,} worlds x {row['steps']:,} steps, a goal every {row['goal_period']} steps"
+    engine = f", on {row['engine']}" if "engine" in row else ""
+    return f"{row['worlds']:,} worlds x {row['steps']:,} steps, a goal every {row['goal_period']} steps{engine}"
 
 
 def _per_part(rows: list[dict]) -> list[tuple[str, list[str]]]:

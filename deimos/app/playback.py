@@ -141,7 +141,8 @@ def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | No
     state = load_checkpoint(folder)["loop"]["selector"]
     if "fear" not in state:  # it is a part of another selector
         return None
-    afraid.load_state_dict(state)
+    for name in ("fear", "calibration"):  # what else there is depends on the version that wrote it
+        getattr(afraid, name).load_state_dict(state[name])
     return afraid if afraid.fear.fitted else None
 
 

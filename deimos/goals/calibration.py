@@ -15,9 +15,9 @@ BINS = 15
 class Calibration(Stateful):
     """Turns logits of a class-balanced classifier into probabilities.
 
-    Class weights n / (2 n_class) multiply the odds that a classifier learns by (1 - pi) / pi, with pi the
-    share of crashes; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What is left is a
-    matter of over- and underconfidence, which one temperature on held-out data corrects [2]_.
+    Where crashes and survivals weigh 1/2 together each, the odds that a classifier learns are (1 - pi) / pi times the
+    true ones, with pi the share of crashes; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What
+    is left is a matter of over- and underconfidence, which one temperature on held-out data corrects [2]_.
 
     Attributes:
         prior: log(pi / (1 - pi)).
@@ -43,7 +43,7 @@ class Calibration(Stateful):
         return torch.sigmoid(log_odds / self.temperature)
 
     def set_share(self, share: float) -> None:
-        """Set the share of crashes, in (0, 1), that the class weights were made from."""
+        """Set the share of crashes in the world, in (0, 1)."""
         self.prior = math.log(share / (1.0 - share))
 
     def fit(self, log_odds: Tensor, crashed: Tensor, steps: int = 3) -> None:

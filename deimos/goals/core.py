@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Spaces
+from deimos.goals.selector import GoalSelector, Spaces, Transitions
 from deimos.nn.stateful import Stateful
 
 
@@ -35,7 +35,7 @@ class GoalCore(Stateful):
         window: Steps that resolved interactions are kept for; ``None`` for 2 T.
     """
 
-    saved = ("selector", "interactions", "weight")
+    saved = ("selector", "interactions", "weight", "percentile", "_delivered", "_steps")
 
     def __init__(self, selector: GoalSelector, spaces: Spaces, window: int | None = None) -> None:
         self.selector = selector
@@ -47,8 +47,12 @@ class GoalCore(Stateful):
             spaces.num_envs, spaces.state_dim, spaces.goal_dim, capacity, window, spaces.device,
             groups=0 if spaces.groups == (slice(None),) else len(spaces.groups),
         )  # fmt: skip
-        self.weight = torch.ones(spaces.num_envs, device=spaces.device)
-        """1 where the learner may use the transitions under the active goal, else 0, shape (num_envs,)."""
+        self.weight = torch.ones(spaces.num_envs, dtype=torch.float32, device=spaces.device)
+        """Weight of the transitions under the active goal in everything learnt, at least 0, shape (num_envs,)."""
+        self.percentile = torch.full_like(self.weight, 50.0)
+        """Percentile of the active goal's fear among the candidates that it was chosen from, in [0, 100], shape
+        (num_envs,): 50 for first goals and whatever else is uniform, NaN where the selector has no fear to rank by."""
+        self._delivered, self._steps = torch.zeros_like(self.weight), 0  # its sum since the last call of learn
         nobody = torch.zeros(0, dtype=torch.int64, device=spaces.device)
         self._nothing = Changes(nobody, nobody, nobody)
 
@@ -68,6 +72,8 @@ class GoalCore(Stateful):
                 where there is one group and the reward says it.
         """
         self.interactions.advance(reward, terminated, tracking)
+        self._delivered += self.percentile
+        self._steps += 1
         done = terminated | truncated
         masks = torch.stack([due & ~done, done, truncated])
         counts = masks.sum(1).tolist()
@@ -80,6 +86,7 @@ class GoalCore(Stateful):
         ))  # fmt: skip
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])
+        self.percentile[changes.done] = 50.0
         return changes
 
     @torch.no_grad()
@@ -95,5 +102,18 @@ class GoalCore(Stateful):
         self.interactions.open(
             rows, state, goal, chosen.goal, chosen.score, self.goal_period, probe=chosen.probe, note=chosen.note
         )
-        self.weight[rows] = 1.0 if chosen.learn is None else chosen.learn.float()
+        self.weight[rows] = 1.0 if chosen.weight is None else chosen.weight
+        self.percentile[rows] = torch.nan if chosen.percentile is None else chosen.percentile
         return chosen.goal
+
+    def learn(self, rollout: Transitions | None) -> dict[str, float]:
+        """Let the selector learn, once per rollout; see ``GoalSelector.learn``.
+
+        Returns:
+            What it has to say, and ``goal_percentile``: the mean of ``percentile`` over all worlds and steps since the
+            last call, which is the dose of fear that was delivered.
+        """
+        mean = self._delivered.mean().item() / self._steps if self._steps else math.nan
+        self._delivered.zero_()
+        self._steps = 0
+        return {"goal_percentile": mean} | self.selector.learn(self.interactions, rollout)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from deimos.checks import check_at_least, check_range
 from deimos.goals.core import GoalCore
-from deimos.goals.fear_selector import fear_selector
+from deimos.goals.fear_selector import FearEstimate, fear_selector
 from deimos.goals.interactions import Interactions
 from deimos.goals.methods import method
 from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces
@@ -22,6 +22,9 @@ class Assignment:
     """Goals, shape (num_envs, goal_dim): the given ones but where ``changed``."""
     changed: Tensor
     """True where the goal is a new one, bool, shape (num_envs,)."""
+    weight: Tensor
+    """Weight of the transitions under the goal in everything that the learner learns, at least 0, shape (num_envs,);
+    1 under most selectors."""
 
 
 class GoalDirector:
@@ -122,9 +125,10 @@ class GoalDirector:
             goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], self._draws[rows])
             self._count[rows] += 1
         self._clock.masked_fill_(due | done, 0)
+        core.weight.masked_fill_(done, 1.0)
         if core.interactions.now % self.learn_every == 0:
-            self.metrics = core.selector.learn(core.interactions, None)
-        return Assignment(goals, due | done)
+            self.metrics = core.learn(None)
+        return Assignment(goals, due | done, core.weight.clone())
 
     @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
     def _begin(self, state: Tensor, goal: Tensor) -> GoalCore:
@@ -158,8 +162,8 @@ class GoalDirector:
             raise ValueError(f"candidates must have the shape {expected}, got {tuple(candidates.shape)}.")
 
     @torch.no_grad()
-    def fear(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> Tensor:
-        """Calibrated probability that the policy crashes within T steps of getting ``new_goal``, shape (B,).
+    def fear(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> FearEstimate:
+        """Calibrated probability that the policy crashes within T steps of getting ``new_goal``, and its quality.
 
         Args:
             state: States, shape (B, state_dim).
@@ -173,9 +177,7 @@ class GoalDirector:
         afraid = fear_selector(self.selector)
         if afraid is None:
             raise ValueError(f"The selector must have a fear network, as a Director has; got {self._config}.")
-        if not afraid.fear.fitted:
-            raise RuntimeError("The fear network has learnt nothing yet: it must see crashes and survivals first.")
-        return afraid.calibration.probability(afraid.score(state, goal, new_goal.unsqueeze(1)).squeeze(1))
+        return afraid.estimate(state, goal, new_goal)
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs; see ``load_state_dict``."""

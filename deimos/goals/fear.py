@@ -30,8 +30,8 @@ class FearConfig:
     """Passes over the window of interactions in every fit, at least 1."""
     minibatches: int = 8
     """Parts that the window is split into, at least 1."""
-    min_per_class: int = 32
-    """Crashes and survivals that the window must hold before a fit, at least 1."""
+    min_per_class: int = 1
+    """Crashes and survivals that a fit must have to learn from, at least 1."""
     workspace: int = 64
     """Memory for the activations of candidates [MiB], at least 1; what takes more is scored in parts. The kernel for
     CPUs needs none."""
@@ -55,7 +55,7 @@ class Fear(Stateful):
         seed: Seed of its weights and of the order that it learns in.
     """
 
-    saved = ("network", "optimizer", "generator", "fitted", "share")
+    saved = ("network", "optimizer", "generator", "fitted")
 
     def __init__(self, config: FearConfig, state_dim: int, goal_dim: int, device: torch.device, seed: int) -> None:
         self.config = config
@@ -67,38 +67,45 @@ class Fear(Stateful):
         self.generator = generator(seed, "fear minibatches", device)
         self.fitted = False
         """Whether it has learnt anything yet; before, its ranking of goals would be an arbitrary bias."""
-        self.share = 0.5
-        """Share of crashes in the data of the last fit, in (0, 1); calibration takes it back."""
+
+    def fit(self, data: Resolved, epochs: int | None = None) -> float:
+        """Learn from interactions that all weigh alike within their class; see ``fit_rows``."""
+        inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
+        return self.fit_rows(inputs, data.crashed, torch.ones_like(inputs[:, 0]), epochs=epochs)
 
     @torch.no_grad()
-    def fit(self, data: Resolved, epochs: int | None = None) -> float:
-        """Learn from interactions by class-balanced binary cross-entropy on logits.
+    def fit_rows(
+        self, inputs: Tensor, crashed: Tensor, weight: Tensor, target: Tensor | None = None, epochs: int | None = None
+    ) -> float:
+        """Learn by class-balanced binary cross-entropy on logits.
 
-        The weights n / (2 n_class) use the class shares of all of ``data``, not of a minibatch, so
-        that the shift they cause is known exactly.
+        Crashes and survivals weigh 1/2 together each, over all rows and not over those of a minibatch, so that the
+        shift this causes is known exactly.
 
         Args:
-            data: Resolved interactions.
-            epochs: Passes over the data; ``None`` for the configured number.
+            inputs: State, goal and next goal, shape (n, state_dim + 2 goal_dim).
+            crashed: True for a crash, bool, shape (n,).
+            weight: Weight within the class, positive, shape (n,).
+            target: What to predict, in [0, 1], shape (n,); ``None`` for the class.
+            epochs: Passes over the rows; ``None`` for the configured number.
 
         Returns:
             Mean loss of the last pass; NaN, and nothing is learnt, where a class has too few rows.
         """
-        crashes = int(data.crashed.sum())
-        if min(crashes, len(data) - crashes) < self.config.min_per_class:
+        crashes = int(crashed.sum())
+        if min(crashes, len(crashed) - crashes) < self.config.min_per_class:
             return float("nan")
-        self.share = share = mean_over_ranks(data.crashed.float().mean()).item()
-        weight = torch.where(data.crashed, 0.5 / share, 0.5 / (1.0 - share)) / len(data)
-        inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
-        target = data.crashed.float()
-        size = -(-len(data) // self.config.minibatches)
-        loss = torch.zeros((), device=target.device)
+        target = crashed.float() if target is None else target
+        mass = mean_over_ranks(torch.stack([(weight * ~crashed).sum(), (weight * crashed).sum()]))
+        weight = weight * (0.5 / mass)[crashed.long()]
+        size = -(-len(inputs) // self.config.minibatches)
+        loss = torch.zeros((), dtype=torch.float32, device=target.device)
         for _ in range(self.config.epochs if epochs is None else epochs):
-            order = torch.randperm(len(data), generator=self.generator, device=target.device)
+            order = torch.randperm(len(inputs), generator=self.generator, device=target.device)
             x, y, w = inputs[order], target[order], weight[order]
             loss.zero_()
             for part in zip(x.split(size), y.split(size), w.split(size), strict=True):
-                scale = len(data) / len(part[0])  # makes the gradient one of a mean
+                scale = len(inputs) / len(part[0])  # makes the gradient one of a mean
                 loss += self._learn(part[0], part[1], part[2] * scale) / scale
         self.fitted = True
         return loss.item()

@@ -1,7 +1,9 @@
 """What every selector that ranks candidates by fear has in common."""
 
 import abc
-from dataclasses import dataclass, field, replace
+import logging
+import math
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import torch
@@ -10,9 +12,23 @@ from torch import Tensor
 from deimos.checks import check_at_least, check_choice, check_range
 from deimos.goals import picks
 from deimos.goals.calibration import Calibration, evaluate
+from deimos.goals.crash_memory import CrashMemory
 from deimos.goals.fear import Fear, FearConfig, auroc
-from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
+from deimos.goals.interactions import Interactions, Resolved
+from deimos.goals.selector import (
+    GoalSelector,
+    Proposal,
+    SelectorConfig,
+    Spaces,
+    Transitions,
+    uniform_proposal,
+    with_parts,
+)
+from deimos.nn.ranks import mean_over_ranks
+
+LEAST = 32  # crashes and survivals that tell a temperature
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,20 +42,44 @@ class FearSelectorConfig(SelectorConfig):
     control: Literal["none", "shuffled", "state-blind"] = "none"
     """``shuffled`` hands every score to another candidate, which must equal Uniform; ``state-blind`` lets the
     network see goals only."""
+    memory: int = 512
+    """Crashes that are remembered with survivals of the same time, at least 0, so that learning goes on where crashes
+    have become rare. 0 is the thesis's literal method: a fit learns from the interactions resolved in the last 2 T
+    steps, and is left out where they lack a class."""
+    gate: bool = False
+    """Whether goals are uniform as long as the network ranks the last outcomes no better than chance."""
     fear: FearConfig = field(default_factory=FearConfig)
     """The fear network."""
 
     def __post_init__(self) -> None:
         check_at_least("candidates", self.candidates, 1)
         check_range("probe", self.probe, 0.0, 1.0)
+        check_at_least("memory", self.memory, 0)
         check_choice("control", self.control, ["none", "shuffled", "state-blind"])
+
+
+@dataclass(frozen=True)
+class FearEstimate:
+    """What a fear network thinks of some goals, and how far it can be trusted."""
+
+    probability: Tensor
+    """Calibrated probability that the policy crashes within T steps, in (0, 1), shape (B,)."""
+    auroc: float
+    """How often it ranked a crash of the last 2 T steps above a survival before it knew, in [0, 1]; 0.5 is chance,
+    NaN where a class is empty."""
+    age: int
+    """Rollouts since it has learnt last; 0 where it learns all the time."""
 
 
 class FearSelector(GoalSelector):
     """Learns fear online and leaves the choice to ``choose``. Until it has seen both classes it is uniform."""
 
     config: FearSelectorConfig
-    saved: ClassVar[tuple[str, ...]] = ("fear", "calibration", "_learnt_at")
+    inputs_per_row: ClassVar[int] = 1
+    """Inputs of the network in a row of ``rows``."""
+    saved: ClassVar[tuple[str, ...]] = (
+        "fear", "memory", "calibration", "_learnt_at", "_age", "_auroc", "_issued", "_chosen",
+    )  # fmt: skip
 
     def __init__(self, config: FearSelectorConfig, spaces: Spaces, seed: int) -> None:
         self.config = config
@@ -47,6 +87,20 @@ class FearSelector(GoalSelector):
         self._learnt_at = 0  # step of the last call of learn
         self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
         self.calibration = Calibration()
+        self.memory: CrashMemory | None = None
+        """Where the crashes are kept that fear is learnt from; ``None`` for the last 2 T steps alone."""
+        if config.memory:
+            width = self.inputs_per_row * (spaces.state_dim + 2 * spaces.goal_dim)
+            self.memory = CrashMemory(config.memory, spaces.goal_period, width, spaces.device, seed)
+        self._age = -1  # rollouts since the last fit, -1 before the first
+        self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
+        self._issued, self._chosen = 0, 0  # goals since the last call of learn, and those of them that fear chose
+        self._said = False  # that there is no fear yet
+
+    @property
+    def afraid(self) -> bool:
+        """Whether fear chooses: the network has learnt something and, behind a gate, ranks better than chance."""
+        return self.fear.fitted and not (self.config.gate and self._auroc <= 0.5)
 
     @abc.abstractmethod
     def choose(self, score: Tensor, draw: Tensor) -> Tensor:
@@ -62,16 +116,25 @@ class FearSelector(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are log odds before the temperature."""
-        if not self.fear.fitted:
+        self._issued += len(rows)
+        if not self.afraid:
             return uniform_proposal(candidates, draws[:, 0])
+        self._chosen += len(rows)
         score = self.score(state, goal, candidates)
-        ranked = _rolled(score, draws[:, 2]) if self.config.control == "shuffled" else score
-        pick, probe = self.choose(ranked, draws[:, 0]), None
+        pick, probe = self.choose(self.ranking(state, goal, candidates, score, draws), draws[:, 0]), None
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
         # As a forecast it keeps the prior at issue time, whatever the crash rate is when it is evaluated.
-        return Proposal(picks.take(candidates, pick), picks.take(score, pick) + self.calibration.prior, probe=probe)
+        forecast = picks.take(score, pick) + self.calibration.prior
+        return Proposal(picks.take(candidates, pick), forecast, probe=probe, percentile=picks.percentile(score, pick))
+
+    def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
+        """What ``choose`` goes by, shape (B, N): the logits of fear, ``score``, unless somebody knows better.
+
+        The other arguments are those of ``propose``.
+        """
+        return _rolled(score, draws[:, 2]) if self.config.control == "shuffled" else score
 
     def score(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Logits of the fear network for all candidates; see ``Fear.score``."""
@@ -87,23 +150,77 @@ class FearSelector(GoalSelector):
         score, crashed = window.score[known], window.crashed[known]
         fair = known & window.probe if self.config.probe else known  # chosen goals are a biased sample
         fresh = fair & recent
+        self._auroc = auroc(window.score[fair], window.crashed[fair])
         row = {
-            "fear/auroc": auroc(window.score[fair], window.crashed[fair]),
+            "fear/auroc": self._auroc,
             "fear/crash_rate": window.crashed[recent].float().mean().item(),
             "fear/resolved": float(recent.sum()),
             "fear/score": window.score[recent].nanmean().item(),
             "fear/temperature": self.calibration.temperature,
+            "fear/chosen": self._chosen / self._issued if self._issued else math.nan,
         }
+        self._issued = self._chosen = 0
         quality = evaluate(self.calibration.of_log_odds(window.score[fresh]), window.crashed[fresh])
         row |= {f"calibration/{name}": value for name, value in quality.items()}
         # The temperature is fitted to scores from before the network learnt from their outcomes.
         crashes = int(crashed.sum())
-        if min(crashes, len(crashed) - crashes) >= self.config.fear.min_per_class:
+        if min(crashes, len(crashed) - crashes) >= LEAST:
             self.calibration.fit(score, crashed)
-        row["fear/loss"] = self.fear.fit(replace(window, state=self._seen(window.state)))
-        if self.fear.fitted:
-            self.calibration.set_share(self.fear.share)
-        return row
+        loss = self._fit(window, interactions)
+        if not math.isnan(loss):
+            self._age = 0
+        elif self.fear.fitted:
+            self._age += 1
+        else:
+            self._say_why(window)
+        counts = torch.stack([window.crashed.sum(), torch.ones_like(window.env).sum()]).double()
+        total, resolved = mean_over_ranks(counts).tolist()
+        self.calibration.set_share((total + 0.5) / (resolved + 1.0))  # no crash lately is no certainty
+        return row | {"fear/loss": loss, "fear/age": float(self._age) if self.fear.fitted else math.nan}
+
+    def _fit(self, window: Resolved, interactions: Interactions) -> float:
+        """Learn from the memory or, without one, from the window; returns the loss, NaN where nothing was learnt."""
+        rows = self.rows(window, interactions)
+        if self.memory is None:
+            return self.fit(rows, window.crashed, torch.ones_like(window.score))
+        self.memory.store(rows, window, interactions.now)
+        rows, crashed, weight, _ = self.memory.sample(rows, window)
+        return self.fit(rows, crashed, weight)
+
+    def rows(self, window: Resolved, interactions: Interactions) -> Tensor:
+        """What to learn from each interaction of the window, shape (n, inputs_per_row * inputs of the network)."""
+        return torch.cat([self._seen(window.state), window.goal, window.next_goal], dim=1)
+
+    def fit(self, rows: Tensor, crashed: Tensor, weight: Tensor) -> float:
+        """Learn from rows, of the window or remembered; see ``Fear.fit_rows``."""
+        return self.fear.fit_rows(rows, crashed, weight)
+
+    def _say_why(self, window: Resolved) -> None:
+        """Say once why goals are uniform yet."""
+        if self._said:
+            return
+        self._said = True
+        least, crashes = self.config.fear.min_per_class, int(window.crashed.sum())
+        _log.info(
+            "Goals are uniform until the fear network has seen %d crash(es) and as many survivals; "
+            "the last 2 T steps had %d and %d.", least, crashes, len(window) - crashes,
+        )  # fmt: skip
+
+    def estimate(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> FearEstimate:
+        """What it thinks of given goals, and how far that can be trusted.
+
+        Args:
+            state: States, shape (B, state_dim).
+            goal: Active goals, shape (B, goal_dim).
+            new_goal: Goals to evaluate, shape (B, goal_dim).
+
+        Raises:
+            RuntimeError: If the network has not learnt anything yet.
+        """
+        if not self.fear.fitted:
+            raise RuntimeError("The fear network has learnt nothing yet: it must see crashes and survivals first.")
+        score = self.score(state, goal, new_goal.unsqueeze(1)).squeeze(1)
+        return FearEstimate(self.calibration.probability(score), self._auroc, self._age)
 
     def _seen(self, state: Tensor) -> Tensor:
         return torch.zeros_like(state) if self.config.control == "state-blind" else state
@@ -115,10 +232,7 @@ class FearSelector(GoalSelector):
 
 def fear_selector(selector: GoalSelector) -> FearSelector | None:
     """The selector with a fear network in ``selector``: itself, or the first of its parts that is one."""
-    if isinstance(selector, FearSelector):
-        return selector
-    found = (fear_selector(part) for part in selector.parts)
-    return next((part for part in found if part is not None), None)
+    return next((part for part in with_parts(selector) if isinstance(part, FearSelector)), None)
 
 
 def _rolled(score: Tensor, draw: Tensor) -> Tensor:

@@ -89,10 +89,10 @@ class Interactions(Stateful):
         self._reward = slice(-1 - groups, None)  # and the tracking: what grows with every step
         width = sum(self._sizes)
         # One row per interaction, not one tensor per field: a few decisions per step cost what their calls cost.
-        self._pending = torch.zeros(num_envs, width, device=device)
+        self._pending = torch.zeros(num_envs, width, dtype=torch.float32, device=device)
         self.issued_at, self._horizon, self._cursor = torch.zeros(3, num_envs, dtype=torch.int64, device=device)
         """Step that the pending interaction was issued after, int64, shape (num_envs,)."""
-        self._ring = torch.zeros(num_envs, capacity, width, device=device)
+        self._ring = torch.zeros(num_envs, capacity, width, dtype=torch.float32, device=device)
         self._marks = torch.zeros(num_envs, capacity, 4, dtype=torch.int64, device=device)
         """Crashed, issued, resolved, horizon; steps count from 1, so a resolved step of 0 marks a free slot."""
 
@@ -146,12 +146,12 @@ class Interactions(Stateful):
         are those that are issued; ``horizon`` may be one number, at least 1; ``probe`` is ``None`` for nowhere, and
         ``note`` for 0, its numbers being below 2^24.
         """
-        rest = torch.zeros(len(rows), 3 + self._sizes[-1], device=score.device)
+        rest = torch.zeros(len(rows), 3 + self._sizes[-1], dtype=torch.float32, device=score.device)
         if probe is not None:
             rest[:, 0] = probe
         if note is not None:
             rest[:, 1] = note
-        self._pending[rows] = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1)
+        self._pending[rows] = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1).float()
         self.issued_at[rows] = self.now
         self._horizon[rows] = horizon
         self.active[rows] = True
@@ -164,7 +164,7 @@ class Interactions(Stateful):
             rows: Worlds, int64, shape (m,), each once.
             goal: Goals, shape (m, goal_dim).
         """
-        self._pending[rows, self._next_goal] = goal
+        self._pending[rows, self._next_goal] = goal.float()
 
     def resolved(self, since: int = 0) -> Resolved:
         """The interactions resolved within the window, and after step ``since``, ordered by world."""
@@ -192,6 +192,15 @@ class Interactions(Stateful):
         known = torch.cat([self._pending[pending], self._ring[env, slot]])
         state, goal, next_goal, *_ = known.split(self._sizes, dim=1)
         return torch.cat([pending, env]), state, goal, next_goal
+
+    @property
+    def latest_state(self) -> Tensor:
+        """State at the latest decision of every world, on the step ``issued_at``, shape (num_envs, state_dim)."""
+        return self._pending[:, : self._sizes[0]]
+
+    def followed(self, done: Resolved) -> Tensor:
+        """True where an interaction was survived and led to the latest decision of its world, bool, shape (n,)."""
+        return ~done.crashed & (self.issued_at[done.env] == done.resolved)
 
     def without_scores(self) -> "Interactions":
         """The same interactions for a selector that did not choose these goals: it sees no scores."""

@@ -5,6 +5,7 @@ from typing import Any
 
 from deimos import plugins
 from deimos.goals import selectors
+from deimos.goals.fear import FearConfig
 from deimos.goals.selector import SelectorConfig
 
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -30,11 +31,27 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "plr": ("plr", {}),
     "plr-robust": ("plr", {"robust": True}),
     "grid": ("grid", {}),
+    "fear-novelty": ("novelty", {}),
+    "q-fear": ("q_fear", {}),
+    "weighted": ("weighted", {}),
     # Controls.
     "shuffled": ("director", {"percentile": 75, "control": "shuffled"}),
     "state-blind": ("director", {"percentile": 75, "control": "state-blind"}),
+    "swapped": ("swapped", {}),
+    "uniform-ensemble": ("vds", {"rule": "uniform"}),
+    "vds-argmax": ("vds", {"rule": "argmax"}),
+    "rnd-raw": ("rnd", {"whiten": False}),
+    "penalty-10": ("penalty", {"size": 10.0}),
+    "penalty-100": ("penalty", {"size": 100.0}),
 }
 """Methods with names of their own: the selector, and its options where they are not the defaults."""
+
+DATA: dict[str, dict[str, Any]] = {
+    "literal": {"memory": 0},
+    "threshold": {"memory": 0, "fear": FearConfig(min_per_class=32)},
+}
+"""What a Director's fear learns from, where it has no crash memory: the last 2 T steps as in the thesis, or, as in
+version 0.1.0, only where they hold 32 of each class."""
 
 
 def method(name: str) -> SelectorConfig:
@@ -42,7 +59,8 @@ def method(name: str) -> SelectorConfig:
 
     Args:
         name: One of ``METHODS``; or ``pNN``, the Director at that percentile, in [0, 100], such as p33 or p12.5; or
-            the name of a selector, also one of another package, with its defaults.
+            any Director's name with one of ``DATA``, such as p75-literal or coop-threshold; or the name of a selector,
+            also one of another package, with its defaults.
 
     Raises:
         ValueError: If there is no such method; the message lists those that there are.
@@ -51,7 +69,8 @@ def method(name: str) -> SelectorConfig:
     if kind not in plugins.names(selectors):
         others = ", ".join(other for other in plugins.names(selectors) if other not in METHODS)
         raise ValueError(
-            f"There is no method '{name}'; there are: {', '.join(METHODS)}; any pNN from p0 to p100; {others}."
+            f"There is no method '{name}'; there are: {', '.join(METHODS)}; any pNN from p0 to p100; "
+            f"a Director's with -{' or -'.join(DATA)}; {others}."
         )
     return plugins.load(selectors, kind).Config(**options)
 
@@ -64,4 +83,9 @@ def _spelled_out(name: str) -> tuple[str, dict[str, Any]]:
         percentile = float(name[1:])
         if percentile <= 100 and name == f"p{percentile:g}":  # no second spelling, such as p07
             return "director", {"percentile": percentile}
+    base, _, data = name.rpartition("-")
+    if data in DATA:
+        kind, options = _spelled_out(base)
+        if kind == "director":
+            return kind, options | DATA[data]
     return name, {}

@@ -29,6 +29,11 @@ def uniformly(draw: Tensor, count: int) -> Tensor:
     return (draw * count).long().clamp(max=count - 1)
 
 
+def kept_above(percentile: float, count: int) -> int:
+    """How many of ``count`` candidates are kept above a percentile in [0, 100]: max(1, N - floor(p N / 100))."""
+    return max(1, count - int(percentile * count / 100))
+
+
 def above_percentile(score: Tensor, draw: Tensor, percentile: float) -> Tensor:
     """Any of the candidates above a percentile of the scores.
 
@@ -41,11 +46,20 @@ def above_percentile(score: Tensor, draw: Tensor, percentile: float) -> Tensor:
         percentile: p, in [0, 100].
     """
     count = score.shape[1]
-    kept = max(1, count - int(percentile * count / 100))
+    kept = kept_above(percentile, count)
     pick = uniformly(draw, kept)
     if kept == count:
         return pick
     return take(score.topk(kept, dim=1, sorted=False).indices, pick)
+
+
+def percentile(score: Tensor, pick: Tensor) -> Tensor:
+    """Percentile of the picked score among those of its row, in (0, 100), ties counting half, shape (B,).
+
+    Whatever the scores, a uniform pick has 50 on average.
+    """
+    own = take(score, pick).unsqueeze(1)
+    return ((score < own).sum(1) + (score <= own).sum(1)).float() * (50.0 / score.shape[1])
 
 
 def in_proportion(weight: Tensor, draw: Tensor) -> Tensor:

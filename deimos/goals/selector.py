@@ -1,7 +1,7 @@
 """What every goal selector promises. A selector sees tensors only, never an environment or a learner."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -60,23 +60,26 @@ class Proposal:
     """Shape (B, goal_dim)."""
     score: Tensor
     """What the selector thinks of each, NaN where it has no opinion, shape (B,)."""
-    learn: Tensor | None = None
-    """Whether the learner may use what follows, bool, shape (B,); ``None`` for everywhere."""
+    weight: Tensor | None = None
+    """Weight of what follows in everything learnt, at least 0, shape (B,); ``None`` for 1 everywhere."""
     probe: Tensor | None = None
     """True where the goal was drawn uniformly, whatever its score, bool, shape (B,); ``None`` for nowhere."""
     note: Tensor | None = None
     """A whole number that comes back with the interaction, int64 below 2^24, shape (B,); ``None`` for 0."""
+    percentile: Tensor | None = None
+    """Percentile of the goal's fear among the candidates, in [0, 100], shape (B,); ``None`` where nobody knows."""
 
 
 def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
-    """Any of the candidates, without an opinion.
+    """Any of the candidates, without an opinion. Whatever is feared, its percentile is 50 on average.
 
     Args:
         candidates: Shape (B, N, goal_dim).
         draw: Uniform numbers in [0, 1), shape (B,).
     """
     pick = picks.uniformly(draw, candidates.shape[1])
-    return Proposal(picks.take(candidates, pick), torch.full_like(draw, torch.nan))
+    unknown, middle = torch.full_like(draw, torch.nan), torch.full_like(draw, 50.0)
+    return Proposal(picks.take(candidates, pick), unknown, percentile=middle)
 
 
 class Transitions(Protocol):
@@ -122,6 +125,8 @@ class GoalSelector(Stateful, abc.ABC):
     """Whether ``learn`` needs the learner's transitions."""
     first_goals_scaled: bool = False
     """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
+    crash_penalty: float = 0.0
+    """What a crash takes from the learner's reward, at least 0, in units of the largest reward of a step."""
 
     def goal_range(self) -> Tensor | None:
         """Share of the goal range to draw candidates from, shape (goal_dim,), in (0, 1]; ``None`` for all of it."""
@@ -164,6 +169,13 @@ class GoalSelector(Stateful, abc.ABC):
         """Raise ``SimulationError`` if a weight is not finite."""
 
 
+def with_parts(selector: GoalSelector) -> Iterator[GoalSelector]:
+    """A selector, and all that it is made of."""
+    yield selector
+    for part in selector.parts:
+        yield from with_parts(part)
+
+
 class Delegate(GoalSelector):
     """Leaves everything to another selector, ``current``, but for what it overrides."""
 
@@ -175,6 +187,7 @@ class Delegate(GoalSelector):
     needs_rollout = property(lambda self: any(part.needs_rollout for part in self.parts))
     num_candidates = property(lambda self: self.current.num_candidates)
     first_goals_scaled = property(lambda self: self.current.first_goals_scaled)
+    crash_penalty = property(lambda self: self.current.crash_penalty)
 
     def goal_range(self) -> Tensor | None:
         """See ``GoalSelector.goal_range``."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.learn.rollout import Rollout
 from deimos.nn.adam import Adam
-from deimos.nn.losses import Surrogate, ValueLoss, log_prob
+from deimos.nn.losses import Loss, Surrogate, ValueLoss, log_prob
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Activation, Actor, mlp
 from deimos.nn.random import Purpose, normals
@@ -104,9 +104,6 @@ class Batch:
     def value(self) -> Tensor:
         """The data of ``losses.ValueLoss``: a view."""
         return self.table[-3:].unsqueeze(0)
-
-    def __getitem__(self, rows: slice) -> "Batch":
-        return Batch(self.table[:, rows], self.obs_dim)
 
 
 class PPO(Stateful):
@@ -278,6 +275,7 @@ class PPO(Stateful):
         """One step of Adam; returns value loss, surrogate loss and KL divergence, shape (3,)."""
         config, std = self.config, self.actor.std
         assert std.grad is not None
+        work: list[tuple[MLPs, Tensor, Loss]]
         work = [(self._actor, minibatch.obs, Surrogate(minibatch.policy, config.clip))]
         if learn_value:
             clip = config.clip if config.clip_value else math.inf

@@ -1,6 +1,7 @@
 """What happened in every world over a few steps, in memory allocated once, and what it was worth."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -32,21 +33,22 @@ class Rollout:
         self.num_steps = num_steps
         self.discount, self.gae_lambda, self.reward_scale = discount, gae_lambda, reward_scale
         n = num_envs
-        self.obs = torch.zeros(num_steps + 1, n, obs_dim, device=device)
-        self.action = torch.zeros(num_steps, n, action_dim, device=device)
-        self.mean = torch.zeros(num_steps, n, action_dim, device=device)
+        zeros = partial(torch.zeros, dtype=torch.float32, device=device)
+        self.obs = zeros(num_steps + 1, n, obs_dim)
+        self.action = zeros(num_steps, n, action_dim)
+        self.mean = zeros(num_steps, n, action_dim)
         """Mean of the policy's distribution at the time."""
-        self.noise = torch.zeros(num_steps, n, action_dim, device=device)
+        self.noise = zeros(num_steps, n, action_dim)
         """Standard normal draws, made for the whole rollout at once."""
-        self.reward = torch.zeros(num_steps, n, device=device)
+        self.reward = zeros(num_steps, n)
         self.terminated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.ends: list[tuple[Tensor, Tensor, Tensor]] = []
         """What ``cut_off`` joins, for every step that truncated worlds; where none does it takes no memory."""
-        self.advantage = torch.zeros(num_steps, n, device=device)
+        self.advantage = zeros(num_steps, n)
         """Advantages in units of scaled rewards, before they are normalised; see ``estimate``."""
         self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
-        self.weight = torch.ones(num_steps, n, device=device)
+        self.weight = zeros(num_steps, n).fill_(1.0)
         """Weight of the transition in everything learnt: 0 leaves it out."""
 
     @torch.no_grad()

@@ -14,9 +14,9 @@ from deimos.nn.losses import Loss, Surrogate, ValueLoss
 from deimos.nn.threads import CREW
 
 ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
-BLOCK = 3 * 2**16  # numbers in a block, 768 KiB: what a core's second cache holds
+BLOCK = 3 * 2**17  # numbers in a block, 1.5 MiB: what a core's caches hold
 PARTS = 16  # of the rows of all networks together, each with a gradient of its own
-LEAST = 2e6  # operations that are worth waking a thread for, about 20 us
+LEAST = 1e7  # operations that are worth waking a thread for, about 100 us
 
 
 class Kernel:
@@ -77,9 +77,7 @@ class Kernel:
         start = None if start is None else start.contiguous()
         with CREW.lock:
             self._prepare(Mode.FORWARD, x, y)
-            self._fill(
-                parts=-(-rows // self._room), start=0 if start is None else start.data_ptr(), shared=shared
-            )  # fmt: skip
+            self._fill(parts=-(-rows // self._room), shared=shared, start=0 if start is None else start.data_ptr())
             _run([self], rows * self._operations)
         return y
 
@@ -95,8 +93,8 @@ class Kernel:
     def prepare_gradient(self, mode: Mode, x: Tensor, sums: int, data: Tensor, clip: float = 0.0) -> float:
         """Fill in a job that adds up gradients; ``data`` are the loss's, or gradients by outputs. Gives operations."""
         rows, count = x.shape[-2], len(self._parameters)
-        parts = min(-(-rows // self._room), max(4, PARTS // count))
-        shape = (count, max(1, parts), self._size + sums)
+        parts = max(1, min(-(-rows // self._room), max(4, PARTS // count)))
+        shape = count, parts, self._size + sums
         if self._gradient.shape != shape:
             with torch.inference_mode(False):
                 self._gradient = torch.zeros(shape, dtype=torch.float32)
@@ -120,13 +118,13 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
     """See ``mlps.gradients``."""
     if not all(isinstance(loss, ValueLoss | Surrogate) for _, _, loss in work):
         return [_by_outputs(*item) for item in work]
+    kernels, operations, kept = [kernel for kernel, _, _ in work], 0.0, []
     with CREW.lock:
-        operations = 0.0
         for kernel, x, loss in work:
             assert isinstance(loss, ValueLoss | Surrogate)
             mode = Mode.VALUE if isinstance(loss, ValueLoss) else Mode.SURROGATE
-            operations += kernel.prepare_gradient(mode, x, loss.sums, loss.data, loss.clip)
-        kernels = [kernel for kernel, _, _ in work]
+            kept.append(loss.data.float() if loss.data.stride(-1) == 1 else loss.data.float().contiguous())
+            operations += kernel.prepare_gradient(mode, x, loss.sums, kept[-1], loss.clip)
         _run(kernels, operations)
         return [kernel.collect() for kernel in kernels]
 
@@ -134,7 +132,7 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
 def _by_outputs(kernel: Kernel, x: Tensor, loss: Loss) -> Tensor:
     """The gradient of a loss that torch computes between two passes."""
     sums, delta, free = loss(kernel.forward(x), kernel._parameters[:, kernel._free])
-    delta = delta.contiguous()
+    delta = delta.float().contiguous()
     with CREW.lock:
         _run([kernel], kernel.prepare_gradient(Mode.BACKWARD, x, 0, delta))
         kernel.collect()

@@ -93,7 +93,7 @@ def cross_entropy(target: Tensor, weight: Tensor) -> Loss:
     """The binary cross-entropy of one logit; see ``Loss``.
 
     Args:
-        target: 0 or 1, shape (n,).
+        target: In [0, 1], shape (n,).
         weight: Weight of every row, shape (n,).
     """
 

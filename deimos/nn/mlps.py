@@ -13,15 +13,13 @@ if TYPE_CHECKING:
     from deimos.nn.cpu import Kernel
 
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.ReLU: "relu", nn.ELU: "elu", nn.Tanh: "tanh"}
-WIDEST = 512
-"""Units of the widest layer that the kernel for CPUs takes: with wider ones torch's own products are as fast."""
 
 
 class MLPs:
     """K networks of one shape in one vector of parameters, those of a network end to end as its module orders them.
 
-    Products are torch's, or those of ``kernels.mlp``: on a CPU, where Warp is installed and no layer is wider than
-    ``WIDEST``. Both give the same to rounding; the kernel's results do not depend on the number of threads.
+    Products are torch's or, on a CPU where Warp is installed, those of ``kernels.mlp``. Both give the same to rounding;
+    the kernel's results do not depend on the number of threads.
 
     Args:
         modules: Linear layers with one kind of activation between them, as ``networks.mlp`` makes them, on one device;
@@ -38,7 +36,8 @@ class MLPs:
         self.units = (linears[0].in_features, *(layer.out_features for layer in linears))
         """Inputs, and outputs of every layer."""
         self.activation = next(ACTIVATIONS[type(layer)] for layer in first.modules() if type(layer) in ACTIVATIONS)
-        offsets, size = {}, 0
+        offsets: dict[Tensor, int] = {}
+        size = 0
         for parameter in first.parameters():
             offsets[parameter] = size
             size += parameter.numel()
@@ -66,12 +65,12 @@ class MLPs:
         """Outputs of all networks, shape (K, n, outputs).
 
         Args:
-            x: Inputs, float32, shape (n, inputs), or (K, n, inputs) for inputs of their own.
+            x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own; rounded to float32.
 
         Raises:
-            ValueError: If the shape is another one.
+            ValueError: If the shape or the device is another one.
         """
-        self._check(x)
+        x = self._rounded(x)
         if self._kernel is not None:
             return self._kernel.forward(x)
         parts = [self._layers(x[..., rows, :].expand(len(self), -1, -1))[-1] for rows in self._parts(x.shape[-2])]
@@ -84,8 +83,8 @@ class MLPs:
         The first layer is linear: the context's share of it is computed once, not N times.
 
         Args:
-            context: The first inputs, float32, shape (B, inputs - goal_dim).
-            candidates: The other inputs, float32, shape (B, N, goal_dim).
+            context: The first inputs, shape (B, inputs - goal_dim); rounded to float32.
+            candidates: The other inputs, shape (B, N, goal_dim); rounded to float32.
 
         Raises:
             ValueError: If the shapes do not fit each other or the networks.
@@ -96,6 +95,7 @@ class MLPs:
                 f"context and candidates must have the shapes (B, {known}) and (B, N, {size}), together "
                 f"{self.units[0]} inputs, got {tuple(context.shape)} and {tuple(candidates.shape)}."
             )
+        context, candidates = context.float(), candidates.float()
         weight, bias = self._layer(0)
         start = torch.baddbmm(bias, context.expand(len(self), -1, -1), weight[..., :known].mT)
         if self._kernel is not None:
@@ -112,7 +112,7 @@ class MLPs:
         """Write ``grad``, the gradient of a loss.
 
         Args:
-            x: Inputs, float32, shape (n, inputs), or (K, n, inputs) for inputs of their own.
+            x: Inputs, as ``forward`` takes them.
             loss: What is minimised; ``losses.ValueLoss`` and ``losses.Surrogate`` are computed within the kernel.
 
         Returns:
@@ -160,29 +160,27 @@ class MLPs:
         norm = torch.linalg.vector_norm(self.grad, dim=1, keepdim=True)
         self.grad *= (max_norm / (norm + 1e-6)).clamp(max=1.0)
 
-    def _check(self, x: Tensor) -> None:
-        inputs, like = self.units[0], self.parameters
-        if (x.dtype, x.device) != (like.dtype, like.device):
-            raise ValueError(f"x must be {_kind(like)}, got {_kind(x)}.")
+    def _rounded(self, x: Tensor) -> Tensor:
+        """Inputs as float32, if their shape and device are right."""
+        inputs, device = self.units[0], self.parameters.device
+        if x.device != device:
+            raise ValueError(f"x must be on {device}, got it on {x.device}.")
         if x.dim() not in (2, 3) or x.shape[-1] != inputs or (x.dim() == 3 and len(x) not in (1, len(self))):
             raise ValueError(
                 f"x must have the shape (n, {inputs}) or ({len(self)}, n, {inputs}), got {tuple(x.shape)}."
             )
+        return x.float()
 
 
 def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
     """``MLPs.gradient`` of several, by threads that pass from one to the next without waiting for each other."""
-    for nets, x, _ in work:
-        nets._check(x)
-    if all(nets._kernel is not None for nets, _, _ in work):
-        from deimos.nn import cpu
+    rounded = [(nets, nets._rounded(x), loss) for nets, x, loss in work]
+    prepared = [(nets._kernel, x, loss) for nets, x, loss in rounded if nets._kernel is not None]
+    if len(prepared) < len(work):
+        return [nets._gradient(x, loss) for nets, x, loss in rounded]
+    from deimos.nn import cpu
 
-        return cpu.gradients([(nets._kernel, x, loss) for nets, x, loss in work])
-    return [nets._gradient(x, loss) for nets, x, loss in work]
-
-
-def _kind(tensor: Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
+    return cpu.gradients(prepared)
 
 
 def _move(module: nn.Module, parameters: Tensor, grad: Tensor) -> None:
@@ -208,11 +206,8 @@ def _times_slope(delta: Tensor, y: Tensor, activation: str) -> Tensor:
 
 
 def _kernel(nets: MLPs) -> "Kernel | None":
-    """The kernel for networks, if it takes them and Warp is installed."""
-    memory = nets.parameters
-    if memory.device.type != "cpu" or memory.dtype != torch.float32 or max(nets.units) > WIDEST:
-        return None
-    if find_spec("warp") is None:
+    """The kernel for networks, on a CPU where Warp is installed."""
+    if nets.parameters.device.type != "cpu" or find_spec("warp") is None:
         return None
     from deimos.nn.cpu import Kernel
 

@@ -22,6 +22,43 @@ def on_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+class _Worker(threading.Thread):
+    """A thread that sleeps until it is given work; two locks cost half of what an executor does."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(daemon=True)
+        self.work: Callable[[int], object] | None = None
+        """What it is to do; ``None`` once it has."""
+        self._number = number
+        self._gate, self._done = threading.Lock(), threading.Lock()
+        self._gate.acquire()
+        self._done.acquire()
+        self.start()
+
+    def run(self) -> None:
+        """Work whenever there is some."""
+        while self._gate.acquire():
+            work = self.work
+            if work is None:  # it was woken once too often
+                continue
+            try:
+                work(self._number)
+            finally:
+                self.work = None
+                if self._done.locked():
+                    self._done.release()
+
+    def wake(self) -> None:
+        """Let it look for work; doing so once too often does no harm."""
+        if self._gate.locked():
+            self._gate.release()
+
+    def wait(self) -> None:
+        """Sleep until it may have done its work."""
+        self.wake()
+        self._done.acquire()
+
+
 class Crew:
     """Threads of Python that sleep while there is nothing to do; made when they are first needed.
 
@@ -31,36 +68,30 @@ class Crew:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         """Held by whoever prepares and runs work: of two threads of the host, one waits."""
-        self._gates: list[tuple[threading.Lock, threading.Lock]] = []
-        self._work: Callable[[int], object] = int
+        self._workers: list[_Worker] = []
 
     def run(self, work: Callable[[int], object], count: int) -> None:
-        """Call ``work(i)`` on ``count`` threads, i from 0, the first of them the caller's; returns when all have."""
-        self._work = work
-        while len(self._gates) < count - 1:
-            self._hire()
-        gates = self._gates[: count - 1]
-        for start, _ in gates:
-            start.release()
+        """Call ``work(i)`` on ``count`` threads, i from 0, the first of them the caller's.
+
+        Returns, or raises what interrupted it, when all of them are done: then nobody touches the work's memory.
+        """
+        while len(self._workers) < count - 1:
+            self._workers.append(_Worker(len(self._workers) + 1))
+        workers, interrupt = self._workers[: count - 1], None
         try:
+            for worker in workers:
+                worker.work = work
+                worker.wake()
             work(0)
-        finally:
-            for _, done in gates:
-                done.acquire()
-
-    def _hire(self) -> None:
-        start, done = threading.Lock(), threading.Lock()
-        start.acquire()
-        done.acquire()
-        self._gates.append((start, done))
-        threading.Thread(target=self._wait, args=(len(self._gates), start, done), daemon=True).start()
-
-    def _wait(self, i: int, start: threading.Lock, done: threading.Lock) -> None:
-        while start.acquire():
+        except BaseException as error:  # Ctrl-C may come at any time
+            interrupt = error
+        while busy := [worker for worker in workers if worker.work is not None]:
             try:
-                self._work(i)
-            finally:
-                done.release()
+                busy[0].wait()
+            except BaseException as error:
+                interrupt = error
+        if interrupt is not None:
+            raise interrupt
 
 
 CREW = Crew()

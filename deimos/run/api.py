@@ -9,6 +9,7 @@ import torch
 from deimos.checks import RunError
 from deimos.nn.threads import on_threads
 from deimos.run import training
+from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -43,13 +44,16 @@ def train(config: TrainConfig | None = None, out: Path | str | None = None) -> P
     return folder.path
 
 
-def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "auto", **changes: Any) -> list[dict]:
+def evaluate(
+    run: Path | str, *, goal_period: int | None = None, device: str = "auto", engine: str | None = None, **changes: Any
+) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run against uniform goals (Naive) and against attackers.
 
     Args:
         run: The run's folder; its ``evaluation.json`` gains the rows.
         goal_period: T: steps that a goal is active; ``None`` for that of training.
         device: ``auto``, ``cpu`` or ``cuda``.
+        engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for what did in training.
         changes: Fields of ``EvalConfig`` that differ from the run's, such as ``worlds``, ``steps`` or ``seed``.
 
     Returns:
@@ -60,14 +64,14 @@ def evaluate(run: Path | str, *, goal_period: int | None = None, device: str = "
     """
     folder = RunFolder.open(Path(run))
     config = training.read_config(folder)
-    env_config, eval_config = configure_evaluation(config, goal_period, changes)
+    env_config, eval_config = configure_evaluation(config, goal_period, changes, engine)
     found = training.resolve_device(device)
     with one_stream(found):
         return evaluate_run(folder, env_config, eval_config, found)
 
 
 def configure_evaluation(
-    config: TrainConfig, goal_period: int | None, changes: dict[str, Any]
+    config: TrainConfig, goal_period: int | None, changes: dict[str, Any], engine: str | None = None
 ) -> tuple[EnvConfig, EvalConfig]:
     """What a run's policy is evaluated in and how, where that differs from how the run was set up.
 
@@ -77,6 +81,10 @@ def configure_evaluation(
     try:
         period = config.env.goal_period if goal_period is None else goal_period
         env_config, eval_config = config.env.with_goal_period(period), replace(config.eval, **changes)
+        if engine is not None:
+            if not hasattr(env_config, "engine"):
+                raise ValueError(f"env.engine is for legged robots, got '{engine}' for {kind(config.env)}.")
+            env_config = replace(env_config, engine=engine)
         if eval_config.steps < 2 * period:
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except (TypeError, ValueError) as error:

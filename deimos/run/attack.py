@@ -105,7 +105,7 @@ def uniform_goals(env: Env) -> GoalSelector:
 
 def argmax_director(env: Env, fear: Fear) -> director.Director:
     """A Director that asks for the candidate that a fear network, as it is at that time, fears most."""
-    selector = director.Config(rule="argmax", fear=fear.config).build(spaces(env), 0)
+    selector = director.Config(rule="argmax", memory=0, fear=fear.config).build(spaces(env), 0)
     selector.fear = fear
     return selector
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import RunError
+from deimos.goals import picks
 from deimos.goals.calibration import evaluate
 from deimos.goals.fear import auroc
 from deimos.goals.fear_selector import FearSelector, fear_selector
@@ -65,15 +66,11 @@ def audit_fear(trainer: Trainer, contexts: int) -> dict:
         RunError: If there is no fear network, or no context with both outcomes.
     """
     afraid = _learnt_fear(trainer)
-    config, act = trainer.config, _Explorer(trainer)
-    clones = Clones(
-        lambda count: config.env.build(count, trainer.env.device, config.seed),
-        _Explorer(trainer, first_world=config.num_envs), limit=BATCH * CANDIDATES,
-    )  # fmt: skip
+    act, clones = _explorers(trainer)
     ranks: list[float] = []
     crashes = tried = 0
     while len(ranks) < contexts and tried < PATIENCE * contexts:
-        state, goal, candidates, survived = _next_contexts(trainer, act, clones)
+        _, state, goal, candidates, survived = _next_contexts(trainer, act, clones)
         logit = afraid.score(state, goal, candidates)
         crashed = survived < trainer.env.goal_period
         tried += len(logit)
@@ -84,12 +81,50 @@ def audit_fear(trainer: Trainer, contexts: int) -> dict:
         raise RunError(
             f"None of {tried} contexts had both outcomes; the policy is too safe or too bad to rank its goals."
         )
-    picks = np.random.default_rng(0).integers(len(ranks), size=(RESAMPLES, len(ranks)))
-    low, high = np.quantile(np.array(ranks)[picks].mean(axis=1), [0.025, 0.975])
+    resamples = np.random.default_rng(0).integers(len(ranks), size=(RESAMPLES, len(ranks)))
+    low, high = np.quantile(np.array(ranks)[resamples].mean(axis=1), [0.025, 0.975])
     return {
         "auroc": math.fsum(ranks) / len(ranks), "low": float(low), "high": float(high), "contexts": len(ranks),
         "tried": tried, "crash_rate": crashes / (tried * CANDIDATES), "iteration": trainer.iteration,
     }  # fmt: skip
+
+
+def audit_percentile(trainer: Trainer, contexts: int) -> dict[str, float]:
+    """Measure how dangerous the goals of a training run's selector are, by the truth.
+
+    Args:
+        trainer: A run. Its worlds move on.
+        contexts: Contexts to collect where candidates differ in danger, at least 1.
+
+    Returns:
+        ``percentile``: the mean percentile of the chosen goal among 50 candidates, by how soon each crashes the policy,
+        ties counting half: 50 is Uniform's; and the number of ``contexts``.
+
+    Raises:
+        RunError: If no context has candidates that differ.
+    """
+    act, clones = _explorers(trainer)
+    found: list[float] = []
+    tried = 0
+    while len(found) < contexts and tried < PATIENCE * contexts:
+        rows, state, goal, candidates, survived = _next_contexts(trainer, act, clones)
+        tried += len(rows)
+        chosen = trainer.loop.selector.propose(rows, state, goal, candidates, trainer.env.draw(rows)).goal
+        pick = (candidates == chosen.unsqueeze(1)).all(2).int().argmax(1)
+        percentile = picks.percentile(-survived, pick)
+        found += percentile[survived.amin(1) < survived.amax(1)].tolist()
+    if not found:
+        raise RunError(f"In none of {tried} contexts do candidates differ in danger.")
+    return {"percentile": math.fsum(found) / len(found), "contexts": float(len(found))}
+
+
+def _explorers(trainer: Trainer) -> tuple[_Explorer, Clones]:
+    """Who acts in the run's own worlds, and clones to try candidates in; both explore as in training."""
+    config = trainer.config
+    return _Explorer(trainer), Clones(
+        lambda count: config.env.build(count, trainer.env.device, config.seed),
+        _Explorer(trainer, first_world=config.num_envs), limit=BATCH * CANDIDATES,
+    )  # fmt: skip
 
 
 def audit_calibration(trainer: Trainer, interactions: int) -> dict[str, tuple[Tensor, Tensor, dict[str, float]]]:
@@ -142,12 +177,12 @@ def _watch(trainer: Trainer, act: _Explorer, chooser: GoalSelector, count: int) 
 
 
 @torch.no_grad()
-def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Step until goals are due, and try candidates in up to ``BATCH`` of those worlds.
 
     Returns:
-        States (n, state_dim), active goals (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the steps
-        survived under each (n, CANDIDATES).
+        Worlds (n,), states (n, state_dim), active goals (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the
+        steps survived under each (n, CANDIDATES).
     """
     env = trainer.env
     while True:
@@ -162,4 +197,4 @@ def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Te
     candidates = env.sample_goals(rows, CANDIDATES).clone()
     survived = clones.try_out(env, rows, candidates)
     trainer.loop.advance(step)
-    return env.state(obs), obs[:, env.goal_slice], candidates, survived
+    return rows, env.state(obs), obs[:, env.goal_slice], candidates, survived

@@ -45,34 +45,42 @@ def kind(config: EnvConfig | SelectorConfig) -> str:
     return name
 
 
-def from_dict(cls: type, data: dict) -> Any:
+def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
     """Rebuild a dataclass from ``to_dict``.
 
+    Args:
+        cls: Its class.
+        data: Its fields. A missing one takes its default.
+        stored: Whether an earlier version may have written them. Then a missing field takes the value that was the only
+            one before there was the field, ``before`` in its metadata, where that is not the default.
+
     Raises:
-        ValueError: If a field is unknown or a value is not allowed. A missing field takes its default.
+        ValueError: If a field is unknown or a value is not allowed.
     """
     data = dict(data)
     if cls in _PLUGINS:
         if "kind" not in data:
             raise ValueError(f"A configuration of {_PLUGINS[cls].__name__} must name its 'kind', got {data}.")
         cls = plugins.load(_PLUGINS[cls], data.pop("kind")).Config
+    if stored:
+        data = {f.name: f.metadata["before"] for f in dataclasses.fields(cls) if "before" in f.metadata} | data
     hints = typing.get_type_hints(cls)
     names = {field.name for field in dataclasses.fields(cls)}
     if unknown := sorted(set(data) - names):
         raise ValueError(
             f"{cls.__module__}.{cls.__name__} has no {', '.join(unknown)}; it has: {', '.join(sorted(names))}."
         )
-    return cls(**{name: _typed(hints[name], value) for name, value in data.items()})
+    return cls(**{name: _typed(hints[name], value, stored) for name, value in data.items()})
 
 
-def _typed(hint: Any, value: Any) -> Any:
+def _typed(hint: Any, value: Any, stored: bool) -> Any:
     """``value`` as the type that ``hint`` asks for, where JSON cannot say it."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         if value is None:
             return None
         hint = next(part for part in typing.get_args(hint) if part is not type(None))
     if hint in _PLUGINS or dataclasses.is_dataclass(hint):
-        return from_dict(hint, value)
+        return from_dict(hint, value, stored=stored)
     if hint is Path:
         return Path(value)
     if hint is float:

@@ -85,14 +85,15 @@ def evaluate_run(
 ) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
 
-    There they replace the rows of the same evaluation of the same weights. One of another T, size or seed, or of an
-    Adversary that was trained otherwise, is another evaluation, and stays beside them. Rows that the folder has are
-    made ``again`` or given back as they are; for the other arguments see ``evaluate``.
+    There they replace the rows of the same evaluation of the same weights. One of another T, size, seed or engine, or
+    of an Adversary that was trained otherwise, is another evaluation, and stays beside them. Rows that the folder has
+    are made ``again`` or given back as they are; for the other arguments see ``evaluate``.
 
     Returns:
         The rows of this evaluation, those of ``evaluate`` with the policy's ``weights_hash``.
     """
     policy = load_policy(folder.path, str(device))
+    env_config = env_config.resolved(device)
     weights = {"weights": weights_hash(policy.actor)}
     known = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
     identities = [(identity | weights).items() for identity in _identities(env_config, config)]
@@ -105,12 +106,28 @@ def evaluate_run(
     return fresh
 
 
+def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
+    """Rows of the folder that differ from these of an evaluation in nothing but the engine: how it did elsewhere."""
+
+    def identity(row: dict) -> list:
+        return [
+            row.get(key) for key in ("goals", "goal_period", "seed", "worlds", "steps", "adversary_setting", "weights")
+        ]
+
+    here = {row.get("engine") for row in rows}
+    same = [identity(row) for row in rows]
+    known = folder.read_json("evaluation.json")
+    return [row for row in known if row.get("engine") not in here and identity(row) in same]
+
+
 def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
     """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
     shared = {name: value for name, value in to_dict(config).items() if name in ("worlds", "seed", "fear")}
+    engine = {"engine": env_config.engine} if hasattr(env_config, "engine") else {}
     return [
         {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed,
          "worlds": config.worlds_against(goals), "steps": config.steps}
+        | engine
         | ({} if goals == "naive" else {"adversary_setting": _setting(shared, config, goals)})
         for goals in ("naive", *config.attackers)
     ]  # fmt: skip
@@ -154,7 +171,7 @@ def evaluate(
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
     """
-    env_config = env_config.for_evaluation()
+    env_config = env_config.for_evaluation().resolved(device)
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
     target = make_target(policy, env_config, config, device)
@@ -174,7 +191,7 @@ def evaluate(
 
 def make_target(policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device) -> Target:
     """A policy as attackers meet it; for the arguments see ``evaluate``."""
-    quiet = env_config.for_evaluation()
+    quiet = env_config.for_evaluation().resolved(device)
     return Target(
         policy=policy, build=lambda worlds, seed: quiet.build(worlds, device, seed), worlds=config.worlds,
         steps=config.adversary_steps, seed=config.seed, fear=config.fear,

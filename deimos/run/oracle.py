@@ -5,6 +5,7 @@ Both need worlds that can be cloned, and time: N candidates cost N T steps of a 
 """
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -13,6 +14,20 @@ from deimos.goals import picks
 from deimos.goals.fear import Fear
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.sim.env import Env
+
+
+@runtime_checkable
+class SeesWorlds(Protocol):
+    """A selector that wants more than tensors; a training run shows it its worlds before the first choice."""
+
+    def see(self, env: Env, clones: "Clones") -> None:
+        """Take note of the worlds.
+
+        Args:
+            env: The worlds whose goals it chooses; it must not touch them.
+            clones: Where it may try goals, with the mean actions of the policy as it is at the time.
+        """
+        ...
 
 
 class Clones:
@@ -97,4 +112,5 @@ class Oracle(GoalSelector):
             logit = self._fear.score(state, goal, candidates)
             score += logit.argsort(dim=1).argsort(dim=1) / candidates.shape[1]  # ranks: sigmoids would tie at 1
         pick = picks.by_rule(score, draws[:, 0], self._rule, self._percentile)
-        return Proposal(picks.take(candidates, pick), picks.take(score, pick))
+        percentile = picks.percentile(score, pick)
+        return Proposal(picks.take(candidates, pick), picks.take(score, pick), percentile=percentile)

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_range, one_line
 from deimos.goals.methods import method
-from deimos.goals.selector import SelectorConfig
+from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn.threads import on_threads
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
 from deimos.run.loop import GoalLoop, spaces
+from deimos.run.oracle import Clones, SeesWorlds
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
 
@@ -99,6 +100,11 @@ class Trainer:
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
         self.ppo = PPO(config.ppo, config.num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed)
         self.rollout = self.ppo.new_rollout()
+        clones = Clones(lambda count: config.env.build(count, device, config.seed), self.ppo.actor)
+        for part in with_parts(self.loop.selector):
+            if isinstance(part, SeesWorlds):
+                part.see(self.env, clones)
+        self._penalty = self.loop.selector.crash_penalty * self.env.config.largest_reward
         self.iteration = 0
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
         """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""
@@ -147,11 +153,12 @@ class Trainer:
             if self.env.may_go_on_invalid:
                 self.rollout.exclude_invalid()
             _check_obs(self.rollout.obs[-1])
+            self.rollout.reward -= self._penalty * self.rollout.terminated
             clock = _Clock(self)
             learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
             self.ppo.check()
             clock.lap("update")
-            selector = self.loop.selector.learn(self.loop.interactions, self.rollout)
+            selector = self.loop.core.learn(self.rollout)
             self.loop.selector.check()
             clock.lap("selector")
         except SimulationError as error:
@@ -159,7 +166,8 @@ class Trainer:
         rollout = self.rollout
         transitions = rollout.reward.numel()
         crashes = int(rollout.terminated.sum())
-        reward = rollout.reward.mean(dtype=torch.float64).item() + self.env.crash_penalty * crashes / transitions
+        penalty = self.env.crash_penalty + self._penalty
+        reward = rollout.reward.mean(dtype=torch.float64).item() + penalty * crashes / transitions
         return {
             "iteration": self.iteration,
             "env_steps": self.iteration * rollout.num_steps,
@@ -205,7 +213,7 @@ def _identity(config: TrainConfig) -> dict:
 def _completed(identity: dict) -> dict:
     """The identity that an older version wrote, with the defaults of fields that configurations have got since."""
     kinds = {"env": EnvConfig, "selector": SelectorConfig}
-    return identity | {name: to_dict(from_dict(cls, identity[name])) for name, cls in kinds.items()}
+    return identity | {name: to_dict(from_dict(cls, identity[name], stored=True)) for name, cls in kinds.items()}
 
 
 def _check_obs(obs: Tensor) -> None:

@@ -72,7 +72,10 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
         RunError: If the folder exists, or the networks do not fit.
     """
     device = resolve_device(config.device)
-    config = replace(config, threads=config.threads or cores(), device="cuda" if device.type == "cuda" else "cpu")
+    config = replace(
+        config, env=config.env.resolved(device), threads=config.threads or cores(),
+        device="cuda" if device.type == "cuda" else "cpu",
+    )  # fmt: skip
     torch.set_num_threads(config.threads)
     trainer = build(config, device)
     if init_from is not None:
@@ -202,7 +205,7 @@ def read_config(folder: RunFolder) -> TrainConfig:
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise RunError(f"{folder.path / 'config.json'} is not that of a run of schema {SCHEMA}.")
     try:
-        config = from_dict(TrainConfig, data["config"] | {"eval": _today(data["config"].get("eval", {}))})
+        config = from_dict(TrainConfig, data["config"] | {"eval": _today(data["config"].get("eval", {}))}, stored=True)
         kept = {name: str(folder.path / copy) for name, copy in data.get("files", {}).items()}
         return replace(config, env=replace(config.env, **kept)) if kept else config
     except (AttributeError, KeyError, TypeError, ValueError) as error:

@@ -106,6 +106,10 @@ class EnvConfig(abc.ABC):
         """The same task without randomisation and without a penalty for crashes, all goal clocks in step."""
         return replace(self.without_randomness(), crash_penalty=0.0)
 
+    def resolved(self, device: torch.device) -> Self:
+        """The same task with what ``auto`` stands for on a device, so that a run goes on with it elsewhere."""
+        return self
+
     def without_randomness(self) -> Self:
         """The same task with every randomisation switched off and all goal clocks in step."""
         return self

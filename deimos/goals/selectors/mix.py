@@ -48,7 +48,8 @@ class Mix(Delegate):
         return replace(
             own,
             goal=torch.where(free.unsqueeze(1), anything, own.goal),
-            learn=None if own.learn is None else own.learn & ~free,
+            weight=None if own.weight is None else own.weight * ~free,
+            percentile=None if own.percentile is None else own.percentile.masked_fill(free, 50.0),
             score=own.score.masked_fill(free, torch.nan),
             probe=free if own.probe is None else free | own.probe,
             note=None if own.note is None else own.note * ~free,

@@ -84,9 +84,9 @@ class PLR(GoalSelector):
             distance = (candidates - self._level[place].unsqueeze(1)).square().sum(2)
             pick = torch.where(replayed, distance.argmin(1), pick)
             score = torch.where(replayed, self._score[place], score)
-        learn = replayed if self.config.robust else None
+        weight = replayed.float() if self.config.robust else None
         note = (place + 1) * replayed
-        return Proposal(picks.take(candidates, pick), score, learn, probe=~replayed, note=note)
+        return Proposal(picks.take(candidates, pick), score, weight, probe=~replayed, note=note)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Score what has resolved, refresh the levels that were replayed, and keep the best new ones."""

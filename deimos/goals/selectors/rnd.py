@@ -1,5 +1,6 @@
 """Random network distillation over goals (Burda et al., ICLR 2019, arXiv:1810.12894; a rival in the thesis, 4.3)."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,6 +35,8 @@ class Config(SelectorConfig):
     """Units in the hidden layer of the trained network, at least as many, so that it can become the frozen one."""
     features: int = 16
     """Outputs of both networks, at least 1."""
+    whiten: bool = True
+    """Whether inputs are whitened and clipped, as in the paper, or seen as they are."""
     activation: Activation = "relu"
     """Between the layers."""
     learning_rate: float = 1e-3
@@ -88,23 +91,30 @@ class RND(GoalSelector):
         self.generator = generator(seed, "rnd minibatches", spaces.device)
         # Inputs are whitened by the moments of states, active goals and *uniform* candidates; those of the
         # chosen goals would drift with what is chosen.
-        self._uniform = torch.full((spaces.num_envs, spaces.goal_dim), torch.nan, device=spaces.device)
+        shape = spaces.num_envs, spaces.goal_dim
+        self._uniform = torch.full(shape, torch.nan, dtype=torch.float32, device=spaces.device)
         self._moments = torch.zeros(3, inputs, dtype=torch.float64, device=spaces.device)  # count, sum, of squares
-        self._mean, self._scale = torch.zeros(inputs, device=spaces.device), torch.ones(inputs, device=spaces.device)
+        self._mean = torch.zeros(inputs, dtype=torch.float32, device=spaces.device)
+        self._scale = torch.ones_like(self._mean)
         self._context = slice(0, inputs - spaces.goal_dim)
         self._goal = slice(inputs - spaces.goal_dim, inputs)
+        self._clip = CLIP if config.whiten else math.inf
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
         """Whether it has seen anything yet; before, nothing can be whitened."""
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are surprises."""
-        self._uniform[rows] = candidates[:, 0]
+        self.watch(rows, candidates)
         if not self.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         score = self.surprise(state, goal, candidates)
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, 0.0)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
+
+    def watch(self, rows: Tensor, candidates: Tensor) -> None:
+        """Note what uniform goals look like; for the arguments see ``propose``."""
+        self._uniform[rows] = candidates[:, 0].float()
 
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
@@ -114,7 +124,7 @@ class RND(GoalSelector):
         return error[0].square_().mean(2)
 
     def _whiten(self, inputs: Tensor, part: slice) -> Tensor:
-        return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-CLIP, CLIP)
+        return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-self._clip, self._clip)
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
@@ -127,7 +137,9 @@ class RND(GoalSelector):
         if len(uniform) == 0:
             return {"rnd/surprise": float("nan"), "rnd/loss": float("nan")}
         context = torch.cat([state, goal], dim=1)
-        self._observe(torch.cat([context, uniform], dim=1).double())
+        if self.config.whiten:
+            self._observe(torch.cat([context, uniform], dim=1).double())
+        self.fitted = True
         everything = slice(0, len(self._mean))
         inputs = self._whiten(torch.cat([context, next_goal], dim=1), everything)
         target = self._target.forward(inputs)[0]
@@ -143,12 +155,11 @@ class RND(GoalSelector):
         self._mean.copy_(mean)
         # A constant input tells nothing, and would explode on the first change.
         self._scale.copy_(torch.where(variance > 1e-12, variance, torch.inf).rsqrt())
-        self.fitted = True
 
     def _fit(self, inputs: Tensor, target: Tensor) -> float:
         """Adam on the mean squared error; returns that of the last pass."""
         size = -(-len(inputs) // self.config.minibatches)
-        total = torch.zeros((), device=inputs.device)
+        total = torch.zeros((), dtype=torch.float32, device=inputs.device)
         for _ in range(self.config.epochs):
             total.zero_()
             order = torch.randperm(len(inputs), generator=self.generator, device=inputs.device)

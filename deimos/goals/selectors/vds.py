@@ -14,7 +14,7 @@ from torch import Tensor
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions
-from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions
+from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 from deimos.nn.adam import Adam
 from deimos.nn.losses import ValueLoss
 from deimos.nn.mlps import MLPs
@@ -28,8 +28,9 @@ from deimos.nn.seeds import generator
 class Config(SelectorConfig):
     """Goals by the standard deviation of an ensemble's values."""
 
-    rule: Literal["proportional", "argmax", "percentile"] = "proportional"
-    """Draw in proportion to the deviation, take its largest, or draw from above its percentile."""
+    rule: Literal["proportional", "argmax", "percentile", "uniform"] = "proportional"
+    """Draw in proportion to the deviation, take its largest, draw from above its percentile, or never mind it: what
+    the ensemble is worth as a baseline alone."""
     percentile: float = 75.0
     """Share of candidates that ``percentile`` discards, in [0, 100] [%]."""
     role: Literal["replace", "auxiliary"] = "replace"
@@ -58,7 +59,7 @@ class Config(SelectorConfig):
     """Norm that every critic's gradient is clipped to, positive."""
 
     def __post_init__(self) -> None:
-        check_choice("rule", self.rule, ["proportional", "argmax", "percentile"])
+        check_choice("rule", self.rule, ["proportional", "argmax", "percentile", "uniform"])
         check_choice("role", self.role, ["replace", "auxiliary"])
         check_choice("data", self.data, ["all", "share"])
         check_choice("activation", self.activation, ["relu", "elu", "tanh"])
@@ -92,7 +93,7 @@ class VDS(GoalSelector):
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config, self._spaces = config, spaces
-        self.num_candidates = config.candidates
+        self.num_candidates = 1 if config.rule == "uniform" else config.candidates
         inputs, device = spaces.state_dim + spaces.goal_dim, spaces.device
         streams = (generator(seed, f"vds critic {k}") for k in range(config.critics))
         self.nets = MLPs([mlp(inputs, config.hidden, 1, config.activation, weights).to(device) for weights in streams])
@@ -104,6 +105,8 @@ class VDS(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""
+        if self.config.rule == "uniform":
+            return uniform_proposal(candidates, draws[:, 0])
         score = deviation(self.nets.score(state, candidates).squeeze(3))
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, self.config.percentile)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))

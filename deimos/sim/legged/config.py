@@ -5,13 +5,15 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from deimos import plugins, terrain
 from deimos.checks import check_at_least, check_choice, check_positive, check_range
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import LevelRule
 from deimos.sim.env import EnvConfig
-from deimos.sim.legged import robots
-from deimos.sim.legged.engines.mujoco_warp import PhysicsConfig
+from deimos.sim.legged import engines, robots
+from deimos.sim.legged.engines import PhysicsConfig
 from deimos.sim.legged.robots import Robot
 from deimos.terrain import Terrain, importing
 
@@ -24,6 +26,9 @@ class LocomotionConfig(EnvConfig):
     """Who walks, a name of ``deimos.sim.legged.robots``."""
     terrain: str = "flat"
     """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a terrain file (.npz)."""
+    engine: engines.Name = field(default="auto", metadata={"before": "warp"})
+    """What simulates: mujoco-warp, or native, MuJoCo's own C code on all cores of a CPU; auto takes mujoco-warp on CUDA
+    and native on a CPU."""
     goal_period: int = 500
     """T: steps that a goal is active, at least 1 and at most an episode."""
     episode_steps: int = 1000
@@ -68,6 +73,7 @@ class LocomotionConfig(EnvConfig):
                 f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
             )
         check_choice("robot", self.robot, plugins.names(robots))
+        check_choice("engine", self.engine, ["auto", *engines.MODULES])
         check_choice("levels", self.levels, [rule.name.lower() for rule in LevelRule])
         for name, gain in self._gains().items():
             check_positive(name, gain, finite=True)
@@ -88,6 +94,10 @@ class LocomotionConfig(EnvConfig):
         """See ``EnvConfig.largest_reward``: perfect tracking."""
         per_second = max(self.rewards.linear_tracking, 0.0) + max(self.rewards.yaw_tracking, 0.0)
         return per_second * self.physics.control_period
+
+    def resolved(self, device: torch.device) -> "LocomotionConfig":
+        """See ``EnvConfig.resolved``."""
+        return replace(self, engine=engines.resolve(self.engine, device))
 
     def without_randomness(self) -> "LocomotionConfig":
         """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns."""

@@ -36,8 +36,10 @@ from deimos.kernels.legged.state import (
 from deimos.kernels.legged.step import apply_actions, evaluate_step
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.sim.env import ObsField
+from deimos.sim.legged import engines
 from deimos.sim.legged.config import LocomotionConfig
-from deimos.sim.legged.engines.mujoco_warp import Captured, Physics
+from deimos.sim.legged.engines import Physics
+from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.goal_parts import GoalPart, velocity_goal
 from deimos.sim.legged.robots import Robot
 from deimos.sim.shared import warp_device
@@ -118,8 +120,8 @@ class Locomotion(WarpEnv):
         u = self._draw.array.numpy().astype(np.float64)
         low, high = config.friction
         varied = high > low or low != 1.0
-        return Physics(
-            self.robot, ground, n, self.device, config.physics,
+        return engines.build(
+            config.engine, self.robot, ground, n, self.device, config.physics,
             friction=low + (high - low) * u[:, 0] if varied else None,
             payload=config.payload * (2.0 * u[:, 1] - 1.0) if config.payload > 0 else None,
         )  # fmt: skip
@@ -176,7 +178,7 @@ class Locomotion(WarpEnv):
 
     def _begin(self) -> None:
         """Record step and reset, each as one graph, and begin every world's first episode."""
-        run_step = Captured(self._run_step, self.device)
+        run_step = self.physics.record_step(partial(apply_actions, self.legged), self._finish_step)
 
         def step() -> None:
             run_step()
@@ -188,11 +190,9 @@ class Locomotion(WarpEnv):
             raise ValueError(f"At most one part may restrict which goals are valid, got {len(validations)}.")
         valid_goals = partial(validations[0], self._row.array, self._candidate_scale.array) if validations else None
         self.begin(step, Captured(self._run_reset, self.device), valid_goals=valid_goals)
-        self.physics.buffer_use()  # what the recording needed says nothing about these worlds
+        self.physics.report()  # what the recording needed says nothing about these worlds
 
-    def _run_step(self) -> None:
-        apply_actions(self.legged)
-        self.physics.step()
+    def _finish_step(self) -> None:
         for part in self._launches:
             part.evaluate()
         evaluate_step(self.legged)
@@ -230,13 +230,11 @@ class Locomotion(WarpEnv):
         means = (self._sums / (steps * self.num_envs)).tolist()
         self._sums.zero_()
         invalid, self.invalid_steps = self.invalid_steps, 0
-        use = self.physics.buffer_use()
         return {
             **{f"reward/{name}": value for name, value in zip(self.columns, means, strict=True)},
             "level": self.tensors["level"].float().mean().item(),
             "invalid_steps": invalid,
-            "contact_use": use["contacts"] / use["max_contacts"],
-            "row_use": use["rows"] / use["max_rows"],
+            **self.physics.report(),
             **{_error_name(name): error.mean().item() for name, error in self.errors.items()},
         }
 

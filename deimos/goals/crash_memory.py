@@ -1,0 +1,100 @@
+"""Crashes of the past, each with survivals of the same time.
+
+A policy that becomes safe stops crashing, and a network that learns from the last 2 T steps alone stops learning with
+it. Old crashes beside young survivals would teach something else: to tell *when* a state was met. So every crash is
+kept together with survivals that were issued in the same rollout, and both fade alike.
+"""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from deimos.goals.interactions import Resolved
+from deimos.nn.seeds import generator
+from deimos.nn.stateful import Stateful
+
+PARTNERS = 3  # survivals that are kept with every crash
+HALF_LIFE = 10  # periods of T steps after which a crash and its partners weigh half
+PRESENT = 0.15  # share of the survivals' weight that the youngest have: alone they raise the AUROC of age by half of it
+YOUNGEST = 512  # of them, drawn from the window
+
+
+class CrashMemory(Stateful):
+    """A bounded number of crashes with their partners; the oldest make way for new ones.
+
+    Args:
+        capacity: Crashes that are kept, at least 1.
+        period: T, in steps: what was issued that long ago is known to have crashed or survived.
+        width: Components of a row: what the network sees of an interaction, and whatever else belongs to it.
+        device: Where they are kept.
+        seed: Seed of which survivals are kept.
+    """
+
+    saved: ClassVar[tuple[str, ...]] = ("_crash", "_partners", "_issued", "stored", "_upto", "generator")
+
+    def __init__(self, capacity: int, period: int, width: int, device: torch.device, seed: int) -> None:
+        self._period = period
+        self._crash = torch.zeros(capacity, width, dtype=torch.float32, device=device)
+        self._partners = torch.zeros(capacity, PARTNERS, width, dtype=torch.float32, device=device)
+        self._issued = torch.zeros(capacity, dtype=torch.int64, device=device)
+        self.stored = 0
+        """Crashes stored so far, those that have made way included."""
+        self._upto = -1  # step that interactions have been looked at up to
+        self.generator = generator(seed, "crash memory", device)
+
+    @torch.no_grad()
+    def store(self, rows: Tensor, window: Resolved, now: int) -> None:
+        """Take over the new crashes among what was issued at least T steps ago, each with survivals of that time.
+
+        Of what was issued later only the crashes are known yet. Crashes of a time without survivals wait for some.
+
+        Args:
+            rows: What to keep of every interaction of the window, shape (n, width).
+            window: The recently resolved interactions.
+            now: Steps so far.
+        """
+        upto = now - self._period
+        new = (window.issued > self._upto) & (window.issued <= upto)
+        crashed, survived = ((new & own).nonzero().squeeze(1) for own in (window.crashed, ~window.crashed))
+        if len(crashed) and not len(survived):
+            return
+        self._upto = max(upto, self._upto)
+        if not len(crashed):
+            return
+        capacity = len(self._issued)
+        crashed = crashed[window.issued[crashed].argsort(stable=True)][-capacity:]  # the newest, in their order
+        count = len(crashed)
+        order = torch.randperm(len(survived), generator=self.generator, device=rows.device)
+        every = torch.arange(count * PARTNERS, device=rows.device)
+        place = (self.stored + every[:count]) % capacity
+        self._crash[place] = rows[crashed]
+        self._partners[place] = rows[survived[order[every % len(survived)]]].view(count, PARTNERS, -1)
+        self._issued[place] = window.issued[crashed]
+        self.stored += count
+
+    def sample(self, rows: Tensor, window: Resolved) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What to learn from.
+
+        Args:
+            rows: Rows of the window, shape (n, width); some of its survivals join the memory's.
+            window: The recently resolved interactions.
+
+        Returns:
+            Rows, shape (m, width); whether each is a crash, bool; its weight within its class, at least 0; and the
+            step that it was issued after, int64, shape (m,) each.
+        """
+        count = min(self.stored, len(self._issued))
+        issued = self._issued[:count]
+        youngest = (~window.crashed).nonzero().squeeze(1)
+        order = torch.randperm(len(youngest), generator=self.generator, device=rows.device)
+        youngest = youngest[order[:YOUNGEST]]
+        age = self._issued.amax() - issued  # only how they compare matters, and the newest weighs 1
+        weight = torch.exp2(age.float() / (-HALF_LIFE * self._period))
+        present = PRESENT if len(youngest) else 0.0
+        partners = weight.repeat_interleave(PARTNERS) * ((1.0 - present) / PARTNERS)
+        fresh = (weight.sum() * present / max(1, len(youngest))).expand(len(youngest))
+        inputs = torch.cat([self._crash[:count], self._partners[:count].flatten(0, 1), rows[youngest]])
+        crashed = torch.arange(len(inputs), device=rows.device) < count
+        steps = torch.cat([issued, issued.repeat_interleave(PARTNERS), window.issued[youngest]])
+        return inputs, crashed, torch.cat([weight, partners, fresh]), steps

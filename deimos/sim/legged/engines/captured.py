@@ -1,0 +1,56 @@
+"""Launches that are recorded once and replayed as one graph."""
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+import warp as wp
+
+from deimos.sim.shared import warp_device
+
+PATIENCE = 3.0  # [s] of silence before the first step says what it waits for
+
+
+class Captured:
+    """Launches that were recorded once, to be replayed as one graph.
+
+    Args:
+        launch: Makes the launches. Run once before it is recorded, which compiles what has to be compiled,
+            and once or not at all while it is: whatever it changes has to be set anew afterwards.
+        device: Where they run.
+    """
+
+    def __init__(self, launch: Callable[[], None], device: torch.device) -> None:
+        with wp.ScopedDevice(warp_device(device)):
+            with _say_what_it_waits_for():
+                launch()
+            with wp.ScopedCapture() as capture:
+                launch()
+        self._graph = capture.graph
+
+    def __call__(self) -> None:
+        """Replay the launches."""
+        wp.capture_launch(self._graph)
+
+
+@contextmanager
+def _say_what_it_waits_for() -> Iterator[None]:
+    """Say that the simulator is being compiled where that takes some seconds; Warp does it in folders of its cache."""
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(PATIENCE):
+            if any(Path(wp.config.kernel_cache_dir or "").glob(f"*_p{os.getpid()}_t*")):
+                message = "Compiling the simulator for this machine, which takes a minute or two, once."
+                print(message, file=sys.stderr, flush=True)
+                return
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
