@@ -17,6 +17,7 @@ from deimos.checks import RunError
 
 HOLDS = {
     "deimos.envs": ("dataclass", "Config"), "deimos.selectors": ("dataclass", "Config"),
+    "deimos.attackers": ("dataclass", "Config"),
     "deimos.robots": ("function", "build"), "deimos.shapes": ("dataclass", "Shape"),
 }  # fmt: skip
 """What every plug-in of a group holds, and its name."""

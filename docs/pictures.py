@@ -24,7 +24,7 @@ from deimos.goals import picks
 from deimos.goals.fear_selector import fear_selector
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
-from deimos.run import evaluation, training
+from deimos.run import attack, evaluation, training
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig
@@ -82,9 +82,10 @@ class Scene:
         self.policy = deimos.load_policy(self.run).scaled
         trainer = training.load(RunFolder.open(self.run), training.read_config(RunFolder.open(self.run)))
         self.director = fear_selector(trainer.loop.selector)
-        eval_config = evaluation.EvalConfig(worlds=500)
+        target = evaluation.make_target(self.policy, config.env, evaluation.EvalConfig(worlds=500), CPU)
+        fear, _ = attack.learn_fear(target, target.steps, own_goals=False)
         env = config.env.build(500, CPU, 1)
-        self.adversary = evaluation.argmax_director(env, evaluation.train_adversary(self.policy, env, eval_config)[0])
+        self.adversary = attack.argmax_director(env, fear)
         self.naive = uniform.Config().build(spaces(env), 0)
         self.films = {"naive": self.film(self.naive), "adversary": self.film(self.adversary)}
 

@@ -19,7 +19,8 @@ from torch import Tensor
 from deimos.goals import picks
 from deimos.goals.fear import Fear
 from deimos.goals.selector import GoalSelector, Proposal, uniform_proposal
-from deimos.run.evaluation import EvalConfig, argmax_director, play, train_adversary
+from deimos.run.attack import argmax_director, learn_fear
+from deimos.run.evaluation import EvalConfig, make_target, play
 from deimos.run.folder import RunFolder
 from deimos.run.oracle import Clones, Oracle
 from deimos.run.training import load, read_config
@@ -68,7 +69,8 @@ def measure(path: Path) -> tuple[list[list[float]], list[float]]:
     def worlds() -> Env:
         return env_config.build(WORLDS, cpu, evaluation.seed)
 
-    fear, _ = train_adversary(act, env_config.build(evaluation.worlds, cpu, evaluation.seed + 1), evaluation)
+    target = make_target(act, config.env, evaluation, cpu)
+    fear, _ = learn_fear(target, 4 * target.steps, own_goals=True)
     clones = Clones(lambda count: env_config.build(count, cpu, evaluation.seed), act)
     env = worlds()
     watcher = Watcher(env, clones, fear)

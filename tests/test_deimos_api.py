@@ -22,7 +22,7 @@ def run(tmp_path_factory):
     """A small run that a program has made."""
     config = deimos.TrainConfig(
         env=particle.Config(goal_period=8), ppo=PPOConfig(hidden=(8,)), num_envs=16, env_steps=48, device="cpu",
-        threads=1, eval=EvalConfig(worlds=16, steps=40, adversary_steps=20, adversary_patience=1),
+        threads=1, eval=EvalConfig(worlds=16, steps=40, adversary_steps=20),
     )  # fmt: skip
     before = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -36,10 +36,14 @@ def run(tmp_path_factory):
 
 def test_a_program_trains_evaluates_and_acts(run):
     """Three calls lead from a configuration to actions; the evaluation is kept beside the one of the run's end."""
-    assert [row["goals"] for row in RunFolder(run).read_json("evaluation.json")] == ["naive", "adversary"]
+    assert [row["goals"] for row in RunFolder(run).read_json("evaluation.json")] == [
+        "naive", "argmax", "scripted",
+    ]  # fmt: skip
     rows = deimos.evaluate(run, goal_period=10, seed=3)
-    assert [(row["goals"], row["goal_period"], row["seed"]) for row in rows] == [("naive", 10, 3), ("adversary", 10, 3)]
-    assert len(RunFolder(run).read_json("evaluation.json")) == 4
+    assert [(row["goals"], row["goal_period"], row["seed"]) for row in rows] == [
+        ("naive", 10, 3), ("argmax", 10, 3), ("scripted", 10, 3),
+    ]  # fmt: skip
+    assert len(RunFolder(run).read_json("evaluation.json")) == 6
     policy = deimos.load_policy(run)
     assert policy(torch.zeros(5, 12)).shape == (5, 3)
 
@@ -53,15 +57,15 @@ def test_the_same_evaluation_replaces_its_rows(run):
 
 @pytest.mark.parametrize("changes", [{"worlds": 8}, {"adversary_steps": 30}])
 def test_another_evaluation_stands_beside(run, changes):
-    """An evaluation of other sizes, or by an Adversary that was trained otherwise, leaves the earlier rows alone."""
+    """An evaluation of other sizes, or by attackers that were made otherwise, leaves the earlier rows alone."""
     large = deimos.evaluate(run)
     before = RunFolder(run).read_json("evaluation.json")
     small = deimos.evaluate(run, **changes)
     after = RunFolder(run).read_json("evaluation.json")
-    for row in (*large, small[1]):
+    for row in (*large, small[1], small[2]):
         key = {name: row[name] for name in ("goals", "worlds", "reward", "crashes", "adversary_setting") if name in row}
         assert sum(each.items() >= key.items() for each in after) == 1, key
-    assert len(after) == len(before) + (1 if "worlds" not in changes else 2)
+    assert len(after) == len(before) + (2 if "worlds" not in changes else 3)
 
 
 @pytest.mark.parametrize(
@@ -90,8 +94,10 @@ def test_policy_of_an_old_run_acts_and_is_evaluated(tmp_path):
     shutil.copytree(OLD, path)
     assert deimos.load_policy(path)(torch.zeros(2, 12)).shape == (2, 3)
     rows = deimos.evaluate(path, worlds=8)
-    assert [row["worlds"] for row in rows] == [8, 8]
-    assert len(RunFolder(path).read_json("evaluation.json")) == 4
+    assert [row["worlds"] for row in rows] == [8, 8, 8]
+    assert [row["goals"] for row in RunFolder(path).read_json("evaluation.json")] == [
+        "naive", "adversary", "naive", "argmax", "scripted",
+    ]  # fmt: skip
 
 
 def test_an_old_run_is_resumed_or_refused_in_one_line(tmp_path, capsys):

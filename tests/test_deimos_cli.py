@@ -30,7 +30,7 @@ HOME = Path(deimos.__file__).resolve().parent.parent
 # A run of a second, evaluated in another.
 TINY = (
     "--num-envs 32 --env-steps 48 --threads 1 --device cpu --env.goal-period 10 --ppo.hidden 16 16 --eval.worlds 32 "
-    "--eval.steps 40 --eval.adversary-steps 20 --eval.adversary-patience 1"
+    "--eval.steps 40 --eval.adversary-steps 20"
 ).split()
 
 TRAIN_ERRORS = {
@@ -517,8 +517,8 @@ def test_run_leaves_its_files(finished):
         "config.json", "progress.csv", "timing.csv", "checkpoint.pt", "policy.pt", "evaluation.json", "summary.png",
     }  # fmt: skip
     assert out.splitlines()[-1] == str(path)
-    assert re.search(r"uniform goals +feared goals\n +\(Naive\) +\(Adversary\)\n", out)
-    assert re.search(r"\n\nUnder uniform goals .* of the goals end in a crash; the Adversary, .*\n", out)
+    assert re.search(r"uniform goals +attacked by +attacked by\n +\(Naive\) +argmax +scripted\n", out)
+    assert re.search(r"\n\nUnder uniform goals .* of the goals end in a crash; argmax .*; scripted .*\n", out)
     assert re.search(r"\nTraining took \d+\.\d s: env \d+%, policy ", out)
     assert (path / "summary.png").read_bytes().startswith(b"\x89PNG")
     folder = RunFolder(path)
@@ -530,7 +530,7 @@ def test_run_leaves_its_files(finished):
     config = from_dict(TrainConfig, data["config"])
     assert (config.method, config.num_envs, config.env.goal_period, config.eval.worlds) == ("p50", 32, 10, 32)
     assert deimos.load_policy(path).hidden == (16, 16)
-    assert [row["goals"] for row in folder.read_json("evaluation.json")] == ["naive", "adversary"]
+    assert [row["goals"] for row in folder.read_json("evaluation.json")] == ["naive", "argmax", "scripted"]
 
 
 def test_progress_holds_no_time(finished):
@@ -552,12 +552,13 @@ def test_evaluating_again_adds_and_never_duplicates(copied, capsys):
 
     assert cli.main(["evaluate", str(copied), "--goal-period", "5"]) == 0
     second = RunFolder(copied).read_json("evaluation.json")
-    assert second[:2] == first
-    assert [(row["goals"], row["goal_period"]) for row in second[2:]] == [("naive", 5), ("adversary", 5)]
+    assert second[:3] == first
+    goals = [(row["goals"], row["goal_period"]) for row in second[3:]]
+    assert goals == [("naive", 5), ("argmax", 5), ("scripted", 5)]
 
     assert cli.main(["evaluate", str(copied)]) == 0
     third = RunFolder(copied).read_json("evaluation.json")
-    assert len(third) == 4
+    assert len(third) == 6
     assert all(row in third for row in second)
     assert {name: (copied / name).read_bytes() for name in keep} == before
     assert not list(copied.glob("*.partial"))

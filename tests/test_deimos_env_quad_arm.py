@@ -241,7 +241,7 @@ def test_presets():
     assert "quad_arm" not in presets.names()
     stand = presets.preset("quad-arm-stand")
     assert (stand.env.noise, stand.ppo.discount, stand.ppo.hidden) == (False, 0.95, (256, 128, 64))
-    assert (stand.eval.worlds, stand.eval.adversary_enough) == (256, "any")
+    assert (stand.eval.worlds, stand.eval.steps) == (256, 1000)
     assert presets.preset("quad-arm-large").env.terrain == "rough"
 
 

@@ -1,18 +1,17 @@
-"""The evaluation of policies: what is counted, the score, and the Adversary."""
+"""The evaluation of policies: what is counted, the score, the worst attacker, and audits of fear."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 
 from deimos.checks import RunError, SimulationError
-from deimos.goals.fear import Fear, FearConfig, auroc
-from deimos.goals.interactions import Resolved
+from deimos.goals.fear import FearConfig, auroc
 from deimos.goals.selectors import uniform
 from deimos.nn.networks import mlp
+from deimos.run.attack import learn_fear
 from deimos.run.audit import CANDIDATES, _Explorer, _next_contexts, audit_fear
-from deimos.run.evaluation import EvalConfig, _Collector, _quality, evaluate, play, train_adversary, weights_hash
+from deimos.run.evaluation import EvalConfig, evaluate, make_target, play, weights_hash, worst
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
 from deimos.run.trainer import TrainConfig, Trainer
@@ -20,10 +19,7 @@ from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
 VARIANTS = ["absolute", "directional", "relative"]
-SMALL = EvalConfig(
-    worlds=64, steps=400, adversary_steps=300, adversary_interactions=100, adversary_crashes=10, adversary_patience=2,
-    fear=FearConfig(epochs=10, min_per_class=8),
-)  # fmt: skip
+SMALL = EvalConfig(worlds=64, steps=400, adversary_steps=300, fear=FearConfig(epochs=10, min_per_class=8))
 
 
 def naive(env):
@@ -78,7 +74,7 @@ def test_play_counts_what_a_plain_loop_counts():
             age[world] += 1
             if crashed or age[world] == period:
                 if not is_first[world]:
-                    ended.append((issued[world], crashed, gained[world] / period))
+                    ended.append((issued[world], crashed, gained[world] / period, world))
                 is_first[world], age[world], gained[world], issued[world] = crashed, 0, 0.0, t
         loop.advance(step)
     in_time = [item for item in ended if item[0] <= steps - period]
@@ -87,9 +83,12 @@ def test_play_counts_what_a_plain_loop_counts():
     assert found["first_goal_steps"] == first_steps
     assert found["first_goal_crashes"] == first_crashes
     assert found["interactions"] == len(in_time)
-    assert found["interaction_crashes"] == sum(crashed for _, crashed, _ in in_time)
+    assert found["interaction_crashes"] == sum(crashed for _, crashed, _, _ in in_time)
+    even = [crashed for _, crashed, _, world in in_time if world % 2 == 0]
+    assert 0 < sum(even) < found["interaction_crashes"]
+    assert (found["even_interactions"], found["even_interaction_crashes"]) == (len(even), sum(even))
     assert found["reward"] == pytest.approx(total / (steps * worlds), rel=1e-6)
-    assert found["return_per_step"] == pytest.approx(sum(gain for *_, gain in in_time) / len(in_time), rel=1e-5)
+    assert found["return_per_step"] == pytest.approx(sum(gain for _, _, gain, _ in in_time) / len(in_time), rel=1e-5)
 
 
 def test_errors_are_read_at_the_end_of_goals():
@@ -108,85 +107,6 @@ def test_errors_of_nobody_are_nan():
     assert math.isnan(row["errors"]["clock [steps]"])
 
 
-def test_the_adversary_finds_what_crashes_a_policy():
-    """Against a follower with a blind side it learns to rank goals and crashes it more often than Naive does."""
-    config = particle.Config()
-    follow = config.build(1, CPU, 0).reference_policy()
-
-    blind = config.build(1, CPU, 0).reference_policy(brake=False)
-
-    def policy(obs):
-        action = follow(obs)
-        action[:, 0] = torch.where(obs[:, 9] > 0, blind(obs)[:, 0], action[:, 0])
-        return action
-
-    rows = evaluate(policy, config, EvalConfig(
-        worlds=100, steps=1000, adversary_steps=1000, adversary_interactions=500, adversary_crashes=20,
-        fear=FearConfig(epochs=20, min_per_class=8),
-    ), CPU)  # fmt: skip
-    naive_row, attacked = rows
-    assert attacked["adversary_auroc"] > 0.8
-    assert attacked["crash_rate"] > 1.3 * naive_row["crash_rate"] > 0
-
-
-def held_out(probe, crashed):
-    """Interactions of which only the kind of the goal and the outcome are known; states hold the kind."""
-    probe, crashed = torch.tensor(probe), torch.tensor(crashed)
-    nothing = torch.zeros(len(probe))
-    return Resolved(
-        env=nothing.long(), state=torch.stack([probe.float(), crashed.float()], dim=1), goal=nothing.unsqueeze(1),
-        next_goal=nothing.unsqueeze(1), score=nothing, reward=nothing, tracking=nothing, probe=probe,
-        note=nothing.long(), crashed=crashed, issued=nothing.long(), resolved=nothing.long(),
-        horizon=nothing.long() + 1,
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("column", "probe", "crashed", "expected"),
-    [
-        (0, [True] * 6 + [False] * 6, [True] + [False] * 5 + [True] * 5 + [False], 0.5),  # it knows the kind alone
-        (1, [True] * 6 + [False] * 6, [True] + [False] * 5 + [True] * 5 + [False], 1.0),
-        (1, [True] * 6 + [False] * 6, [False] * 9 + [True] * 3, 1.0),  # only its own goals crash the policy
-        (1, [True] * 6 + [False] * 6, [False] * 6 + [True] * 6, math.nan),  # no kind has both outcomes
-        (1, [True] * 6, [False] * 6, math.nan),
-    ],
-)
-def test_the_adversary_is_judged_within_each_kind_of_goals(column, probe, crashed, expected):
-    """To know which goals are its own is worth nothing, and where one kind never crashes the other one counts."""
-    network = SimpleNamespace(fitted=True, score=lambda state, goal, candidates: state[:, column : column + 1])
-    assert _quality(network, held_out(probe, crashed)) == pytest.approx(expected, nan_ok=True)
-    assert math.isnan(_quality(SimpleNamespace(fitted=False), held_out(probe, crashed)))
-
-
-def test_the_adversarys_uniform_goals_are_marked():
-    """While it collects, about half of its goals are Uniform's, and these are the ones that are marked as probes."""
-    env = particle.Config().build(400, CPU, 0)
-    fear = Fear(FearConfig(), env.state_dim, env.goal_dim, CPU, 0)
-    fear.fitted = True
-    collector, rows = _Collector(env, fear), torch.arange(400)
-    candidates, draws = env.sample_goals(rows, collector.num_candidates).clone(), env.draw(rows)
-    arguments = (rows, env.state(env.obs), env.goal, candidates, draws)
-    proposal, free = collector.propose(*arguments), naive(env).propose(*arguments)
-    same = (proposal.goal == free.goal).all(1)
-    assert bool(same[proposal.probe].all())
-    assert same[~proposal.probe].float().mean() < 0.1  # one of a hundred candidates, by chance
-    assert abs(proposal.probe.sum().item() - 200) < 4 * 10
-
-
-def test_collecting_continues_until_there_is_enough():
-    """The collection ends at its steps where they suffice, and at its patience where a policy never crashes."""
-    env = particle.Config(goal_period=50).build(64, CPU, 0)
-    fear, facts = train_adversary(lambda obs: torch.zeros(64, 3), env, SMALL)
-    assert facts["adversary_steps"] == SMALL.adversary_steps * SMALL.adversary_patience
-    assert facts["adversary_crashes"] == 0
-    assert math.isnan(facts["adversary_auroc"])
-    assert not fear.fitted
-    env = particle.Config(goal_period=50, max_speed=20.0).build(64, CPU, 0)
-    fear, facts = train_adversary(env.reference_policy(brake=False), env, SMALL)
-    assert facts["adversary_steps"] == SMALL.adversary_steps
-    assert fear.fitted
-
-
 def test_policies_meet_the_same_goals():
     """Evaluating twice gives the same numbers, and another seed gives others."""
     config = particle.Config()
@@ -195,6 +115,41 @@ def test_policies_meet_the_same_goals():
     assert str(first) == str(again)
     other = evaluate(policy, config, EvalConfig(**(vars(SMALL) | {"seed": 4})), CPU)
     assert other[0]["reward"] != first[0]["reward"]
+
+
+def attacked(goals, even, odd, count=100):
+    """A row: crashes of 100 interactions each in worlds of even and of odd number."""
+    return {
+        "goals": goals, "interactions": 2 * count, "interaction_crashes": even + odd, "even_interactions": count,
+        "even_interaction_crashes": even,
+    }  # fmt: skip
+
+
+def test_the_worst_is_chosen_on_some_worlds_and_reported_on_others():
+    """It is the attacker that crashes most in even worlds; the rate is that in odd ones, which may be a smaller one."""
+    rows = [attacked("naive", 99, 99), attacked("argmax", 30, 10), attacked("scripted", 20, 40)]
+    assert worst([rows]) == [{"attacker": "argmax", "crash_rate": 0.1, "interactions": 100}]
+    assert worst([rows, [attacked("scripted", 0, 1)]]) == [
+        {"attacker": "scripted", "crash_rate": 0.4, "interactions": 100},
+        {"attacker": "scripted", "crash_rate": 0.01, "interactions": 100},
+    ]
+
+
+def test_there_is_no_worst_of_nothing():
+    """Policies that met no attacker in common have none, nor have rows of 0.1.0, which do not tell worlds apart."""
+    assert worst([[attacked("argmax", 1, 1)], [attacked("scripted", 1, 1)]]) == []
+    assert worst([[{"goals": "adversary", "interactions": 10, "interaction_crashes": 1}]]) == []
+    assert worst([]) == []
+
+
+def test_the_worst_of_equals_is_not_too_large():
+    """The larger of two noisy rates of the same size is too large; the one that is reported is not."""
+    generator = torch.Generator().manual_seed(0)
+    crashes = torch.binomial(torch.full((1000, 4), 100.0), torch.full((1000, 4), 0.1), generator).long().tolist()
+    rows = [[attacked("argmax", a, b), attacked("scripted", c, d)] for a, b, c, d in crashes]
+    rates = torch.tensor([found["crash_rate"] for found in worst(rows)])
+    largest = torch.tensor([max(a + b, c + d) / 200 for a, b, c, d in crashes])
+    assert largest.mean() > 0.11 > 0.103 > rates.mean() > 0.097
 
 
 def test_steps_must_fit_an_interaction():
@@ -228,8 +183,8 @@ def test_the_audit_ranks_within_contexts():
     follow = trainer.env.reference_policy(brake=False)
     trainer.ppo.actor.forward = follow
     trainer.ppo.actor.std.data.fill_(0.0)
-    enough = EvalConfig(adversary_steps=1000, adversary_interactions=0, adversary_crashes=0)
-    trainer.loop.selector.fear, _ = train_adversary(follow, config.env.build(256, CPU, 1), enough)
+    target = make_target(follow, config.env, EvalConfig(worlds=256, adversary_steps=1000), CPU)
+    trainer.loop.selector.fear, _ = learn_fear(target, target.steps, own_goals=True)
     audit = audit_fear(trainer, 20)
     assert audit["contexts"] >= 20
     assert 0.8 < audit["low"] <= audit["auroc"] <= audit["high"] <= 1.0
@@ -267,6 +222,9 @@ def test_the_audit_is_exact():
         ("steps", -1, "steps must be at least 1, got -1"),
         ("seed", -1, "seed must be in .*, got -1"),
         ("seed", 2**32, "seed must be in .*, got 4294967296"),
+        ("oracle_worlds", 0, "oracle_worlds must be at least 1, got 0"),
+        ("attackers", ("nobody",), "There is no attacker 'nobody'; there are: argmax, argmax-long, .*scripted"),
+        ("attackers", ("argmax", "argmax"), "attackers must be different, got argmax, argmax"),
     ],
 )
 def test_config_rejects(field, value, message):

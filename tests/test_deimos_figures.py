@@ -57,7 +57,7 @@ def test_evaluations_stand_beside_each_other():
     assert len(axes.patches) == 6
     assert [text.get_text() for text in axes.get_legend().texts] == [
         "uniform goals (Naive)",
-        "feared goals (Adversary)",
+        "attacked by adversary",
     ]
 
 

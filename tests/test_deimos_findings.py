@@ -19,8 +19,16 @@ def evaluated(naive=0.005, adversary=0.36, **more):
     collection = {"adversary_interactions": 20_000, "adversary_crashes": 1500, "adversary_auroc": 0.97}
     return [
         shared | {"goals": "naive", "crash_rate": naive} | more,
-        shared | collection | {"goals": "adversary", "crash_rate": adversary, "weak_adversary": False} | more,
+        shared | collection | {"goals": "argmax", "crash_rate": adversary, "uninformed": False} | more,
     ]
+
+
+def attacked(goals, even, odd):
+    """A row of an attacker that crashed so many of 100 goals each in worlds of even and of odd number."""
+    return evaluated(adversary=(even + odd) / 200)[1] | {
+        "goals": goals, "interactions": 200, "interaction_crashes": even + odd, "even_interactions": 100,
+        "even_interaction_crashes": even,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -58,7 +66,7 @@ def test_everything_is_described_in_words():
     assert lines["goals that ended in a crash"] == ["0.5", "%", "36", "%"]
     assert lines["goals"] == ["38,000", "38,000"]
     assert lines["crashes per 1000 steps"] == ["0.0475", "0.0475"]
-    assert lines["goals that the Adversary learnt from"] == ["-", "20,000"]
+    assert lines["goals that the attacker learnt from"] == ["-", "20,000"]
     assert "robot-minute" not in text
     assert "tracking" not in text  # of a goal in one part it is the reward
 
@@ -85,19 +93,26 @@ def test_rows_of_an_earlier_version_are_described():
 @pytest.mark.parametrize(
     ("rows", "sentence"),
     [
-        (evaluated(), "Under uniform goals 0.5 % of the goals end in a crash; the Adversary, .*, raises that to 36 %."),
+        (evaluated(), "Under uniform goals 0.5 % of the goals end in a crash; argmax raises that to 36 %."),
         (evaluated(0.0, 0.2), "Under uniform goals none of the goals end in a crash; .* raises that to 20 %."),
-        (evaluated(0.3, 0.3), ".* 30 % of the goals end in a crash; the Adversary, .*, gets no more than 30 %."),
-        (evaluated(0.0, 0.0), ".* none of the goals end in a crash; the Adversary, .*, gets no more than 0 %."),
-        (evaluated(weak_adversary=True), r".* 36 %\. It is too weak an Adversary to prove anything: .*"),
+        (evaluated(0.3, 0.3), ".* 30 % of the goals end in a crash; argmax gets no more than 30 %."),
+        (evaluated(0.0, 0.0), ".* none of the goals end in a crash; argmax gets no more than 0 %."),
+        (
+            [evaluated()[0], evaluated(uninformed=True)[1]],
+            r".* 36 %\. Goals of argmax are uniform: there was nothing to learn from, so they prove nothing\.",
+        ),
+        (
+            [evaluated()[0], attacked("argmax", 40, 10), attacked("scripted", 20, 30)],
+            r".* scripted raises .* 25 %\. The worst attacker is argmax: 10 % in the worlds that did not choose it\.",
+        ),
         (evaluated(math.nan), "No goal was pursued to its end, so nothing can be said of crashes."),
         (evaluated(None), "No goal was pursued to its end, so nothing can be said of crashes."),
         (
             [*evaluated(), evaluated()[0] | {"goals": "oracle", "crash_rate": 0.5}],
-            ".* raises that to 36 %; the oracle, .*, raises that to 50 %.",
+            ".* raises that to 36 %; oracle raises that to 50 %.",
         ),
     ],
 )
 def test_a_sentence_says_what_it_means(rows, sentence):
-    """The last words are what the shares of crashes mean; that a weak Adversary proves nothing is among them."""
+    """The last words are what the shares of crashes mean; an attacker that knew nothing and the worst one are named."""
     assert re.fullmatch(sentence, conclude(rows))

@@ -543,8 +543,7 @@ CONFIGS = {
             hidden=(3, 2, 1), activation="elu", init_std=0.7,
         ),
         eval=EvalConfig(
-            worlds=3, steps=99, seed=0, adversary_steps=4, adversary_interactions=0, adversary_crashes=0,
-            adversary_patience=1, adversary_enough="any", oracle_worlds=2,
+            worlds=3, steps=99, seed=0, adversary_steps=4, attackers=("oracle",), oracle_worlds=2, pool=Path("pool.pt"),
             fear=FearConfig(
                 hidden=(9, 9, 9), activation="elu", learning_rate=1.0, epochs=1, minibatches=1, min_per_class=9,
                 workspace=1,

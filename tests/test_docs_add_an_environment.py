@@ -61,7 +61,7 @@ def test_it_trains_is_evaluated_and_resumes(cart, tmp_path, monkeypatch):
     assert cli.main([*train, *SMALL[2:], "--no-evaluation"]) == 0
     assert cli.main(evaluate) == 0
     evaluation = RunFolder(tmp_path / "runs/cart").read_json("evaluation.json")
-    assert [row["goals"] for row in evaluation] == ["naive", "adversary"]
+    assert [row["goals"] for row in evaluation] == ["naive", "argmax", "scripted"]
     assert cli.main(resume) == 0
     rows = RunFolder(tmp_path / "runs/cart").read_csv("progress.csv")
     assert [row["env_steps"] for row in rows] == ["24", "48", "72", "96"]

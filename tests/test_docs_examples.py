@@ -39,23 +39,24 @@ CRASHING = {
 """Of particles, so fast that there are crashes to learn from; some commands need a fear network."""
 TRAINING = {
     "--num-envs": "16", "--env-steps": "48", "--env.goal-period": "5", "--eval.worlds": "8", "--eval.steps": "100",
-    "--eval.adversary-steps": "20", "--eval.adversary-patience": "1", "--threads": "1", "--device": "cpu",
+    "--eval.adversary-steps": "20", "--threads": "1", "--device": "cpu",
 }  # fmt: skip
 BUDGETS = {
     "train": TRAINING,
     "resume": {"--env-steps": "192"},
     "evaluate": {"--oracle-worlds": "4", "--calibration": "100", "--contexts": "2"},
+    "pool": {"--worlds": "16", "--adversary-steps": "60"},
     "study run": {"--methods": "uniform p25", "--num-envs": "16", "--env-steps": "48", "--threads": "1"},
     "play": {"--seconds": "0.2", "--fps": "10", "--width": "64", "--height": "48"},
 }
 """By command: what its options become. Those of ``evaluate`` only where the page gives them."""
 SMALL = {
     "num_envs": 16, "env_steps": 48, "threads": 1,
-    "eval": EvalConfig(worlds=8, steps=200, adversary_steps=20, adversary_patience=1),
+    "eval": EvalConfig(worlds=8, steps=200, adversary_steps=20),
 }  # fmt: skip
 """The same for ``deimos.TrainConfig(...)`` in Python."""
 
-STUDY_EVAL = "eval = { worlds = 8, steps = 200, adversary_steps = 20, adversary_patience = 1 }"
+STUDY_EVAL = "eval = { worlds = 8, steps = 200, adversary_steps = 20 }"
 """The same in a study's file."""
 
 ELSEWHERE = {

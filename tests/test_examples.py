@@ -16,7 +16,7 @@ BUDGETS = {
 }
 
 NOTEBOOK = HOME / "examples" / "first_hour.ipynb"
-PARAMETERS = "NUM_ENVS, ENV_STEPS, WORLDS, PATIENCE, ATTACK_STEPS = 64, 240, 32, 1, 400\n"
+PARAMETERS = "NUM_ENVS, ENV_STEPS, WORLDS, ATTACK_STEPS = 64, 240, 32, 400\n"
 
 
 def test_every_example_is_run():

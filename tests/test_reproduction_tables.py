@@ -133,7 +133,7 @@ def test_table_of_the_oracle_asks_every_rule(tmp_path, monkeypatch):
     training.train(trainer, folder)
     monkeypatch.setattr(oracle_table, "WORLDS", 8)
     monkeypatch.setattr(oracle_table, "STEPS", 41)
-    evaluation = EvalConfig(worlds=32, steps=40, adversary_steps=40, adversary_patience=1, adversary_interactions=1)
+    evaluation = EvalConfig(worlds=32, steps=40, adversary_steps=40)
     monkeypatch.setattr(oracle_table, "EvalConfig", lambda: evaluation)
     same, closed = oracle_table.measure(folder.path)
     assert np.shape(same) == (len(oracle_table.RULES), 2)

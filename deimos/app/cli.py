@@ -22,6 +22,7 @@ from deimos.checks import RunError, SimulationError
 COMMANDS = {
     "train": ("deimos.app.train", "train a policy and evaluate it (also: python train.py)"),
     "evaluate": ("deimos.app.evaluate", "evaluate the policy of a run folder"),
+    "pool": ("deimos.app.pool", "train the network of the attacker pooled on other runs"),
     "study": ("deimos.app.study", "train and compare populations of policies"),
     "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),

@@ -1,4 +1,4 @@
-"""``deimos evaluate``: the policy of a run under Naive and the Adversary, or its fear network against what happened."""
+"""``deimos evaluate``: the policy of a run under Naive and attackers, or its fear network against what happened."""
 
 import os
 from dataclasses import dataclass, field, replace
@@ -21,7 +21,7 @@ from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
-_CHANGES = ("worlds", "steps", "seed", "oracle_worlds")
+_CHANGES = ("worlds", "steps", "seed", "attackers", "pool", "oracle_worlds")
 _AUDITS = ("contexts", "calibration")
 _AUDIT = (
     ("AUROC within contexts (0.5: chance, 1: perfect)", "auroc"),
@@ -46,7 +46,7 @@ class Elsewhere:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """Evaluate the policy of a run against Naive and against a freshly trained Adversary."""
+    """Evaluate the policy of a run against uniform goals (Naive) and against attackers."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -60,10 +60,14 @@ class EvaluateOptions:
     """T: steps that a goal is active. By default as in training."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate; auto takes the GPU where there is one."""
+    attackers: tuple[str, ...] | None = None
+    """Attackers beside those that the run was set up with, by name: argmax-long, oracle, ..."""
+    pool: Path | None = None
+    """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
     env: Elsewhere = field(default_factory=Elsewhere)
     """What the policy is evaluated in."""
     oracle_worlds: int | None = None
-    """Worlds that meet the oracle Adversary too; 200 is plenty. By default as the run was set up."""
+    """Worlds that meet an attacker that tries its goals in clones. By default as the run was set up."""
     calibration: int = 0
     """Instead of the policy, evaluate the fear network's probabilities on this many interactions, and draw
     calibration.png. 0 disables it."""
@@ -100,6 +104,7 @@ def main(arguments: list[str], program: str) -> None:
                 _evaluate_fear(trainer, folder, options)
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
+    changes["attackers"] = tuple(dict.fromkeys((*config.eval.attackers, *changes.get("attackers", ()))))
     env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes, options.env.engine)
     with one_stream(device):
         show_evaluation(folder, config, env_config, eval_config, device)

@@ -1,12 +1,13 @@
 """The figures of a run."""
 
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deimos.app.console import number
-from deimos.app.findings import GOALS, conditions, percent
+from deimos.app.findings import conditions, heading, percent
 from deimos.files import write_whole
 from deimos.goals.calibration import reliability
 from deimos.run.folder import RunFolder
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"  # of Okabe and Ito's palette, told apart by the colour-blind
-GOAL_COLOURS = {"naive": BLUE, "adversary": ORANGE, "oracle": GREEN}
+ATTACKED = (ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 VALUES = ("explained_variance", "critic: explained variance\nof the values", BLUE)
 FEAR = ("fear/auroc", "fear network: how well it ranked\nthe goals' crashes (AUROC)", BLUE)
 CURVES = (
@@ -28,7 +29,7 @@ CURVES = (
 )
 """Columns of ``progress.csv`` that are drawn, what they are called, and their colours."""
 MARKED = 3  # points; a line through fewer is hard to see
-BAR = 0.42  # width of a bar with the gap beside it; evaluations are 1 apart
+BAR = 0.42  # largest width of a bar with the gap beside it; evaluations are 1 apart
 MOST_EVALUATIONS = 4
 EVALUATION = "evaluation"
 
@@ -131,12 +132,15 @@ def _bars(axes: "Axes", rows: list[dict]) -> None:
         alike = tuple(row.get(name) for name in ("worlds", "steps", "goal_period", "seed", "engine"))
         groups.setdefault(alike, []).append(row)
     shown = list(groups.values())[:MOST_EVALUATIONS]
+    width = min(BAR, 0.9 / max(map(len, shown)))
+    attackers = dict.fromkeys(row["goals"] for group in shown for row in group if row["goals"] != "naive")
+    colours = {"naive": BLUE} | dict(zip(attackers, cycle(ATTACKED), strict=False))
     for place, group in enumerate(shown):
         for i, row in enumerate(group):
             known = row["crash_rate"] is not None
             bar = axes.bar(
-                place + (i - (len(group) - 1) / 2) * BAR, 100 * row["crash_rate"] if known else 0.0, 0.9 * BAR,
-                color=GOAL_COLOURS[row["goals"]], label=" ".join(GOALS[row["goals"]]),
+                place + (i - (len(group) - 1) / 2) * width, 100 * row["crash_rate"] if known else 0.0, 0.9 * width,
+                color=colours[row["goals"]], label=" ".join(heading(row["goals"])),
             )  # fmt: skip
             # Without a reference policy there is no score.
             score = "" if row["score"] is None else f"\nscore {number(row['score'], 2)}"

@@ -5,19 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from deimos.app.console import number, table
-
-GOALS = {
-    "naive": ("uniform goals", "(Naive)"),
-    "adversary": ("feared goals", "(Adversary)"),
-    "oracle": ("worst goals", "(oracle)"),
-}
-"""What kinds of goals are called."""
-
-WHO = {
-    "adversary": "the Adversary, who asks for what its fear network ranks worst,",
-    "oracle": "the oracle, who tries every candidate beforehand,",
-}
-"""Who chooses those that are not uniform."""
+from deimos.run.evaluation import worst
 
 _LINES = (
     ("score (0: no action, 1: reference controller)", "score"),
@@ -27,9 +15,9 @@ _LINES = (
     ("goals", "interactions"),
     ("crashes, under first goals too", "crashes"),
     ("crashes under first goals, which nobody chose", "first_goal_crashes"),
-    ("goals that the Adversary learnt from", "adversary_interactions"),
-    ("crashes that the Adversary learnt from", "adversary_crashes"),
-    ("Adversary's AUROC (0.5: chance, 1: perfect)", "adversary_auroc"),
+    ("goals that the attacker learnt from", "adversary_interactions"),
+    ("crashes that the attacker learnt from", "adversary_crashes"),
+    ("attacker's AUROC (0.5: chance, 1: perfect)", "adversary_auroc"),
 )
 
 
@@ -45,9 +33,14 @@ def describe(rows: list[dict], elsewhere: Sequence[dict] = ()) -> str:
     lines += [("goals that ended in a crash", [percent(row["crash_rate"]) for row in columns])]
     lines += [(label, [known(row.get(key)) for row in columns]) for label, key in _LINES]
     lines += _per_part(columns)
-    header, names = zip(("", ""), *[GOALS[row["goals"]] for row in columns], strict=True)
+    header, names = zip(("", ""), *[heading(row["goals"]) for row in columns], strict=True)
     shown = [[label, *values] for label, values in lines if any(value != "-" for value in values)]
     return f"Evaluation: {conditions(rows[0])}\n\n{table(header, [names, *shown])}\n\n{conclude(rows)}"
+
+
+def heading(goals: str) -> tuple[str, str]:
+    """What the goals of a row are called, in two lines: uniform ones, or those of an attacker."""
+    return ("uniform goals", "(Naive)") if goals == "naive" else ("attacked by", goals)
 
 
 def conditions(row: dict) -> str:
@@ -76,10 +69,15 @@ def conclude(rows: list[dict]) -> str:
     naive = shares.pop("naive")
     said = f"Under uniform goals {percent(naive) if naive else 'none'} of the goals end in a crash"
     for goals, share in shares.items():
-        said += f"; {WHO[goals]} " + ("raises that to " if share > naive else "gets no more than ") + percent(share)
+        said += f"; {goals} " + ("raises that to " if share > naive else "gets no more than ") + percent(share)
     said += "."
-    if any(row.get("weak_adversary") for row in rows):
-        said += " It is too weak an Adversary to prove anything: it saw too few crashes, or its AUROC is too low."
+    if without := [row["goals"] for row in rows if row.get("uninformed")]:
+        said += (
+            f" Goals of {' and '.join(without)} are uniform: there was nothing to learn from, so they prove nothing."
+        )
+    for most in worst([rows]) if len(shares) > 1 else []:
+        said += f" The worst attacker is {most['attacker']}: {percent(most['crash_rate'])} in the worlds that did not"
+        said += " choose it."
     return said
 
 

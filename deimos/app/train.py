@@ -114,7 +114,7 @@ def _training_progress(trainer: Trainer) -> Iterator[Callable[[dict[str, float],
 def _train_options() -> type:
     """``FolderOptions`` with every environment and selector that there is."""
     about = (
-        "Train a policy under a goal selector, then evaluate it against Naive and Adversary. "
+        "Train a policy under a goal selector, then evaluate it against uniform goals and attackers. "
         f"--preset NAME starts from a ready configuration: {', '.join(presets.names())}."
     )
     selector = _subcommands(selectors, Annotated[None, tyro.conf.subcommand("none")])

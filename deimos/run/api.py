@@ -47,7 +47,7 @@ def train(config: TrainConfig | None = None, out: Path | str | None = None) -> P
 def evaluate(
     run: Path | str, *, goal_period: int | None = None, device: str = "auto", engine: str | None = None, **changes: Any
 ) -> list[dict]:  # fmt: skip
-    """Evaluate the policy of a run against uniform goals (Naive) and against a freshly trained Adversary.
+    """Evaluate the policy of a run against uniform goals (Naive) and against attackers.
 
     Args:
         run: The run's folder; its ``evaluation.json`` gains the rows.
@@ -57,7 +57,7 @@ def evaluate(
         changes: Fields of ``EvalConfig`` that differ from the run's, such as ``worlds``, ``steps`` or ``seed``.
 
     Returns:
-        A row for each kind of goals; see ``evaluation.evaluate``.
+        A row for uniform goals and one for each attacker; see ``evaluation.evaluate``.
 
     Raises:
         RunError: If it is not a run folder, or a value is not allowed.

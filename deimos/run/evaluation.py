@@ -1,42 +1,35 @@
-"""How good and how safe a policy is: against uniform goals (Naive) and against the worst ones (Adversary).
+"""How good and how safe a policy is: against uniform goals (Naive) and against attackers.
 
-Every policy meets the same goals: the i-th goal of a world depends on the evaluation's seed, the world and i alone. The
-Adversary is the argmax Director with a fear network of its own, trained after the policy, so that it knows this
+Every policy meets the same worlds, and under uniform goals the same goals: the i-th of a world depends on the
+evaluation's seed, the world and i alone. An attacker that learns is trained after the policy, so that it knows this
 policy's weaknesses and not those of some training run.
 """
 
 import hashlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import check_at_least, check_choice, check_range
-from deimos.goals.fear import Fear, FearConfig, auroc
+from deimos.checks import RunError, check_at_least, check_range
+from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
-from deimos.goals.selector import GoalSelector, Proposal
-from deimos.goals.selectors import director, uniform
+from deimos.goals.selector import GoalSelector
 from deimos.learn.policy import load_policy
 from deimos.nn.threads import on_threads
+from deimos.run.attack import Attack, Policy, Target, attacker, uniform_goals
 from deimos.run.config import to_dict
 from deimos.run.folder import RunFolder
-from deimos.run.loop import GoalLoop, spaces
-from deimos.run.oracle import Clones, Oracle
+from deimos.run.loop import GoalLoop
 from deimos.sim.env import Env, EnvConfig
 
-Policy = Callable[[Tensor], Tensor]
-"""Observations, shape (n, obs_dim), to actions, shape (n, action_dim)."""
 Progress = Callable[[str, float], None]
 """Called now and then with the stage's name and the share of it that is done."""
-
-WEAK_CRASHES, WEAK_AUROC = 100, 0.6  # below either, resisting the Adversary proves nothing
-FITS = 15  # fits of the Adversary's network during its ``adversary_steps``
-HELD_OUT = 5  # every fifth world of the collection is kept for the Adversary's AUROC
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,31 +42,32 @@ class EvalConfig:
     """Steps of every world, at least 2 T."""
     seed: int = 1_000_003
     """Seed of the worlds and their goals, in [0, 2^32 - 1). The same for all policies that are to be compared."""
+    attackers: tuple[str, ...] = ("argmax", "scripted")
+    """Who attacks the policy, by name, each at most once (docs/how_to/evaluate.md)."""
     adversary_steps: int = 1500
-    """Steps of every world that the Adversary learns from, at least 1; more where its data is still too small."""
-    adversary_interactions: int = 20_000
-    """Interactions that it needs, at least 0."""
-    adversary_crashes: int = 500
-    """Crashes among them that it needs, at least 0."""
-    adversary_enough: Literal["all", "any"] = "all"
-    """``all``: it collects until all of these are reached. ``any``: it stops at whichever limit comes first,
-    interactions or crashes; simulators of robots are too slow for more."""
-    adversary_patience: int = 10
-    """It gives up collecting after this many times ``adversary_steps``, at least 1."""
-    fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32, min_per_class=8))
-    """The Adversary's fear network."""
-    oracle_worlds: int = 0
-    """Worlds that also meet an oracle Adversary, which tries every candidate in clones of the world and asks for
-    the one that crashes the policy soonest, or else for the one that the Adversary's network fears most; 200 is
-    plenty, 0 leaves it out. It costs N T steps per goal."""
+    """Steps of every world that ``argmax``, the thesis's Adversary, learns from, at least 1. Other attackers that learn
+    take a multiple of it, the same for every policy."""
+    fear: FearConfig = field(default_factory=lambda: FearConfig(epochs=20, minibatches=32, min_per_class=1))
+    """The fear network of an attacker."""
+    pool: Path | None = None
+    """File of the attacker ``pooled``, which ``deimos pool`` makes."""
+    oracle_worlds: int = 200
+    """Worlds, at least 1 and of the others, that meet an attacker that tries its goals in clones: N T steps a goal."""
 
     def __post_init__(self) -> None:
-        for name in ("worlds", "steps", "adversary_steps", "adversary_patience"):
+        for name in ("worlds", "steps", "adversary_steps", "oracle_worlds"):
             check_at_least(name, getattr(self, name), 1)
-        for name in ("adversary_interactions", "adversary_crashes", "oracle_worlds"):
-            check_at_least(name, getattr(self, name), 0)
-        check_choice("adversary_enough", self.adversary_enough, ["all", "any"])
         check_range("seed", self.seed, 0, 2**32 - 2)
+        for name in self.attackers:
+            if attacker(name).needs_pool and self.pool is None:
+                raise ValueError(f"pool must be a file of deimos pool for the attacker {name}, got none.")
+        if len(set(self.attackers)) < len(self.attackers):
+            raise ValueError(f"attackers must be different, got {', '.join(self.attackers)}.")
+
+    def worlds_against(self, goals: str) -> int:
+        """Worlds that meet an attacker, or ``naive`` goals."""
+        few = goals != "naive" and attacker(goals).few_worlds
+        return min(self.worlds, self.oracle_worlds) if few else self.worlds
 
 
 def weights_hash(module: nn.Module) -> str:
@@ -128,35 +122,51 @@ def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
 
 def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
     """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
-    trained = {name: value for name, value in to_dict(config).items() if name not in ("steps", "oracle_worlds")}
-    setting = hashlib.sha256(json.dumps(trained, sort_keys=True).encode()).hexdigest()[:12]
+    shared = {name: value for name, value in to_dict(config).items() if name in ("worlds", "seed", "fear")}
     engine = {"engine": env_config.engine} if hasattr(env_config, "engine") else {}
-    sizes = {"naive": config.worlds, "adversary": config.worlds, "oracle": config.oracle_worlds}
     return [
-        {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed, "worlds": worlds,
-         "steps": config.steps} | engine | ({} if goals == "naive" else {"adversary_setting": setting})
-        for goals, worlds in sizes.items() if worlds
+        {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed,
+         "worlds": config.worlds_against(goals), "steps": config.steps}
+        | engine
+        | ({} if goals == "naive" else {"adversary_setting": _setting(shared, config, goals)})
+        for goals in ("naive", *config.attackers)
     ]  # fmt: skip
+
+
+def _setting(shared: dict, config: EvalConfig, name: str) -> str:
+    """A hash of all that fixes how an attacker was made, but for the policy."""
+    made = shared | {"adversary_steps": config.adversary_steps, "attacker": name} | to_dict(attacker(name))
+    if attacker(name).needs_pool:
+        assert config.pool is not None
+        made["pool"] = hashlib.sha256(_read(config.pool)).hexdigest()
+    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RunError(f"{path} cannot be read ({error.strerror}).") from error
 
 
 def evaluate(
     policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device,
     progress: Progress = lambda stage, share: None,
 ) -> list[dict]:  # fmt: skip
-    """Evaluate a policy against Naive and against Adversary.
+    """Evaluate a policy against uniform goals and against attackers.
 
     Args:
         policy: What acts; of a Gaussian policy, its deterministic (mean) actions.
         env_config: The environment that it was trained in; randomisations are switched off.
-        config: Sizes and seed.
+        config: Sizes, seed and attackers.
         device: Where to simulate.
         progress: Told how far it is.
 
     Returns:
-        One row for ``naive`` and one for ``adversary``, and one for ``oracle`` if asked for: what ``play`` gives, and
-        ``score``: the place of its ``return_per_step`` between that of the policy that does nothing (0) and that of the
-        environment's reference policy (1), both under Naive goals; NaN where there is none. For the Adversary also
-        what ``train_adversary`` gives, and ``adversary_setting``, a hash of all that fixed its training but the policy.
+        A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` gives, and ``score``: the
+        place of its ``return_per_step`` between that of the policy that does nothing (0) and that of the environment's
+        reference policy (1), both under Naive goals; NaN where there is none. For an attacker also its facts, see
+        ``deimos.run.attack``, and ``adversary_setting``, a hash of all that fixed how it was made but the policy.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -164,40 +174,75 @@ def evaluate(
     env_config = env_config.for_evaluation().resolved(device)
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
-
-    def build(worlds: int = config.worlds, seed: int = config.seed) -> Env:
-        return env_config.build(worlds, device, seed)
-
-    scale = _scale(build, config.steps, progress)
-    fear, collection = train_adversary(policy, build(seed=config.seed + 1), config, partial(progress, "collection"))
-    choosers: dict[str, Callable[[Env], GoalSelector]] = {
-        "naive": _naive,
-        "adversary": lambda env: argmax_director(env, fear),
-        "oracle": lambda env: Oracle(env, Clones(build, policy), fear=fear),
-    }
+    target = make_target(policy, env_config, config, device)
+    scale = _scale(target.build, config, progress)
     rows = []
     for identity in _identities(env_config, config):
-        goals, env = identity["goals"], build(identity["worlds"])
-        row = {"goals": goals} | play(env, policy, choosers[goals](env), config.steps, partial(progress, goals))
-        row |= collection if goals == "adversary" else {}
+        goals = identity["goals"]
+        attack = Attack(uniform_goals)
+        if goals != "naive":
+            attack = attacker(goals).prepare(replace(target, progress=partial(progress, f"{goals} learns")))
+        env = target.build(identity["worlds"], config.seed)
+        row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals)) | attack.facts
         row["score"] = (row["return_per_step"] - scale[0]) / (scale[1] - scale[0]) if scale else math.nan
-        rows.append(row | identity)
+        rows.append({"goals": goals} | row | identity)
     return rows
 
 
-def _naive(env: Env) -> GoalSelector:
-    return uniform.Config().build(spaces(env), 0)
+def make_target(policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device) -> Target:
+    """A policy as attackers meet it; for the arguments see ``evaluate``."""
+    quiet = env_config.for_evaluation().resolved(device)
+    return Target(
+        policy=policy, build=lambda worlds, seed: quiet.build(worlds, device, seed), worlds=config.worlds,
+        steps=config.adversary_steps, seed=config.seed, fear=config.fear,
+        pool=config.pool,
+    )  # fmt: skip
 
 
-def _scale(build: Callable[[], Env], steps: int, progress: Progress) -> tuple[float, float] | None:
+def worst(policies: Sequence[Sequence[dict]]) -> list[dict]:
+    """The worst that attackers did to each policy, among those that every policy has met.
+
+    The largest of several noisy rates is too large. So the attacker is chosen by its crashes in worlds of even number
+    and reported by those in worlds of odd number.
+
+    Args:
+        policies: For each, the rows of one evaluation; those of ``naive`` goals do not count.
+
+    Returns:
+        For each policy the ``attacker``, its ``crash_rate``, and how many ``interactions`` that is the rate of; empty
+        where no attacker met all of them. Of attackers that tie it is the first.
+    """
+    by_name = [{row["goals"]: row for row in rows if row["goals"] != "naive" and _halves(row)} for rows in policies]
+    shared = [name for name in (by_name[0] if by_name else {}) if all(name in own for own in by_name)]
+    found = []
+    for own in by_name:
+        if not shared:
+            return []
+        name = max(shared, key=lambda name: _halves(own[name])[0])
+        _, rate, count = _halves(own[name])
+        found.append({"attacker": name, "crash_rate": rate, "interactions": count})
+    return found
+
+
+def _halves(row: dict) -> tuple[float, float, int] | None:
+    """Share of interactions that crashed in even worlds, in odd ones, and how many there were in odd ones."""
+    even, crashed = row.get("even_interactions"), row.get("even_interaction_crashes")
+    if not even or row["interactions"] == even:  # of an earlier version, or too few to tell
+        return None
+    odd = row["interactions"] - even
+    return crashed / even, (row["interaction_crashes"] - crashed) / odd, odd
+
+
+def _scale(build: Callable[[int, int], Env], config: EvalConfig, progress: Progress) -> tuple[float, float] | None:
     """Return per step of the zero-action policy and of the reference policy, if there is one."""
-    env = build()
+    env = build(config.worlds, config.seed)
     nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
     reference = env.reference_policy()
     if reference is None:
         return None
-    low = play(env, lambda obs: nothing, _naive(env), steps, partial(progress, "zero action"))
-    high = play(build(), reference, _naive(env), steps, partial(progress, "reference"))
+    low = play(env, lambda obs: nothing, uniform_goals(env), config.steps, partial(progress, "zero action"))
+    env = build(config.worlds, config.seed)
+    high = play(env, reference, uniform_goals(env), config.steps, partial(progress, "reference"))
     return low["return_per_step"], high["return_per_step"]
 
 
@@ -209,7 +254,8 @@ def play(
 
     Returns:
         ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions`` (issued early enough
-        to end in time), ``crash_rate`` (share of those that crashed), steps and crashes under first goals apart.
+        to end in time), ``crash_rate`` (share of those that crashed), those of worlds of even number apart, and
+        steps and crashes under first goals.
         ``return_per_step``, the mean over interactions of (sum of the rewards over the T steps, 0 from a crash on) / T,
         cannot be raised by crashing, unlike the reward per transition: a crash puts a particle back to the origin, far
         from every wall. ``tracking`` has the mean of every group of goal components, ``strata`` the same and more by
@@ -239,7 +285,7 @@ def play(
     done = loop.outcomes()
     reward_sum, crash_count, first_count, first_crash_count = totals.sum(1).tolist()
     transitions = steps * env.num_envs
-    crashed = int(done.crashed.sum())
+    crashed, even = int(done.crashed.sum()), done.env % 2 == 0
     return {
         "reward": reward_sum / transitions,
         "crashes": int(crash_count),
@@ -247,6 +293,8 @@ def play(
         "interactions": len(done),
         "interaction_crashes": crashed,
         "crash_rate": crashed / len(done) if len(done) else math.nan,
+        "even_interactions": int(even.sum()),
+        "even_interaction_crashes": int((even & done.crashed).sum()),
         "first_goal_steps": int(first_count),
         "first_goal_crashes": int(first_crash_count),
         "return_per_step": done.reward.double().mean().item() / env.goal_period,
@@ -269,93 +317,3 @@ def _by_stratum(strata: list[str], crashes: Tensor, tracking: Tensor, done: Reso
             "tracking": tracking[own].mean(0).tolist(), "success": success,
         }  # fmt: skip
     return rows
-
-
-def argmax_director(env: Env, fear: Fear) -> director.Director:
-    """A Director that asks for the candidate that a fear network, as it is at that time, fears most."""
-    selector = director.Config(rule="argmax", fear=fear.config).build(spaces(env), 0)
-    selector.fear = fear
-    return selector
-
-
-def train_adversary(
-    policy: Policy, env: Env, config: EvalConfig, progress: Callable[[float], None] = lambda share: None
-) -> tuple[Fear, dict]:
-    """Train a fear network on a finished policy.
-
-    Half of the goals of the collection are uniform and half are the network's own argmax: uniform goals alone would
-    show few crashes of a safe policy, its own choices alone no survivals.
-
-    Returns:
-        The network, and ``adversary_interactions``, ``adversary_crashes``, ``adversary_steps``, ``adversary_auroc`` (on
-        every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``weak_adversary``:
-        whether it has seen so few crashes, or ranks so badly, that resisting it proves nothing.
-    """
-    fear = Fear(config.fear, env.state_dim, env.goal_dim, env.device, config.seed)
-    collector = _Collector(env, fear)
-    limit = config.adversary_steps * config.adversary_patience
-    loop = GoalLoop(env, collector, window=limit)
-    pause = max(env.goal_period, config.adversary_steps // FITS)
-    for t in range(1, limit + 1):
-        with torch.no_grad():
-            step = env.step(policy(env.obs))
-        loop.advance(step)
-        if t % pause == 0 or t == limit:
-            progress(min(1.0, t / config.adversary_steps))
-            data = loop.outcomes()
-            learnt_from = data.where(data.env % HELD_OUT != 0)
-            fear.fit(learnt_from, epochs=1)
-            if _enough(config, len(data), int(data.crashed.sum()), t):
-                break
-    env.check()
-    fear.fit(learnt_from)
-    fear.check()
-    quality = _quality(fear, data.where(data.env % HELD_OUT == 0))
-    crashes = int(data.crashed.sum())
-    return fear, {
-        "adversary_steps": t,
-        "adversary_interactions": len(data),
-        "adversary_crashes": crashes,
-        "adversary_auroc": quality,
-        "weak_adversary": not fear.fitted or crashes < WEAK_CRASHES or quality < WEAK_AUROC,
-    }
-
-
-def _quality(fear: Fear, held_out: Resolved) -> float:
-    """How often the network ranks a crash above a survival under a goal of the same kind, its own or a uniform one.
-
-    Between the kinds, to tell which goals are its own would tell much of what crashes.
-    """
-    if not fear.fitted or not len(held_out):
-        return math.nan
-    logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
-    ranked = pairs = 0.0
-    for kind in (held_out.probe, ~held_out.probe):
-        crashed = held_out.crashed[kind]
-        count = float(crashed.sum() * (~crashed).sum())
-        if count:
-            ranked += count * auroc(logits[kind], crashed)
-            pairs += count
-    return ranked / pairs if pairs else math.nan
-
-
-def _enough(config: EvalConfig, interactions: int, crashes: int, steps: int) -> bool:
-    """Whether the Adversary has seen enough."""
-    counts = (interactions >= config.adversary_interactions, crashes >= config.adversary_crashes)
-    return any(counts) if config.adversary_enough == "any" else all(counts) and steps >= config.adversary_steps
-
-
-class _Collector(GoalSelector):
-    """Half uniform goals, which are marked as probes, half the argmax of a fear network that is being trained."""
-
-    def __init__(self, env: Env, fear: Fear) -> None:
-        self._uniform = _naive(env)
-        self._argmax = argmax_director(env, fear)
-        self.num_candidates = self._argmax.num_candidates
-
-    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
-        """See ``GoalSelector.propose``."""
-        free = self._uniform.propose(rows, state, goal, candidates, draws)
-        own = self._argmax.propose(rows, state, goal, candidates, draws)
-        coin = draws[:, 1] < 0.5
-        return replace(own, goal=torch.where(coin.unsqueeze(1), free.goal, own.goal), probe=coin)

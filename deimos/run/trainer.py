@@ -36,7 +36,7 @@ class TrainConfig:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learner."""
     eval: EvalConfig = field(default_factory=EvalConfig)
-    """The evaluation against Naive and Adversary at the end."""
+    """The evaluation at the end, under uniform goals and against attackers."""
     evaluation: bool = True
     """Whether the run ends with the evaluation."""
     seed: int = 0

@@ -205,11 +205,18 @@ def read_config(folder: RunFolder) -> TrainConfig:
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise RunError(f"{folder.path / 'config.json'} is not that of a run of schema {SCHEMA}.")
     try:
-        config = from_dict(TrainConfig, data["config"], stored=True)
+        config = from_dict(TrainConfig, data["config"] | {"eval": _today(data["config"].get("eval", {}))}, stored=True)
         kept = {name: str(folder.path / copy) for name, copy in data.get("files", {}).items()}
         return replace(config, env=replace(config.env, **kept)) if kept else config
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{folder.path / 'config.json'} does not describe a run: {error}") from error
+
+
+def _today(evaluation: dict) -> dict:
+    """The options of an evaluation, of which 0.1.0 had more: budgets that depended on how much the policy crashed."""
+    former = ("adversary_interactions", "adversary_crashes", "adversary_enough", "adversary_patience")
+    kept = {name: value for name, value in evaluation.items() if name not in former}
+    return {name: value for name, value in kept.items() if (name, value) != ("oracle_worlds", 0)}
 
 
 def save(trainer: Trainer, folder: RunFolder) -> None:

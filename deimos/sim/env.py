@@ -225,6 +225,29 @@ class Env(abc.ABC):
         """Whether ``dt`` is in seconds."""
         return self.dt != 1
 
+    def goal_bounds(self, rows: Tensor) -> tuple[Tensor, Tensor] | None:
+        """The box of the valid goals of the listed worlds; ``None`` where not all goals of a box are valid.
+
+        Args:
+            rows: Worlds, int64, shape (B,).
+
+        Returns:
+            The lowest and the highest value of every component, as the policy sees it, shape (B, goal_dim) each.
+        """
+        return None
+
+    def scripted_goals(self, rows: Tensor, goal: Tensor) -> Tensor | None:
+        """What a person would ask of the listed worlds to make them crash, for the attacker ``scripted``.
+
+        Args:
+            rows: Worlds, int64, shape (B,).
+            goal: A valid uniform goal for each, shape (B, goal_dim), for the components that are left to chance.
+
+        Returns:
+            Valid goals as the policy sees them, shape (B, goal_dim); ``None`` where the environment has no idea.
+        """
+        return None
+
     def strata(self) -> list[str]:
         """What kind of world each one is, such as the ground that it stands on, for evaluation; empty for no kinds."""
         return []

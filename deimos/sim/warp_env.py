@@ -178,6 +178,16 @@ class WarpEnv(Env):
         return candidates.tensor[: len(rows)]
 
     @final
+    def goal_bounds(self, rows: Tensor) -> tuple[Tensor, Tensor] | None:
+        """See ``Env.goal_bounds``."""
+        if self._valid_goals is not None:
+            return None
+        middle = torch.zeros(len(rows), self.goal_dim, device=self.device)
+        if self.worlds.origin.shape[0]:
+            middle -= wp.to_torch(self.worlds.origin)[rows] * (self._seen_range / self._whole_range)
+        return middle - self._seen_range, middle + self._seen_range
+
+    @final
     def draw(self, rows: Tensor) -> Tensor:
         """See ``Env.draw``."""
         self._set_rows(rows)

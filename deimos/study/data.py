@@ -54,7 +54,7 @@ class Where:
     environment: str
     """Name of the environment or variant."""
     goals: str
-    """Who chose the goals: naive, adversary or oracle."""
+    """Who chose the goals: naive, or an attacker; ``adversary`` is the thesis's, which evaluations call argmax."""
     period: int
     """T [steps]."""
 
@@ -77,7 +77,8 @@ class Data:
         self._samples: dict[tuple[Where, str], dict[int, Row]] = defaultdict(dict)
         for row in self.rows:
             if not row["weak_adversary"]:
-                where = Where(row["environment"], row["goals"], row["goal_period"])
+                goals = "adversary" if row["goals"] == "argmax" else row["goals"]
+                where = Where(row["environment"], goals, row["goal_period"])
                 self._samples[where, row["method"]][row["seed"]] = row
 
     @classmethod

@@ -37,7 +37,7 @@ RESULT_COLUMNS = _CELL | {
     "errors": dict,
     "first_goal_steps": int, "first_goal_crashes": int,
     "adversary_steps": int, "adversary_interactions": int, "adversary_crashes": int, "adversary_auroc": float,
-    "weak_adversary": bool,
+    "weak_adversary": bool, "uninformed": bool, "even_interactions": int, "even_interaction_crashes": int,
     # By what.
     "fps": float, "weights": str, "device": str, "versions": str,
 }  # fmt: skip
@@ -47,7 +47,7 @@ CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS), tuple)
 TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 FORMER_NAMES = {"selected_share": "selected_fraction"}
 """Columns of version 0.1.0 that have another name today."""
-LATER_COLUMNS = {"goal_groups"}
+LATER_COLUMNS = {"goal_groups", "uninformed", "even_interactions", "even_interaction_crashes"}
 """Columns that its tables lack."""
 
 

@@ -140,6 +140,19 @@ class Particle(WarpEnv):
             goal = position + goal * (self.goal_period - int(self.tensors["goal_clock"][world]))
         return Sketch(HALF_SIDE, position, goal)
 
+    def scripted_goals(self, rows: Tensor, goal: Tensor) -> Tensor:
+        """See ``Env.scripted_goals``: full speed away from the origin, or the farthest place beyond the position.
+
+        A particle at the origin itself is sent along the diagonal.
+        """
+        position = self.tensors["position"][rows]
+        outward = torch.where(position < 0, -1.0, 1.0)
+        if not self.config.has_velocity_goals:
+            reach = position.abs().amax(1, keepdim=True)
+            outward = torch.where(reach > 0, position / reach, outward)
+        origin = self.config.params().position_scale * position if self.config.variant == "relative" else 0.0
+        return outward * self._seen_range - origin
+
     def reference_policy(self, brake: bool = True) -> Callable[[Tensor], Tensor]:
         """A controller that follows goals and brakes in time for the wall.
 

@@ -18,8 +18,6 @@ class Config(LocomotionConfig):
         return Locomotion(self, self.make_robot(), (velocity_goal(),), num_envs, device, seed, env_offset)
 
 
-_EVAL = {"steps": 1000, "adversary_steps": 1500, "adversary_patience": 2, "adversary_enough": "any"}
-
 PRESETS = {
     # Sizes that two CPU cores can train within the hour.
     "quad": {
@@ -27,7 +25,7 @@ PRESETS = {
         "env_steps": 6400,
         # Rewards hold the time step already. A larger deviation at the start clips nearly all of them to 0.
         "ppo": {"hidden": (256, 128, 64), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0},
-        "eval": _EVAL | {"worlds": 256},
+        "eval": {"worlds": 256, "steps": 1000},
     },
     # Legged Gym's sizes on rough terrain: 3000 iterations of 24 steps.
     "quad-large": {
@@ -35,6 +33,6 @@ PRESETS = {
         "num_envs": 4096,
         "env_steps": 72_000,
         "ppo": {"hidden": (512, 256, 128), "activation": "elu", "reward_scale": 1.0},
-        "eval": _EVAL | {"worlds": 4096, "steps": 2000},
+        "eval": {"worlds": 4096, "steps": 2000},
     },
 }

@@ -40,7 +40,7 @@ from deimos.sim.legged import engines
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.engines import Physics
 from deimos.sim.legged.engines.captured import Captured
-from deimos.sim.legged.goal_parts import GoalPart
+from deimos.sim.legged.goal_parts import GoalPart, velocity_goal
 from deimos.sim.legged.robots import Robot
 from deimos.sim.shared import warp_device
 from deimos.sim.warp_env import WarpEnv
@@ -243,6 +243,12 @@ class Locomotion(WarpEnv):
         columns = len(self.terrain.shapes)
         levels = self.tensors["level"].tolist()
         return [(self.terrain.shapes[(self._offset + i) % columns], level) for i, level in enumerate(levels)]
+
+    def scripted_goals(self, rows: Tensor, goal: Tensor) -> Tensor:
+        """See ``Env.scripted_goals``: the reverse of the active velocity at its limits; the rest is left to chance."""
+        count = len(velocity_goal().range)
+        reverse = torch.where(self.goal[rows, :count] < 0, 1.0, -1.0) * self._seen_range[:count]
+        return torch.cat([reverse, goal[:, count:]], dim=1)
 
     def strata(self) -> list[str]:
         """See ``Env.strata``: shape and level of the tile; empty on flat ground."""

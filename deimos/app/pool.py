@@ -1,0 +1,61 @@
+"""``deimos pool``: the network of the attacker ``pooled``, from runs whose policies it shall not attack."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from deimos.app import console
+from deimos.app.findings import known
+from deimos.checks import RunError
+from deimos.learn.policy import load_policy
+from deimos.nn.threads import on_threads
+from deimos.run import training
+from deimos.run.attackers.pooled import make_pool
+from deimos.run.evaluation import EvalConfig, make_target
+from deimos.run.folder import RunFolder
+from deimos.sim.shared import one_stream
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoolOptions:
+    """Train a fear network on the crashes of some policies, to attack others with it (the attacker pooled)."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of the runs: the more different methods, the better."""
+    out: Path
+    """File to write, which must not exist."""
+    worlds: int = 2000
+    """Worlds that each policy acts in."""
+    adversary_steps: int = 1500
+    """Steps of every world that are learnt from, of each policy."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to simulate; auto takes the GPU where there is one."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs must be at least one folder, got none.")
+        EvalConfig(worlds=self.worlds, adversary_steps=self.adversary_steps)
+
+
+def main(arguments: list[str], program: str) -> None:
+    """Run ``deimos pool``."""
+    options: PoolOptions = console.parse(PoolOptions, arguments, program)
+    if options.out.exists():
+        raise RunError(f"{options.out} exists and is not overwritten; choose another --out.")
+    folders = [RunFolder.open(path) for path in options.runs]
+    console.quiet_warp()
+    device = training.resolve_device(options.device)
+    sizes = EvalConfig(worlds=options.worlds, adversary_steps=options.adversary_steps)
+    with one_stream(device), on_threads(1):  # sums of torch's depend on its threads
+        targets = [
+            make_target(load_policy(folder.path, str(device)).scaled, training.read_config(folder).env, sizes, device)
+            for folder in folders
+        ]
+        facts = make_pool(targets, options.out)
+    print(
+        f"{facts['adversary_crashes']:,} crashes in {facts['adversary_interactions']:,} goals of {len(folders)}", end=""
+    )
+    print(f" policies; AUROC {known(facts['adversary_auroc'])} on worlds that were not learnt from.")
+    print(options.out)

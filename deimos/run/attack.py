@@ -1,0 +1,194 @@
+"""What an attacker is: who chooses the goals of a finished policy so that it crashes.
+
+A file of ``deimos.run.attackers``, or a module that is registered under the entry-point group of that name, is an
+attacker. It may learn about the policy first, for a number of steps that is the same for every policy: one that could
+go on until it has seen enough crashes would be stronger against unsafe policies for that reason alone.
+"""
+
+import abc
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from deimos import plugins
+from deimos.goals.fear import Fear, FearConfig, auroc
+from deimos.goals.interactions import Resolved
+from deimos.goals.selector import GoalSelector, Proposal
+from deimos.goals.selectors import director, uniform
+from deimos.run import attackers
+from deimos.run.loop import GoalLoop, spaces
+from deimos.sim.env import Env
+
+Policy = Callable[[Tensor], Tensor]
+"""Observations, shape (n, obs_dim), to actions, shape (n, action_dim)."""
+
+FITS = 15  # of an attacker's network while it chooses goals itself
+HELD_OUT = 5  # every fifth world is kept for the network's AUROC
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A policy that is attacked, and what an attacker may spend on it."""
+
+    policy: Policy
+    """What acts; of a Gaussian policy, its mean actions."""
+    build: Callable[[int, int], Env]
+    """Makes as many worlds as it is told, of a seed; without randomisations."""
+    worlds: int
+    """Worlds to learn in, at least 1."""
+    steps: int
+    """Steps of each that the thesis's Adversary learns from, at least 1: the unit of every attacker's budget."""
+    seed: int
+    """Seed of the worlds that it is evaluated in, and of an attacker's own draws."""
+    fear: FearConfig
+    """A fear network, and how it learns."""
+    pool: Path | None = None
+    """The file of ``pooled``."""
+    progress: Callable[[float], None] = lambda share: None
+    """Called now and then with the share of the preparation that is done."""
+
+
+@dataclass(frozen=True)
+class Attack:
+    """An attacker that is ready."""
+
+    selector: Callable[[Env], GoalSelector]
+    """Makes who chooses the goals of some worlds."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Numbers that stand in the row of the evaluation beside what came out; see ``learn_fear``."""
+
+
+class AttackerConfig(abc.ABC):
+    """What the ``Config`` of an attacker promises: a frozen dataclass, of which every field has a default."""
+
+    few_worlds: ClassVar[bool] = False
+    """Whether a goal costs so much that it meets ``EvalConfig.oracle_worlds`` worlds only."""
+
+    needs_pool: ClassVar[bool] = False
+    """Whether it is made from the file ``EvalConfig.pool``."""
+
+    @abc.abstractmethod
+    def prepare(self, target: Target) -> Attack:
+        """Learn what there is to learn about a policy."""
+
+
+def names() -> list[str]:
+    """Names of all attackers, sorted."""
+    return sorted(_plugins())
+
+
+def _plugins() -> dict[str, str]:
+    """Names of the plug-ins by those of the attackers, which have hyphens where a file's has underscores."""
+    return {name.replace("_", "-"): name for name in plugins.names(attackers)}
+
+
+def attacker(name: str) -> AttackerConfig:
+    """The configuration of an attacker.
+
+    Raises:
+        ValueError: If there is none of this name; the message lists those that there are.
+    """
+    if name not in _plugins():
+        raise ValueError(f"There is no attacker '{name}'; there are: {', '.join(names())}.")
+    return plugins.load(attackers, _plugins()[name]).Config()
+
+
+def uniform_goals(env: Env) -> GoalSelector:
+    """Naive: uniform goals."""
+    return uniform.Config().build(spaces(env), 0)
+
+
+def argmax_director(env: Env, fear: Fear) -> director.Director:
+    """A Director that asks for the candidate that a fear network, as it is at that time, fears most."""
+    selector = director.Config(rule="argmax", memory=0, fear=fear.config).build(spaces(env), 0)
+    selector.fear = fear
+    return selector
+
+
+def learn_fear(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, dict[str, Any]]:
+    """Train a fear network on a finished policy; for the arguments see ``collect``.
+
+    Returns:
+        The network, and ``adversary_steps``, ``adversary_interactions``, ``adversary_crashes``, ``adversary_auroc`` (on
+        every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``uninformed``: whether
+        it has learnt nothing, for want of a crash or of a survival, so that goals are uniform.
+    """
+    fear, data = collect(target, steps, own_goals=own_goals)
+    fear.fit(learnt_from(data))
+    fear.check()
+    return fear, {
+        "adversary_steps": steps, "adversary_interactions": len(data), "adversary_crashes": int(data.crashed.sum()),
+        "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)), "uninformed": not fear.fitted,
+    }  # fmt: skip
+
+
+def collect(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, Resolved]:
+    """Let a policy act, to learn from what happens.
+
+    Args:
+        target: The policy.
+        steps: Steps of every world, at least 1.
+        own_goals: Whether every other goal is a network's own argmax, as far as it has learnt by then. Uniform goals
+            show few crashes of a safe policy, its own choices alone no survivals. False for uniform goals alone.
+
+    Returns:
+        The network, which has learnt nothing yet without goals of its own, and all interactions.
+    """
+    env = target.build(target.worlds, target.seed + 1)
+    fear = Fear(target.fear, env.state_dim, env.goal_dim, env.device, target.seed)
+    loop = GoalLoop(env, Explorer(env, fear) if own_goals else uniform_goals(env), window=steps)
+    pause = max(env.goal_period, steps // FITS)
+    for t in range(1, steps + 1):
+        with torch.no_grad():
+            step = env.step(target.policy(env.obs))
+        loop.advance(step)
+        if t % pause == 0:
+            target.progress(t / steps)
+            if own_goals:
+                fear.fit(learnt_from(loop.outcomes()), epochs=1)
+    env.check()
+    return fear, loop.outcomes()
+
+
+def learnt_from(data: Resolved) -> Resolved:
+    """What a network may learn from: all but every fifth world."""
+    return data.where(data.env % HELD_OUT != 0)
+
+
+def quality(fear: Fear, held_out: Resolved) -> float:
+    """How often the network ranks a crash above a survival under a goal of the same kind, its own or a uniform one.
+
+    Between the kinds, to tell which goals are its own would tell much of what crashes.
+    """
+    if not fear.fitted or not len(held_out):
+        return math.nan
+    logits = fear.score(held_out.state, held_out.goal, held_out.next_goal.unsqueeze(1)).squeeze(1)
+    ranked = pairs = 0.0
+    for kind in (held_out.probe, ~held_out.probe):
+        crashed = held_out.crashed[kind]
+        count = float(crashed.sum() * (~crashed).sum())
+        if count:
+            ranked += count * auroc(logits[kind], crashed)
+            pairs += count
+    return ranked / pairs if pairs else math.nan
+
+
+class Explorer(GoalSelector):
+    """Half uniform goals, which are marked as probes, half the argmax of a fear network that is being trained."""
+
+    def __init__(self, env: Env, fear: Fear) -> None:
+        self._uniform = uniform_goals(env)
+        self._argmax = argmax_director(env, fear)
+        self.num_candidates = self._argmax.num_candidates
+
+    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
+        """See ``GoalSelector.propose``."""
+        free = self._uniform.propose(rows, state, goal, candidates, draws)
+        own = self._argmax.propose(rows, state, goal, candidates, draws)
+        coin = draws[:, 1] < 0.5
+        return replace(own, goal=torch.where(coin.unsqueeze(1), free.goal, own.goal), probe=coin)

@@ -1,0 +1,324 @@
+"""Attackers: what each asks for, that their budgets do not depend on the policy, and planted policies."""
+
+import importlib
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from deimos.checks import RunError
+from deimos.goals.fear import Fear, FearConfig
+from deimos.goals.interactions import Resolved
+from deimos.run import attackers
+from deimos.run.attack import Explorer, argmax_director, attacker, learn_fear, names, quality, uniform_goals
+from deimos.run.attackers import search
+from deimos.run.attackers.pooled import make_pool
+from deimos.run.attackers.scripted import Scripted
+from deimos.run.evaluation import EvalConfig, _identities, evaluate, make_target
+from deimos.sim.envs import particle
+
+CPU = torch.device("cpu")
+VARIANTS = ["absolute", "directional", "relative"]
+SMALL = EvalConfig(
+    worlds=60, steps=600, adversary_steps=300, oracle_worlds=8,
+    fear=FearConfig(epochs=10, min_per_class=1),
+)  # fmt: skip
+
+
+def stay(obs):
+    """A policy that never moves."""
+    return torch.zeros(len(obs), 3)
+
+
+def blind(variant="directional"):
+    """A policy that follows its goals and never brakes."""
+    return particle.Config(variant=variant).build(1, CPU, 0).reference_policy(brake=False)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_nobody_crashes_a_policy_that_stays(tmp_path, variant):
+    """A policy that stays at the origin never crashes; attackers that would have to learn from crashes say so."""
+    config, pool = particle.Config(variant=variant), tmp_path / "pool.pt"
+    make_pool([make_target(blind(variant), config, SMALL, CPU)], pool)
+    rows = evaluate(stay, config, replace(SMALL, attackers=tuple(names()), pool=pool), CPU)
+    assert [row["goals"] for row in rows] == ["naive", *names()]
+    assert [row["crashes"] for row in rows] == [0] * len(rows)
+    learn = [row for row in rows if "adversary_crashes" in row and row["goals"] != "pooled"]
+    assert [row["adversary_crashes"] for row in learn] == [0] * len(learn)
+    assert {row["goals"]: row["uninformed"] for row in rows[1:]} == dict.fromkeys(names(), True) | {
+        "scripted": False, "oracle": False, "pooled": False,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_scripted_crashes_a_policy_that_never_brakes(variant):
+    """More than nine of ten of its goals crash a policy that follows them blindly, far more than uniform ones."""
+    config = EvalConfig(worlds=500, steps=1000, attackers=("scripted",))
+    naive, attacked = evaluate(blind(variant), particle.Config(variant=variant), config, CPU)
+    assert attacked["crash_rate"] > 0.9
+    assert attacked["interactions"] > 500
+    assert attacked["crash_rate"] > 1.5 * naive["crash_rate"]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_scripted_goals_are_outward_and_valid(variant):
+    """They lie in the box of uniform goals, on its surface, away from the origin; also for a particle that is there."""
+    config = particle.Config(variant=variant, spawn_range=900.0)
+    env = config.build(50, CPU, 0)
+    env.tensors["position"][0] = 0.0
+    position, rows = env.tensors["position"], torch.arange(50)
+    goal = Scripted(env).propose(rows, env.state(env.obs), env.goal, env.sample_goals(rows, 1), env.draw(rows)).goal
+    if variant == "directional":
+        assert torch.equal(goal[1:], position[1:].sign())  # full speed, in units of the largest
+        return
+    place = 1000.0 * goal + (position if variant == "relative" else 0.0)
+    assert place.abs().amax(1) == pytest.approx(torch.full((50,), 1250.0), rel=1e-5)
+    cosine = torch.nn.functional.cosine_similarity(place[1:], position[1:])
+    assert cosine == pytest.approx(torch.ones(49), abs=1e-5)
+
+
+def test_scripted_is_uniform_where_nobody_knows_better():
+    """In an environment without scripted goals it issues Uniform's, and its row says so."""
+    env = particle.Config().build(20, CPU, 0)
+    env.scripted_goals = lambda rows, goal: None
+    rows = torch.arange(20)
+    arguments = (rows, env.state(env.obs), env.goal, env.sample_goals(rows, 1).clone(), env.draw(rows))
+    assert torch.equal(Scripted(env).propose(*arguments).goal, uniform_goals(env).propose(*arguments).goal)
+    target = replace(make_target(stay, particle.Config(), SMALL, CPU), build=lambda worlds, seed: env)
+    assert attacker("scripted").prepare(target).facts == {"uninformed": True}
+
+
+@pytest.mark.parametrize(
+    ("name", "steps"), [("argmax", 300), ("argmax-long", 1200), ("q-fear", 1200), ("search", 1200), ("oracle", 1200)]
+)
+def test_every_policy_costs_the_same(name, steps):
+    """What an attacker may learn from is as much for a policy that never crashes as for one that does all the time."""
+    for policy in (stay, blind()):
+        target = make_target(policy, particle.Config(goal_period=50), SMALL, CPU)
+        facts = attacker(name).prepare(target).facts
+        assert facts["adversary_steps"] == steps
+        assert facts["adversary_interactions"] > 0
+        assert (facts["adversary_crashes"] == 0) == (policy is stay)
+
+
+def test_the_thesis_adversary_learns_from_uniform_goals():
+    """The goals that argmax has learnt from are as many as Naive's, and their crashes those of Naive goals."""
+    config = particle.Config(goal_period=50)
+    _, facts = learn_fear(make_target(blind(), config, SMALL, CPU), 600, own_goals=False)
+    naive = evaluate(blind(), config, replace(SMALL, seed=SMALL.seed + 1, attackers=()), CPU)[0]
+    assert facts["adversary_interactions"] == naive["interactions"]
+    assert facts["adversary_crashes"] == naive["interaction_crashes"]
+
+
+def test_q_fear_sees_beyond_a_goal():
+    """Where no goal can crash a policy within its T steps, it asks for speed towards the wall that is next."""
+    config = particle.Config(goal_period=10)  # at 10 u a step nobody crosses the 250 u that are left
+    target = make_target(blind(), config, replace(SMALL, worlds=300, adversary_steps=500), CPU)
+    env, rows = config.build(200, CPU, 3), torch.arange(200)
+    still = torch.tensor([0.0, 0.0, 0.0, 0.75, 0.0, 0.0, 0.0, 0.0, 0.0]).expand(200, 9)
+    arguments = (rows, still, still[:, :3], env.sample_goals(rows, 100).clone(), env.draw(rows))
+    speed = attacker("q-fear").prepare(target).selector(env).propose(*arguments).goal[:, 0]
+    assert speed.mean() > 0.7
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_search_fears_more_than_the_best_candidate(variant):
+    """What it finds is a valid goal, feared at least as much as the first round's best, and mostly more by far."""
+    env = particle.Config(variant=variant, spawn_range=900.0).build(40, CPU, 0)
+    fear = Fear(FearConfig(hidden=(16,)), env.state_dim, env.goal_dim, CPU, seed=0)
+    fear.fitted = True
+    searcher, rows = search.Search(search.Config(), env, fear), torch.arange(40)
+    state, candidates = env.state(env.obs), env.sample_goals(rows, searcher.num_candidates).clone()
+    chosen = searcher.propose(rows, state, env.goal, candidates, env.draw(rows))
+    low, high = env.goal_bounds(rows)
+    assert ((candidates >= low.unsqueeze(1) - 1e-5) & (candidates <= high.unsqueeze(1) + 1e-5)).all()
+    assert ((chosen.goal >= low) & (chosen.goal <= high)).all()
+    score = fear.score(state, env.goal, candidates)
+    assert chosen.score == pytest.approx(fear.score(state, env.goal, chosen.goal.unsqueeze(1))[:, 0], abs=1e-5)
+    assert (chosen.score >= score[:, :100].amax(1) - 1e-6).all()
+    assert (chosen.score > score.amax(1)).float().mean() > 0.9
+    half = searcher.propose(rows[:7], state[:7], env.goal[:7], candidates[:7], env.draw(rows[:7]))
+    assert half.goal == pytest.approx(chosen.goal[:7], abs=1e-5)
+
+
+def test_gradients_lead_to_the_top():
+    """Fear that grows with every component is followed to the corner of the box, which no candidate is in."""
+    env = particle.Config().build(10, CPU, 0)
+    fear = Fear(FearConfig(hidden=(8,), activation="elu"), env.state_dim, env.goal_dim, CPU, seed=0)
+    fear.fitted = True
+    with torch.no_grad():
+        for weights in fear.network.parameters():
+            weights.abs_()
+    searcher = search.Search(search.Config(rounds=1, ascents=100), env, fear)
+    rows = torch.arange(10)
+    arguments = (rows, env.state(env.obs), env.goal, env.sample_goals(rows, 100), env.draw(rows))
+    assert searcher.propose(*arguments).goal == pytest.approx(torch.ones(10, 3), abs=1e-5)
+
+
+def test_search_in_no_box_is_argmax():
+    """Where the environment cannot bound its valid goals, the most feared candidate is asked for."""
+    env = particle.Config().build(10, CPU, 0)
+    env.goal_bounds = lambda rows: None
+    fear = Fear(FearConfig(), env.state_dim, env.goal_dim, CPU, seed=0)
+    fear.fitted = True
+    rows = torch.arange(10)
+    arguments = (rows, env.state(env.obs), env.goal, env.sample_goals(rows, 300).clone(), env.draw(rows))
+    chosen = search.Search(search.Config(), env, fear).propose(*arguments)
+    assert torch.equal(chosen.goal, argmax_director(env, fear).propose(*arguments).goal)
+
+
+def test_a_pool_attacks_policies_that_it_has_not_seen(tmp_path):
+    """A network that has seen some policies crash crashes another; all meet the same network, which the file fixes."""
+    config, pool = particle.Config(), tmp_path / "pool.pt"
+    facts = make_pool([make_target(policy, config, SMALL, CPU) for policy in (stay, blind())], pool)
+    alone = [learn_fear(make_target(policy, config, SMALL, CPU), 300, own_goals=True)[1] for policy in (stay, blind())]
+    assert facts["adversary_interactions"] == sum(each["adversary_interactions"] for each in alone)
+    assert facts["adversary_crashes"] == alone[1]["adversary_crashes"] > 0
+    assert facts["adversary_auroc"] > 0.7
+
+    def slower(obs):
+        return 0.6 * blind()(obs)
+
+    sizes = replace(SMALL, attackers=("pooled",), pool=pool, steps=1000)
+    naive, attacked = evaluate(slower, config, sizes, CPU)
+    assert attacked["crash_rate"] > 1.2 * naive["crash_rate"] > 0
+    assert attacked["adversary_crashes"] == facts["adversary_crashes"]
+    before = _identities(config, sizes)
+    make_pool([make_target(blind(), config, SMALL, CPU)], pool)
+    after = _identities(config, sizes)
+    assert before[0] == after[0]
+    assert before[1] != after[1]
+
+
+def test_a_pool_is_refused_in_one_line(tmp_path):
+    """None, one of another environment, one that is not there, and policies that never crash."""
+    config, pool = particle.Config(), tmp_path / "pool.pt"
+    with pytest.raises(ValueError, match="pool must be a file of deimos pool for the attacker pooled, got none"):
+        EvalConfig(attackers=("pooled",))
+    sizes = replace(SMALL, attackers=("pooled",), pool=pool)
+    with pytest.raises(RunError, match=r"pool.pt cannot be read \(No such file"):
+        evaluate(stay, config, sizes, CPU)
+    with pytest.raises(RunError, match="None of the policies crashed"):
+        make_pool([make_target(stay, config, SMALL, CPU)], pool)
+    make_pool([make_target(blind(), config, SMALL, CPU)], pool)
+    with pytest.raises(RunError, match=r"pool\.pt is of other observations"):
+        evaluate(stay, replace(config, max_speed=20.0), sizes, CPU)
+    other = make_target(blind(), replace(config, max_speed=20.0), SMALL, CPU)
+    with pytest.raises(RunError, match="observe different things"):
+        make_pool([make_target(blind(), config, SMALL, CPU), other], pool)
+    pool.write_bytes(b"broken")
+    with pytest.raises(RunError, match=r"pool\.pt"):
+        evaluate(stay, config, sizes, CPU)
+
+
+def test_setting_tells_attackers_apart():
+    """A row is another's where the attacker, its budget or its network is another, whoever else attacks."""
+    config = particle.Config()
+
+    def settings(**changes):
+        return [row.get("adversary_setting") for row in _identities(config, replace(SMALL, **changes))]
+
+    both = settings(attackers=("argmax", "scripted"))
+    assert both[0] is None
+    assert both[1] != both[2]
+    assert settings(attackers=("argmax",)) == both[:2]
+    assert settings(attackers=("argmax",), steps=700) == both[:2]
+    for change in ({"adversary_steps": 301}, {"seed": 3}, {"worlds": 61}, {"fear": FearConfig(epochs=9)}):
+        assert settings(attackers=("argmax",), **change)[1] != both[1]
+
+
+ATTACKER = """
+from dataclasses import dataclass
+from deimos.run.attack import Attack, AttackerConfig, uniform_goals
+
+@dataclass(frozen=True)
+class Config(AttackerConfig):
+    def prepare(self, target):
+        return Attack(uniform_goals, {"uninformed": True})
+"""
+
+
+def test_a_file_is_an_attacker(tmp_path, monkeypatch):
+    """One file in the package's folder, and nothing else, makes an attacker of its name, with hyphens."""
+    (tmp_path / "like_naive.py").write_text(ATTACKER)
+    monkeypatch.setattr(attackers, "__path__", [*attackers.__path__, str(tmp_path)])
+    importlib.invalidate_caches()
+    assert "like-naive" in names()
+    naive, same = evaluate(stay, particle.Config(), replace(SMALL, attackers=("like-naive",)), CPU)
+    assert (same["goals"], same["reward"]) == ("like-naive", naive["reward"])
+
+
+def test_an_entry_point_is_an_attacker(tmp_path, monkeypatch):
+    """A module of another distribution that is registered under ``deimos.attackers`` is an attacker too."""
+    (tmp_path / "other_attacker.py").write_text(ATTACKER)
+    (tmp_path / "other-1.0.dist-info").mkdir()
+    (tmp_path / "other-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    (tmp_path / "other-1.0.dist-info/entry_points.txt").write_text("[deimos.attackers]\nfar-off = other_attacker\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert "far-off" in names()
+    assert EvalConfig(attackers=("far-off",)).worlds_against("far-off") == 2000
+
+
+def test_argmax_finds_what_crashes_a_policy():
+    """Against a follower with a blind side both learn to rank goals and crash it more often than Naive does."""
+    config = particle.Config()
+    follow = config.build(1, CPU, 0).reference_policy()
+
+    unseeing = blind()
+
+    def policy(obs):
+        action = follow(obs)
+        action[:, 0] = torch.where(obs[:, 9] > 0, unseeing(obs)[:, 0], action[:, 0])
+        return action
+
+    sizes = EvalConfig(worlds=100, steps=1000, attackers=("argmax", "argmax-long"), adversary_steps=1000)
+    naive, *rows = evaluate(policy, config, sizes, CPU)
+    for attacked in rows:
+        assert attacked["adversary_auroc"] > 0.8
+        assert attacked["crash_rate"] > 1.3 * naive["crash_rate"] > 0
+
+
+def held_out(probe, crashed):
+    """Interactions of which only the kind of the goal and the outcome are known; states hold the kind."""
+    probe, crashed = torch.tensor(probe), torch.tensor(crashed)
+    nothing = torch.zeros(len(probe))
+    return Resolved(
+        env=nothing.long(), state=torch.stack([probe.float(), crashed.float()], dim=1), goal=nothing.unsqueeze(1),
+        next_goal=nothing.unsqueeze(1), score=nothing, reward=nothing, tracking=nothing, probe=probe,
+        note=nothing.long(), crashed=crashed, issued=nothing.long(), resolved=nothing.long(),
+        horizon=nothing.long() + 1,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("column", "probe", "crashed", "expected"),
+    [
+        (0, [True] * 6 + [False] * 6, [True] + [False] * 5 + [True] * 5 + [False], 0.5),  # it knows the kind alone
+        (1, [True] * 6 + [False] * 6, [True] + [False] * 5 + [True] * 5 + [False], 1.0),
+        (1, [True] * 6 + [False] * 6, [False] * 9 + [True] * 3, 1.0),  # only its own goals crash the policy
+        (1, [True] * 6 + [False] * 6, [False] * 6 + [True] * 6, math.nan),  # no kind has both outcomes
+        (1, [True] * 6, [False] * 6, math.nan),
+    ],
+)
+def test_the_adversary_is_judged_within_each_kind_of_goals(column, probe, crashed, expected):
+    """To know which goals are its own is worth nothing, and where one kind never crashes the other one counts."""
+    network = SimpleNamespace(fitted=True, score=lambda state, goal, candidates: state[:, column : column + 1])
+    assert quality(network, held_out(probe, crashed)) == pytest.approx(expected, nan_ok=True)
+    assert math.isnan(quality(SimpleNamespace(fitted=False), held_out(probe, crashed)))
+
+
+def test_the_adversarys_uniform_goals_are_marked():
+    """While it collects, about half of its goals are Uniform's, and these are the ones that are marked as probes."""
+    env = particle.Config().build(400, CPU, 0)
+    fear = Fear(FearConfig(), env.state_dim, env.goal_dim, CPU, 0)
+    fear.fitted = True
+    collector, rows = Explorer(env, fear), torch.arange(400)
+    candidates, draws = env.sample_goals(rows, collector.num_candidates).clone(), env.draw(rows)
+    arguments = (rows, env.state(env.obs), env.goal, candidates, draws)
+    proposal, free = collector.propose(*arguments), uniform_goals(env).propose(*arguments)
+    same = (proposal.goal == free.goal).all(1)
+    assert bool(same[proposal.probe].all())
+    assert same[~proposal.probe].float().mean() < 0.1  # one of a hundred candidates, by chance
+    assert abs(proposal.probe.sum().item() - 200) < 4 * 10
