@@ -168,6 +168,18 @@ def test_threads_change_no_bit(threads):
             ensemble.parameters -= 1e-3 * ensemble.grad
 
 
+def test_torch_alone_keeps_to_one_thread():
+    """``torch_on_one`` leaves shared work its threads, whatever is nested, and gives torch its own back."""
+    with on_threads(3):
+        with torch_on_one():
+            assert (torch.get_num_threads(), available()) == (1, 3)
+            with on_threads(2):
+                assert (torch.get_num_threads(), available()) == (2, 2)
+            with torch_on_one():
+                assert (torch.get_num_threads(), available()) == (1, 3)
+        assert (torch.get_num_threads(), available()) == (3, 3)
+
+
 def test_two_threads_of_the_host_share_the_kernel():
     """What two threads of Python ask for at the same time is what each gets alone."""
     with on_threads(3):
