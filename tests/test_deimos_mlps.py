@@ -14,7 +14,7 @@ from deimos.nn.adam import Adam
 from deimos.nn.losses import ValueLoss
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Actor, mlp
-from deimos.nn.threads import available, on_threads, torch_on_one
+from deimos.nn.threads import Crew, available, on_threads, torch_on_one
 
 # Depths; widths that fill no register, some, and all; few and many inputs and outputs.
 SHAPES = [(5, 7, 1), (12, 64, 64, 3), (11, 50, 33, 9, 6), (3, 130, 2), (48, 1100, 256, 128, 12)]
