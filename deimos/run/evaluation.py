@@ -212,14 +212,17 @@ def worst(policies: Sequence[Sequence[dict]]) -> list[dict]:
         For each policy the ``attacker``, its ``crash_rate``, and how many ``interactions`` that is the rate of; empty
         where no attacker met all of them. Of attackers that tie it is the first.
     """
-    by_name = [{row["goals"]: row for row in rows if row["goals"] != "naive" and _halves(row)} for rows in policies]
+    by_name = [
+        {row["goals"]: halves for row in rows if row["goals"] != "naive" and (halves := _halves(row))}
+        for rows in policies
+    ]
     shared = [name for name in (by_name[0] if by_name else {}) if all(name in own for own in by_name)]
     found = []
     for own in by_name:
         if not shared:
             return []
-        name = max(shared, key=lambda name: _halves(own[name])[0])
-        _, rate, count = _halves(own[name])
+        name = max(shared, key=lambda name: own[name][0])
+        _, rate, count = own[name]
         found.append({"attacker": name, "crash_rate": rate, "interactions": count})
     return found
 
