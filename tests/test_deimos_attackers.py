@@ -2,13 +2,17 @@
 
 import importlib
 import math
+import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from deimos.kernels.legged.state import RATE_SCALE, VELOCITY_SCALE
 
+from deimos.app import cli
 from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.interactions import Resolved
@@ -20,6 +24,7 @@ from deimos.run.attackers.scripted import Scripted
 from deimos.run.evaluation import EvalConfig, _identities, evaluate, make_target
 from deimos.sim.envs import particle, quad, quad_arm
 
+OLD = Path(__file__).parent / "data" / "run_0_1_0"  # of a policy that crashes
 CPU = torch.device("cpu")
 VARIANTS = ["absolute", "directional", "relative"]
 SMALL = EvalConfig(
@@ -206,6 +211,24 @@ def test_a_pool_attacks_policies_that_it_has_not_seen(tmp_path):
     assert before[1] != after[1]
 
 
+def test_a_pool_is_made_and_used_by_commands(tmp_path, capsys):
+    """``deimos pool`` makes the file, once, and ``deimos evaluate`` attacks with it, beside the run's own attackers."""
+    shutil.copytree(OLD, tmp_path / "run")
+    stored = tmp_path / "run" / "config.json"
+    stored.write_text(stored.read_text().replace('"goal_period": 100', '"goal_period": 20'))  # some goals are survived
+    run, pool = str(tmp_path / "run"), str(tmp_path / "pool.pt")
+    make = ["pool", run, run, "--out", pool, "--worlds", "16", "--adversary-steps", "600", "--device", "cpu"]
+    assert cli.main(make) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^2 policies, [\d,]+ goals, [1-9][\d,]* crashes; AUROC .*\n.*pool\.pt\n$", said)
+    assert cli.main(make) == 2
+    assert "pool.pt exists and is not overwritten" in capsys.readouterr().err
+    assert cli.main(["evaluate", run, "--attackers", "pooled", "--device", "cpu"]) == 2
+    assert "pool must be a file of deimos pool" in capsys.readouterr().err
+    assert cli.main(["evaluate", run, "--attackers", "pooled", "--pool", pool, "--device", "cpu"]) == 0
+    assert re.search(r"\(Naive\) +argmax +scripted +pooled\n", capsys.readouterr().out)
+
+
 def test_a_pool_is_refused_in_one_line(tmp_path):
     """None, one of another environment, one that is not there, and policies that never crash."""
     config, pool = particle.Config(), tmp_path / "pool.pt"
@@ -214,7 +237,7 @@ def test_a_pool_is_refused_in_one_line(tmp_path):
     sizes = replace(SMALL, attackers=("pooled",), pool=pool)
     with pytest.raises(RunError, match=r"pool.pt cannot be read \(No such file"):
         evaluate(stay, config, sizes, CPU)
-    with pytest.raises(RunError, match="None of the policies crashed"):
+    with pytest.raises(RunError, match="These policies never crashed, or always"):
         make_pool([make_target(stay, config, SMALL, CPU)], pool)
     make_pool([make_target(blind(), config, SMALL, CPU)], pool)
     with pytest.raises(RunError, match=r"pool\.pt is of other observations"):
