@@ -72,7 +72,7 @@ def measure(name: str, variant: str, seed: int) -> dict[str, object]:
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="where the rows are kept")
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))

@@ -181,7 +181,9 @@ def test_a_loop_without_gradients_may_continue_with_them():
     theirs.step()
 
 
-@pytest.mark.parametrize("name", ["p75", "rnd", "learnability"])
+@pytest.mark.parametrize(
+    "name", ["p75", "p75-literal", "rnd", "learnability", "swapped", "weighted", "fear-novelty", "q-fear"]
+)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_host_may_compute_in_float64(name, dtype):
     """Where the default is float64 it chooses and learns, from states of either kind."""

@@ -14,7 +14,7 @@ from deimos.nn.adam import Adam
 from deimos.nn.losses import ValueLoss
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Actor, mlp
-from deimos.nn.threads import Crew, on_threads
+from deimos.nn.threads import Crew, available, on_threads, torch_on_one
 
 # Depths; widths that fill no register, some, and all; few and many inputs and outputs.
 SHAPES = [(5, 7, 1), (12, 64, 64, 3), (11, 50, 33, 9, 6), (3, 130, 2), (48, 1100, 256, 128, 12)]
@@ -166,6 +166,18 @@ def test_threads_change_no_bit(threads):
         for own, ensemble in built:
             own.parameters -= 1e-5 * own.grad
             ensemble.parameters -= 1e-3 * ensemble.grad
+
+
+def test_torch_alone_keeps_to_one_thread():
+    """``torch_on_one`` leaves shared work its threads, whatever is nested, and gives torch its own back."""
+    with on_threads(3):
+        with torch_on_one():
+            assert (torch.get_num_threads(), available()) == (1, 3)
+            with on_threads(2):
+                assert (torch.get_num_threads(), available()) == (2, 2)
+            with torch_on_one():
+                assert (torch.get_num_threads(), available()) == (1, 3)
+        assert (torch.get_num_threads(), available()) == (3, 3)
 
 
 def test_two_threads_of_the_host_share_the_kernel():

@@ -12,7 +12,7 @@ from deimos.app import console, figures
 from deimos.app.console import table
 from deimos.app.findings import describe, known
 from deimos.checks import RunError, check_at_least
-from deimos.nn.threads import on_threads
+from deimos.nn.threads import torch_on_one
 from deimos.run import api, audit, training
 from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig, elsewhere, evaluate_run
@@ -100,7 +100,7 @@ def main(arguments: list[str], program: str) -> None:
     if options.contexts or options.calibration:
         with one_stream(device):
             trainer = training.load(folder, replace(config, device=options.device))
-            with on_threads(1):  # sums of torch's depend on its threads
+            with torch_on_one():
                 _evaluate_fear(trainer, folder, options)
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}

@@ -10,7 +10,7 @@ from deimos.app import console
 from deimos.app.findings import known
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy
-from deimos.nn.threads import on_threads
+from deimos.nn.threads import torch_on_one
 from deimos.run import training
 from deimos.run.attackers.pooled import make_pool
 from deimos.run.evaluation import EvalConfig, make_target
@@ -48,7 +48,7 @@ def main(arguments: list[str], program: str) -> None:
     console.quiet_warp()
     device = training.resolve_device(options.device)
     sizes = EvalConfig(worlds=options.worlds, adversary_steps=options.adversary_steps)
-    with one_stream(device), on_threads(1):  # sums of torch's depend on its threads
+    with one_stream(device), torch_on_one():
         targets = [
             make_target(load_policy(folder.path, str(device)).scaled, training.read_config(folder).env, sizes, device)
             for folder in folders

@@ -95,7 +95,7 @@ class Fear(Stateful):
         crashes = int(crashed.sum())
         if min(crashes, len(crashed) - crashes) < self.config.min_per_class:
             return float("nan")
-        target = crashed.float() if target is None else target
+        inputs, weight, target = inputs.float(), weight.float(), crashed.float() if target is None else target
         mass = mean_over_ranks(torch.stack([(weight * ~crashed).sum(), (weight * crashed).sum()]))
         weight = weight * (0.5 / mass)[crashed.long()]
         size = -(-len(inputs) // self.config.minibatches)

@@ -182,14 +182,14 @@ class FearSelector(GoalSelector):
         """Learn from the memory or, without one, from the window; returns the loss, NaN where nothing was learnt."""
         rows = self.rows(window, interactions)
         if self.memory is None:
-            return self.fit(rows, window.crashed, torch.ones_like(window.score))
+            return self.fit(rows, window.crashed, torch.ones_like(rows[:, 0]))
         self.memory.store(rows, window, interactions.now)
         rows, crashed, weight, _ = self.memory.sample(rows, window)
         return self.fit(rows, crashed, weight)
 
     def rows(self, window: Resolved, interactions: Interactions) -> Tensor:
         """What to learn from each interaction of the window, shape (n, inputs_per_row * inputs of the network)."""
-        return torch.cat([self._seen(window.state), window.goal, window.next_goal], dim=1)
+        return torch.cat([self._seen(window.state), window.goal, window.next_goal], dim=1).float()
 
     def fit(self, rows: Tensor, crashed: Tensor, weight: Tensor) -> float:
         """Learn from rows, of the window or remembered; see ``Fear.fit_rows``."""

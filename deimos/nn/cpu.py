@@ -11,7 +11,7 @@ from torch import Tensor
 
 from deimos.kernels.mlp import ACTIVATIONS, STEP, Job, Mode, Shape, record
 from deimos.nn.losses import Loss, Surrogate, ValueLoss
-from deimos.nn.threads import CREW
+from deimos.nn.threads import CREW, available
 
 ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
 BLOCK = 3 * 2**17  # numbers in a block, 1.5 MiB: what a core's caches hold
@@ -38,7 +38,7 @@ class Kernel:
     ) -> None:  # fmt: skip
         wp.init()
         self._parameters, self._grad, self._free, self._outputs = parameters, grad, free, units[-1]
-        self._threads = torch.get_num_threads()
+        self._threads = available()
         count, self._size = parameters.shape
         shape = Shape()
         shape.layers, shape.activation = len(units) - 1, ACTIVATIONS.index(activation)

@@ -4,22 +4,41 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
+
+_shared: ContextVar[int | None] = ContextVar("threads that share work", default=None)
+
+
+def available() -> int:
+    """Threads that may share work: as many as torch has, or would have but for ``torch_on_one``."""
+    return _shared.get() or torch.get_num_threads()
 
 
 @contextmanager
 def on_threads(count: int) -> Iterator[None]:
-    """Run torch's CPU operations on so many threads; afterwards on as many as before.
-
-    A thread of torch's that has had work waits for more in a loop, and takes the processor from everybody else.
-    """
-    before = torch.get_num_threads()
+    """Run torch's CPU operations, and work that is shared, on so many threads; afterwards on as many as before."""
+    before, token = torch.get_num_threads(), _shared.set(None)
     torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+        _shared.reset(token)
+
+
+@contextmanager
+def torch_on_one() -> Iterator[None]:
+    """Run torch's CPU operations on one thread, and work that is shared on as many as before.
+
+    Sums of torch's depend on its threads; and one of them that has had work waits for more in a loop, which takes the
+    processor from everybody else.
+    """
+    share = available()
+    with on_threads(1):
+        _shared.set(share)
+        yield
 
 
 class _Worker(threading.Thread):

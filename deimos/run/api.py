@@ -9,7 +9,7 @@ import torch
 from deimos.checks import RunError
 from deimos.nn.threads import on_threads
 from deimos.run import training
-from deimos.run.config import kind
+from deimos.run.config import from_dict, to_dict
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -82,9 +82,7 @@ def configure_evaluation(
         period = config.env.goal_period if goal_period is None else goal_period
         env_config, eval_config = config.env.with_goal_period(period), replace(config.eval, **changes)
         if engine is not None:
-            if not hasattr(env_config, "engine"):
-                raise ValueError(f"env.engine is for legged robots, got '{engine}' for {kind(config.env)}.")
-            env_config = replace(env_config, engine=engine)
+            env_config = from_dict(EnvConfig, to_dict(env_config) | {"engine": engine})
         if eval_config.steps < 2 * period:
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except (TypeError, ValueError) as error:

@@ -21,7 +21,7 @@ from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.learn.policy import load_policy
-from deimos.nn.threads import on_threads
+from deimos.nn.threads import torch_on_one
 from deimos.run.attack import Attack, Policy, Target, attacker, uniform_goals
 from deimos.run.config import to_dict
 from deimos.run.folder import RunFolder
@@ -100,7 +100,7 @@ def evaluate_run(
     same = [row for row in known if any(row.items() >= identity for identity in identities)]
     if len(same) == len(identities) and not again:
         return same
-    with on_threads(1):  # sums of torch's depend on its threads
+    with torch_on_one():
         fresh = [row | weights for row in evaluate(policy.scaled, env_config, config, device, progress)]
     folder.write_json("evaluation.json", [row for row in known if row not in same] + fresh)
     return fresh

@@ -11,7 +11,7 @@ from deimos.checks import RunError, SimulationError, check_at_least, check_choic
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
-from deimos.nn.threads import on_threads
+from deimos.nn.threads import torch_on_one
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
 from deimos.run.loop import GoalLoop, spaces
@@ -142,7 +142,7 @@ class Trainer:
             SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
         """
         # Sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not.
-        with on_threads(1):
+        with torch_on_one():
             return self._iterate()
 
     def _iterate(self) -> dict[str, float]:

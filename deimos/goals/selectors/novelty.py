@@ -85,5 +85,6 @@ class Novelty(FearSelector):
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""
-        for part in (self.fear, *self.heads, self.rnd):
-            part.check()
+        for head in (self.fear, *self.heads):
+            head.check()
+        self.rnd.check()

@@ -58,7 +58,7 @@ class QFear(director.Director):
         self._worst[rows] = torch.nan
         if self.fear.fitted:
             worst = picks.take(candidates, self.score(state, goal, candidates).argmax(1))
-            self._worst[rows] = torch.cat([self._seen(state), goal, worst], dim=1)
+            self._worst[rows] = torch.cat([self._seen(state), goal, worst], dim=1).float()
         return super().propose(rows, state, goal, candidates, draws)
 
     def rows(self, window: Resolved, interactions: Interactions) -> Tensor:

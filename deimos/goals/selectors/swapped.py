@@ -54,6 +54,6 @@ class Swapped(director.Director):
         _, state, goal, _ = interactions.issued(self._learnt_at)
         size = len(self._state)
         place = (self._count + torch.arange(len(state), device=state.device)[-size:]) % size
-        self._state[place], self._goal[place] = state[-size:], goal[-size:]
+        self._state[place], self._goal[place] = state[-size:].float(), goal[-size:].float()
         self._count += len(state)
         return super().learn(interactions, rollout)

@@ -77,7 +77,7 @@ class Weighted(FearSelector):
             kept = picks.kept_above(self.config.percentile, count)
             mix = self.config.probe + (1.0 - self.config.probe) * self.config.mix
             inside = chosen.percentile > 100.0 * (1.0 - kept / count)
-            weight = (mix + (1.0 - mix) * inside * (count / kept)) ** -self.config.alpha
+            weight = (mix + (1.0 - mix) * inside.float() * (count / kept)) ** -self.config.alpha
             top = draws[:, 0] >= self.config.mix
             if chosen.probe is not None:
                 top &= ~chosen.probe
@@ -108,7 +108,8 @@ def _state_shift(interactions: Interactions) -> float:
     if min(len(side) for side in sides) < 2:
         return math.nan
     means = [side.mean(0) for side in sides]
-    within = sum((side - mean).t() @ (side - mean) / len(side) for side, mean in zip(sides, means, strict=True))
+    centred = [side - mean for side, mean in zip(sides, means, strict=True)]
+    within = centred[0].t() @ centred[0] / len(centred[0]) + centred[1].t() @ centred[1] / len(centred[1])
     ridge = 1e-3 * within.diagonal().mean() + 1e-12
     within.diagonal().add_(ridge)
     return auroc((state @ torch.linalg.solve(within, means[0] - means[1]))[~even], top[~even])

@@ -48,7 +48,7 @@ class Engine(Physics):
         import mujoco
 
         if device.type != "cpu":
-            raise ValueError(f"engine must be warp on {device}, got native, which is for CPUs.")
+            raise ValueError(f"engine must be warp on {device}, got native; take --env.engine warp, or --device cpu.")
         # Warnings are counted per world and explained by this engine; MuJoCo itself would also write them to a file in
         # the working directory. Whoever has a handler keeps it.
         if mujoco.get_mju_user_warning() is None:
