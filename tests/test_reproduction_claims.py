@@ -223,6 +223,7 @@ def test_argmax_is_the_thesis_adversary():
         row["goals"] = {"adversary": "argmax"}.get(row["goals"], row["goals"])
     results.rows += [row | {"goals": "scripted", "crashes": 9} for row in results.rows if row["goals"] == "naive"]
     data = Data(results)
+    assert data.goals == ["naive", "adversary", "scripted"]
     assert data.sample(Where("directional", "adversary", 100), "uniform", "crashes").tolist() == before.tolist()
     assert data.sample(Where("directional", "scripted", 100), "uniform", "crashes").tolist() == [9.0] * 5
 

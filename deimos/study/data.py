@@ -100,6 +100,12 @@ class Data:
         """The T that an environment's policies were evaluated at."""
         return sorted({row["goal_period"] for row in self.rows if row["environment"] == environment})
 
+    @property
+    def goals(self) -> list[str]:
+        """Who chose the goals of evaluations: naive, adversary, and other attackers by name."""
+        found = {where.goals for where, _ in self._samples}
+        return sorted(found, key=lambda name: (name != "naive", name != "adversary", name))
+
     def places(self, environment: str, goals: str) -> list[Where]:
         """The evaluations of an environment under one kind of goals."""
         return [Where(environment, goals, period) for period in self.periods(environment)]

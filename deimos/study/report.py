@@ -83,7 +83,8 @@ def what_was_run(data: Data) -> list[Block]:
             "setting": _values(own, "setting"),
         })  # fmt: skip
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
-    return ["## What was run", rows, _weak_adversaries(data), "By: " + "; ".join(versions) + "."]
+    weak = [_weak_adversaries(data)] if data.weak else []  # of results of 0.1.0
+    return ["## What was run", rows, *weak, "By: " + "; ".join(versions) + "."]
 
 
 def _values(rows: Sequence[dict], column: str) -> str:
@@ -94,8 +95,6 @@ def _weak_adversaries(data: Data) -> str:
     made = sum(row["goals"] == "adversary" for row in data.rows)
     weak = Counter((row["environment"], row["method"]) for row in data.weak)
     text = f"{len(data.weak)} of {made} evaluations by the Adversary are marked weak and left out"
-    if not weak:
-        return f"{text}."
     found = {place: [f"{name} {weak[place, name]}" for name in data.methods(place) if weak[place, name]]
              for place in data.environments}  # fmt: skip
     parts = "; ".join(f"{place}: {', '.join(names)}" for place, names in found.items() if names)
@@ -111,7 +110,7 @@ def environments(data: Data, pictures: Pictures) -> list[Block]:
     for environment in data.environments:
         blocks.append(f"## {environment}")
         for period in data.periods(environment):
-            for goals in ("naive", "adversary", "oracle"):
+            for goals in data.goals:
                 blocks += _table(data, Where(environment, goals, period))
         blocks += pictures[environment]
     return blocks
