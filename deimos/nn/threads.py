@@ -48,6 +48,8 @@ class _Worker(threading.Thread):
         super().__init__(daemon=True)
         self.work: Callable[[int], object] | None = None
         """What it is to do; ``None`` once it has."""
+        self.error: BaseException | None = None
+        """What its last work raised."""
         self._number = number
         self._gate, self._done = threading.Lock(), threading.Lock()
         self._gate.acquire()
@@ -62,10 +64,11 @@ class _Worker(threading.Thread):
                 continue
             try:
                 work(self._number)
-            finally:
-                self.work = None
-                if self._done.locked():
-                    self._done.release()
+            except BaseException as error:
+                self.error = error
+            self.work = None
+            if self._done.locked():
+                self._done.release()
 
     def wake(self) -> None:
         """Let it look for work; doing so once too often does no harm."""
@@ -92,25 +95,27 @@ class Crew:
     def run(self, work: Callable[[int], object], count: int) -> None:
         """Call ``work(i)`` on ``count`` threads, i from 0, the first of them the caller's.
 
-        Returns, or raises what interrupted it, when all of them are done: then nobody touches the work's memory.
+        Returns when all of them are done, for then nobody touches the work's memory, or raises the first error: what
+        interrupted the caller, or what the work raised on a thread.
         """
         while len(self._workers) < count - 1:
             self._workers.append(_Worker(len(self._workers) + 1))
-        workers, interrupt = self._workers[: count - 1], None
+        workers, errors = self._workers[: count - 1], []
         try:
             for worker in workers:
-                worker.work = work
+                worker.work, worker.error = work, None
                 worker.wake()
             work(0)
         except BaseException as error:  # Ctrl-C may come at any time
-            interrupt = error
+            errors.append(error)
         while busy := [worker for worker in workers if worker.work is not None]:
             try:
                 busy[0].wait()
             except BaseException as error:
-                interrupt = error
-        if interrupt is not None:
-            raise interrupt
+                errors.append(error)
+        errors += [worker.error for worker in workers if worker.error is not None]
+        if errors:
+            raise errors[0]
 
 
 CREW = Crew()
