@@ -63,14 +63,14 @@ class Job:
     gradient: wp.uint64  # of every network and part: its parameters' and the sums of the loss
     sums: int
     x: wp.uint64
-    x_net: int
-    x_row: int
-    x_unit: int
+    x_net: wp.int64
+    x_row: wp.int64
+    x_unit: wp.int64
     inputs: int  # that ``x`` has
     y: wp.uint64  # outputs, or the gradients by them, shape (count, rows, outputs)
     data: wp.uint64  # of the loss, shape (count, columns, rows)
-    data_net: int
-    data_column: int
+    data_net: wp.int64
+    data_column: wp.int64
     columns: int
     clip: float
     start: wp.uint64  # if not 0, what the first layer's sums start from, shape (count, rows / shared, units)
@@ -206,8 +206,6 @@ auto tile = [&](auto& sum, int unit, int in) __attribute__((always_inline)) {
     const float* d = delta + unit * room;
     const float* v = x + in * room;
     const int one = left > 1 ? room : 0, two = left > 2 ? 2 * room : 0;
-    #pragma unroll
-    for (int i = 0; i < height; ++i) sum[i][0] = sum[i][1] = sum[i][2] = Vector{};
     for (int row = 0; row < b.rows; row += 16, d += 16, v += 16) {
         const Vector v0 = at(v), v1 = at(v + one), v2 = at(v + two);
         #pragma unroll
@@ -230,7 +228,7 @@ for (int unit = 0, height; unit < outs; unit += height) {
     const int tiles = (outs - unit + most - 1) / most;
     height = (outs - unit + tiles - 1) / tiles;
     for (int in = 0; in < ins; in += 3) {
-        """ + _by_height("{ Vector sum[N][3]; tile(sum, unit, in); }") + """
+        """ + _by_height("{ Vector sum[N][3] = {}; tile(sum, unit, in); }") + """
     }
 }
 for (int unit = 0; unit < outs; ++unit) {
@@ -332,19 +330,19 @@ def _surrogate(shape: Shape, b: Block, clip: float):
 
 
 @wp.func_native("return address + 4 * ((wp::uint64)i * (wp::uint64)size + (wp::uint64)j * (wp::uint64)step);")
-def _offset(address: wp.uint64, i: int, size: int, j: int, step: int) -> wp.uint64:
-    """Where number i * size + j * step lies."""
+def _offset(address: wp.uint64, i: int, size: wp.int64, j: int, step: wp.int64) -> wp.uint64:
+    """Where number i * size + j * step lies; there may be more than 2^31."""
 
 
 @wp.func_native("""
 float* y = (float*)b.memory + unit * b.room;
 for (int i = 0; i < units; ++i, y += b.room) {
     for (int row = 0; row < rows; ++row) y[row] = ((const float*)source)[row * to_row + i * to_unit];
-    for (int row = rows; row < b.rows; ++row) y[row] = 0.0f;
+    for (int row = rows; row < b.rows; ++row) y[row] = y[rows - 1];
 }
 """)
-def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row: int, to_unit: int):
-    """Copy units of rows into a block, and 0 behind them."""
+def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row: wp.int64, to_unit: wp.int64):
+    """Copy units of rows into a block; behind them the last row is repeated, which overflows only if it does itself."""
 
 
 @wp.func_native("""
@@ -360,9 +358,9 @@ def _write(b: Block, unit: int, units: int, rows: int, to: wp.uint64):
 float* y = (float*)b.memory + unit * b.room;
 for (int row = 0, until; row < b.rows; row = until) {
     const int group = (first + row) / shared, end = (group + 1) * shared - first;
-    until = row >= rows ? b.rows : end < rows ? end : rows;
+    until = end < rows ? end : b.rows;
     for (int i = 0; i < units; ++i) {
-        const float value = row < rows ? ((const float*)start)[group * units + i] : 0.0f;
+        const float value = ((const float*)start)[(long long)group * units + i];
         for (int r = row; r < until; ++r) y[i * b.room + r] = value;
     }
 }
@@ -394,13 +392,11 @@ def _backward(shape: Shape, b: Block):
 def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
     """Take some rows through a network, and back."""
     outs, end = shape.units[shape.layers], shape.unit[shape.layers]
-    y = _offset(job.y, net, job.rows * outs, first, outs)
+    y = _offset(job.y, net, wp.int64(job.rows) * wp.int64(outs), first, wp.int64(outs))
     if job.start != wp.uint64(0):
-        units = shape.units[1]
-        start = _offset(job.start, net, (job.rows // job.shared) * units, 0, 0)
-        _spread(b, shape.unit[1], units, first, rows, start, job.shared)
-    x = _offset(job.x, net, job.x_net, first, job.x_row)
-    _read(b, 0, b.inputs, rows, x, job.x_row, job.x_unit)
+        start = _offset(job.start, net, wp.int64(job.rows // job.shared) * wp.int64(shape.units[1]), 0, wp.int64(0))
+        _spread(b, shape.unit[1], shape.units[1], first, rows, start, job.shared)
+    _read(b, 0, b.inputs, rows, _offset(job.x, net, job.x_net, first, job.x_row), job.x_row, job.x_unit)
     for layer in range(shape.layers):
         _product(shape, b, layer, False)
         if shape.activation > 0 and layer + 1 < shape.layers:
@@ -409,10 +405,14 @@ def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
         _write(b, end, outs, rows, y)
         return
     if job.mode == wp.static(int(Mode.BACKWARD)):
-        _read(b, end, outs, rows, y, outs, 1)
+        _read(b, end, outs, rows, y, wp.int64(outs), wp.int64(1))
+        for unit in range(end, end + outs):
+            _clear(_offset(b.memory, unit, wp.int64(b.room), rows, wp.int64(1)), b.rows - rows)
     else:
-        data = _offset(job.data, net, job.data_net, first, 1)
-        _read(b, shape.unit[shape.layers + 1], job.columns, rows, data, 1, job.data_column)
+        data, column = _offset(job.data, net, job.data_net, first, wp.int64(1)), shape.unit[shape.layers + 1]
+        _read(b, column, job.columns, rows, data, wp.int64(1), job.data_column)
+        weight = column if job.mode == wp.static(int(Mode.VALUE)) else column + job.columns - 1
+        _clear(_offset(b.memory, weight, wp.int64(b.room), rows, wp.int64(1)), b.rows - rows)  # those rows add nothing
         if job.mode == wp.static(int(Mode.VALUE)):
             _value_loss(shape, b, job.clip)
         else:
@@ -425,7 +425,7 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
     """Take parts until there are none left: cores that others use too are not equally fast."""
     job = jobs[0]
     b = Block()
-    b.memory = _offset(job.memory, thread, job.memory_size, 0, 0)
+    b.memory = _offset(job.memory, thread, wp.int64(job.memory_size), 0, wp.int64(0))
     b.room = job.room
     b.inputs = job.inputs
     blocks = (job.rows + job.room - 1) // job.room
@@ -433,8 +433,8 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
     task = _take(job.counter)
     while task < job.count * job.parts:
         net, part = task // job.parts, task % job.parts
-        b.parameters = _offset(job.parameters, net, shape.parameters, 0, 0)
-        b.gradient = _offset(job.gradient, task, size, 0, 0)
+        b.parameters = _offset(job.parameters, net, wp.int64(shape.parameters), 0, wp.int64(0))
+        b.gradient = _offset(job.gradient, task, wp.int64(size), 0, wp.int64(0))
         if job.mode != wp.static(int(Mode.FORWARD)):
             _clear(b.gradient, size)
         for block in range(part * blocks // job.parts, (part + 1) * blocks // job.parts):

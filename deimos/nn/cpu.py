@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from deimos.kernels.mlp import ACTIVATIONS, STEP, Job, Mode, Shape, record
-from deimos.nn.losses import Loss, Surrogate, ValueLoss
+from deimos.nn.losses import Loss, Surrogate, ValueLoss, by_outputs
 from deimos.nn.threads import CREW, available
 
 ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
@@ -123,7 +123,7 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
         for kernel, x, loss in work:
             assert isinstance(loss, ValueLoss | Surrogate)
             mode = Mode.VALUE if isinstance(loss, ValueLoss) else Mode.SURROGATE
-            kept.append(loss.data.float() if loss.data.stride(-1) == 1 else loss.data.float().contiguous())
+            kept.append(loss.data if loss.data.stride(-1) == 1 else loss.data.contiguous())
             operations += kernel.prepare_gradient(mode, x, loss.sums, kept[-1], loss.clip)
         _run(kernels, operations)
         return [kernel.collect() for kernel in kernels]
@@ -131,8 +131,8 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
 
 def _by_outputs(kernel: Kernel, x: Tensor, loss: Loss) -> Tensor:
     """The gradient of a loss that torch computes between two passes."""
-    sums, delta, free = loss(kernel.forward(x), kernel._parameters[:, kernel._free])
-    delta = delta.float().contiguous()
+    sums, delta, free = by_outputs(loss, kernel.forward(x), kernel._parameters[:, kernel._free])
+    delta = delta.contiguous()
     with CREW.lock:
         _run([kernel], kernel.prepare_gradient(Mode.BACKWARD, x, 0, delta))
         kernel.collect()
