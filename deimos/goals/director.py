@@ -12,7 +12,6 @@ from deimos.goals.interactions import Interactions
 from deimos.goals.methods import method
 from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces
 from deimos.nn.random import Purpose, uniforms
-from deimos.nn.threads import torch_on_one
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,6 @@ class GoalDirector:
             self.metrics = core.learn(None)
         return Assignment(goals, due | done, core.weight.clone())
 
-    @torch_on_one()  # what a selector starts with shall not depend on the host's threads
     @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
     def _begin(self, state: Tensor, goal: Tensor) -> GoalCore:
         self._sizes = len(state), state.shape[1], goal.shape[1]

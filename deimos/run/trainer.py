@@ -88,7 +88,7 @@ class TrainConfig:
 class Trainer:
     """Everything that a run holds in memory, and one iteration of it."""
 
-    @torch_on_one()  # sums of torch's depend on its threads, a decomposition's too; those of ``MLPs`` do not
+    @torch_on_one()  # sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.config = config
         self.env = config.env.build(config.num_envs, device, config.seed)

@@ -17,6 +17,7 @@ from deimos.nn.mlps import MLPs
 from deimos.nn.networks import Activation, mlp
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.seeds import generator
+from deimos.nn.threads import torch_on_one
 
 CLIP = 5.0  # bound of whitened inputs, as in the paper
 
@@ -71,6 +72,7 @@ class RND(GoalSelector):
         "fitted",
     )  # fmt: skip
 
+    @torch_on_one()  # orthogonal weights come from a decomposition whose sums depend on torch's threads
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
