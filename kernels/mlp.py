@@ -274,7 +274,7 @@ for (int row = 0; row < b.rows; row += 16) {
     const Vector kept = at(old + row) + held - at(target + row), plain = error * error, clipped = kept * kept;
     const Vector slope = 2.0f * w * error;
     loss += w * (plain >= clipped ? plain : clipped);
-    at(value + row) = (step == held) | (plain >= clipped) ? slope : slope * 0.0f;  // 0 times NaN is NaN
+    at(value + row) = ((step == held) | (plain >= clipped)) ? slope : slope * 0.0f;  // 0 times NaN is NaN
 }
 ((float*)b.gradient)[shape.parameters] += total(loss);
 """  # fmt: skip
