@@ -55,7 +55,7 @@ class Job:
     count: int  # networks
     rows: int
     parts: int  # of the rows: what a thread takes at a time
-    room: int  # rows of a whole block
+    block_rows: int  # of a whole block
     counter: wp.uint64  # parts that have been taken, int32
     memory: wp.uint64  # of a block for every thread
     memory_size: int
@@ -84,7 +84,7 @@ class Block:
     parameters: wp.uint64
     gradient: wp.uint64
     memory: wp.uint64
-    room: int  # numbers from a unit to the next one
+    stride: int  # numbers from a unit to the next one
     rows: int
     inputs: int  # of the first layer, without those whose share it starts from
 
@@ -93,8 +93,8 @@ class Block:
 _VECTORS = """
 typedef float Vector __attribute__((vector_size(64)));
 typedef int Whole __attribute__((vector_size(64)));
-typedef Vector Loose __attribute__((aligned(4), may_alias));
-auto at = [](const float* p) __attribute__((always_inline)) -> Loose& { return *(Loose*)p; };
+typedef Vector Unaligned __attribute__((aligned(4), may_alias));
+auto at = [](const float* p) __attribute__((always_inline)) -> Unaligned& { return *(Unaligned*)p; };
 auto total = [](Vector v) __attribute__((always_inline)) {
     typedef float Eight __attribute__((vector_size(32)));
     typedef float Four __attribute__((vector_size(16)));
@@ -135,13 +135,13 @@ constexpr int lanes = 8, most = 4;  // 12 sums in 16
 constexpr int lanes = 4, most = 8;
 #endif
 typedef float Vector __attribute__((vector_size(4 * lanes)));
-typedef Vector Loose __attribute__((aligned(4), may_alias));
-auto at = [](const float* p) __attribute__((always_inline)) -> Loose& { return *(Loose*)p; };
-const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], room = b.room;
+typedef Vector Unaligned __attribute__((aligned(4), may_alias));
+auto at = [](const float* p) __attribute__((always_inline)) -> Unaligned& { return *(Unaligned*)p; };
+const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], stride = b.stride;
 const int skipped = layer == 0 ? ins - b.inputs : 0;
 const bool relu = shape.activation == 0, elu = shape.activation == 1, linear = layer + 1 == shape.layers;
-float* below = (float*)b.memory + shape.unit.data[layer] * room;
-float* above = (float*)b.memory + shape.unit.data[layer + 1] * room;
+float* below = (float*)b.memory + shape.unit.data[layer] * stride;
+float* above = (float*)b.memory + shape.unit.data[layer + 1] * stride;
 const float* weight = (const float*)b.parameters + shape.weight.data[layer];
 const float* bias = weight + ins * outs;
 const float* x = back ? above : below;
@@ -150,14 +150,14 @@ const int depth = back ? outs : ins - skipped, width = back ? ins : outs;
 const int to_next = back ? 1 : ins, to_deeper = back ? ins : 1;  // distances of weights
 auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
     constexpr int height = sizeof(sum) / sizeof(sum[0]);
-    float* const to = y + unit * room + row;
+    float* const to = y + unit * stride + row;
     #pragma unroll
     for (int n = 0; n < 3 * height; ++n)
-        sum[n / 3][n % 3] = back ? Vector{} : skipped ? Vector(at(to + n / 3 * room + n % 3 * lanes))
+        sum[n / 3][n % 3] = back ? Vector{} : skipped ? Vector(at(to + n / 3 * stride + n % 3 * lanes))
                                  : Vector{} + bias[unit + n / 3];
     const float* w = weight + skipped + unit * to_next;
     const float* v = x + row;
-    for (int k = 0; k < depth; ++k, w += to_deeper, v += room) {
+    for (int k = 0; k < depth; ++k, w += to_deeper, v += stride) {
         const Vector v0 = at(v), v1 = at(v + lanes), v2 = at(v + 2 * lanes);
         #pragma unroll
         for (int i = 0; i < height; ++i) {
@@ -169,7 +169,7 @@ auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
     }
     #pragma unroll
     for (int n = 0; n < 3 * height; ++n) {
-        Loose& out = at(to + n / 3 * room + n % 3 * lanes);
+        Unaligned& out = at(to + n / 3 * stride + n % 3 * lanes);
         const Vector s = sum[n / 3][n % 3], h = out;
         if (!back) out = relu && !linear ? (s <= 0.0f ? Vector{} : s) : s;  // NaN stays NaN
         else if (relu) out = h <= 0.0f ? Vector{} : s;
@@ -196,21 +196,21 @@ constexpr int most = 8;
 #else
 constexpr int most = 2;
 #endif
-const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], room = b.room;
+const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], stride = b.stride;
 float* gradient = (float*)b.gradient + shape.weight.data[layer];
-const float* x = (const float*)b.memory + shape.unit.data[layer] * room;
-const float* delta = (const float*)b.memory + shape.unit.data[layer + 1] * room;
+const float* x = (const float*)b.memory + shape.unit.data[layer] * stride;
+const float* delta = (const float*)b.memory + shape.unit.data[layer + 1] * stride;
 auto tile = [&](auto& sum, int unit, int in) __attribute__((always_inline)) {
     constexpr int height = sizeof(sum) / sizeof(sum[0]);
     const int left = ins - in;  // less than three: some sums are made twice, and dropped
-    const float* d = delta + unit * room;
-    const float* v = x + in * room;
-    const int one = left > 1 ? room : 0, two = left > 2 ? 2 * room : 0;
+    const float* d = delta + unit * stride;
+    const float* v = x + in * stride;
+    const int one = left > 1 ? stride : 0, two = left > 2 ? 2 * stride : 0;
     for (int row = 0; row < b.rows; row += 16, d += 16, v += 16) {
         const Vector v0 = at(v), v1 = at(v + one), v2 = at(v + two);
         #pragma unroll
         for (int i = 0; i < height; ++i) {
-            const Vector u = at(d + i * room);
+            const Vector u = at(d + i * stride);
             sum[i][0] += u * v0;
             sum[i][1] += u * v1;
             sum[i][2] += u * v2;
@@ -233,7 +233,7 @@ for (int unit = 0, height; unit < outs; unit += height) {
 }
 for (int unit = 0; unit < outs; ++unit) {
     Vector sum = {};
-    for (int row = 0; row < b.rows; row += 16) sum += at(delta + unit * room + row);
+    for (int row = 0; row < b.rows; row += 16) sum += at(delta + unit * stride + row);
     gradient[ins * outs + unit] += total(sum);
 }
 """  # fmt: skip
@@ -244,9 +244,9 @@ def _add_gradient(shape: Shape, b: Block, layer: int):
     """Add the gradient by a layer's weights and biases."""
 
 
-_CURVE = _VECTORS + _EXP + """
-float* y = (float*)b.memory + shape.unit.data[layer + 1] * b.room;
-for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.room)
+_ACTIVATION = _VECTORS + _EXP + """
+float* y = (float*)b.memory + shape.unit.data[layer + 1] * b.stride;
+for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.stride)
     for (int row = 0; row < b.rows; row += 16) {
         const Vector s = at(y + row);
         if (shape.activation == 1) at(y + row) = s <= 0.0f ? expm1(s) : s;
@@ -258,15 +258,15 @@ for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.room)
 """  # fmt: skip
 
 
-@wp.func_native(_CURVE)
-def _bend(shape: Shape, b: Block, layer: int):
+@wp.func_native(_ACTIVATION)
+def _apply_activation(shape: Shape, b: Block, layer: int):
     """Apply ELU or tanh to a layer's outputs; ReLU costs nothing while they are in registers."""
 
 
 # The data of a loss lie behind the outputs, column by column as ``losses`` has them.
 _VALUE = _VECTORS + """
-float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.room;
-const float *weight = value + b.room, *old = weight + b.room, *target = old + b.room;
+float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.stride;
+const float *weight = value + b.stride, *old = weight + b.stride, *target = old + b.stride;
 Vector loss = {};
 for (int row = 0; row < b.rows; row += 16) {
     const Vector v = at(value + row), w = at(weight + row), error = v - at(target + row), step = v - at(old + row);
@@ -286,10 +286,10 @@ def _value_loss(shape: Shape, b: Block, clip: float):
 
 
 _SURROGATE = _VECTORS + _EXP + """
-const int room = b.room, actions = shape.units.data[shape.layers];
-float* mean = (float*)b.memory + shape.unit.data[shape.layers] * room;
-float *action = mean + actions * room, *old_mean = action + actions * room, *log_prob = old_mean + actions * room;
-float *advantage = log_prob + room, *weight = advantage + room, *slope = log_prob;  // by log r
+const int stride = b.stride, actions = shape.units.data[shape.layers];
+float* mean = (float*)b.memory + shape.unit.data[shape.layers] * stride;
+float *action = mean + actions * stride, *old_mean = action + actions * stride, *log_prob = old_mean + actions * stride;
+float *advantage = log_prob + stride, *weight = advantage + stride, *slope = log_prob;  // by log r
 const float* std = (const float*)b.parameters + shape.free;
 float *std_gradient = (float*)b.gradient + shape.free, *sums = (float*)b.gradient + shape.parameters;
 float normaliser = 0.918938533f * actions;
@@ -298,7 +298,7 @@ Vector loss = {};
 for (int row = 0; row < b.rows; row += 16) {
     Vector squares = {};
     for (int a = 0; a < actions; ++a) {
-        const Vector z = (at(action + a * room + row) - at(mean + a * room + row)) / std[a];
+        const Vector z = (at(action + a * stride + row) - at(mean + a * stride + row)) / std[a];
         squares += z * z;
     }
     const Vector ratio = expm1(-0.5f * squares - normaliser - at(log_prob + row)) + 1.0f, gain = -at(advantage + row);
@@ -312,8 +312,8 @@ sums[0] += total(loss);
 for (int a = 0; a < actions; ++a) {
     Vector by_std = {}, moved = {};
     for (int row = 0; row < b.rows; row += 16) {
-        Loose& m = at(mean + a * room + row);
-        const Vector z = (at(action + a * room + row) - m) / std[a], step = m - at(old_mean + a * room + row);
+        Unaligned& m = at(mean + a * stride + row);
+        const Vector z = (at(action + a * stride + row) - m) / std[a], step = m - at(old_mean + a * stride + row);
         by_std += (z * z - 1.0f) * at(slope + row);
         moved += at(weight + row) * step * step;
         m = z / std[a] * at(slope + row);
@@ -335,8 +335,8 @@ def _offset(address: wp.uint64, i: int, size: wp.int64, j: int, step: wp.int64) 
 
 
 @wp.func_native("""
-float* y = (float*)b.memory + unit * b.room;
-for (int i = 0; i < units; ++i, y += b.room) {
+float* y = (float*)b.memory + unit * b.stride;
+for (int i = 0; i < units; ++i, y += b.stride) {
     for (int row = 0; row < rows; ++row) y[row] = ((const float*)source)[row * to_row + i * to_unit];
     for (int row = rows; row < b.rows; ++row) y[row] = y[rows - 1];
 }
@@ -346,26 +346,26 @@ def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row:
 
 
 @wp.func_native("""
-const float* y = (const float*)b.memory + unit * b.room;
+const float* y = (const float*)b.memory + unit * b.stride;
 for (int row = 0; row < rows; ++row)
-    for (int i = 0; i < units; ++i) ((float*)to)[row * units + i] = y[i * b.room + row];
+    for (int i = 0; i < units; ++i) ((float*)to)[row * units + i] = y[i * b.stride + row];
 """)
 def _write(b: Block, unit: int, units: int, rows: int, to: wp.uint64):
     """Copy units of rows out of a block, row by row."""
 
 
 @wp.func_native("""
-float* y = (float*)b.memory + unit * b.room;
+float* y = (float*)b.memory + unit * b.stride;
 for (int row = 0, until; row < b.rows; row = until) {
     const int group = (first + row) / shared, end = (group + 1) * shared - first;
     until = end < rows ? end : b.rows;
     for (int i = 0; i < units; ++i) {
         const float value = ((const float*)start)[(long long)group * units + i];
-        for (int r = row; r < until; ++r) y[i * b.room + r] = value;
+        for (int r = row; r < until; ++r) y[i * b.stride + r] = value;
     }
 }
 """)
-def _spread(b: Block, unit: int, units: int, first: int, rows: int, start: wp.uint64, shared: int):
+def _broadcast(b: Block, unit: int, units: int, first: int, rows: int, start: wp.uint64, shared: int):
     """Write what the first layer's sums start from, the same for ``shared`` consecutive rows."""
 
 
@@ -395,24 +395,24 @@ def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
     y = _offset(job.y, net, wp.int64(job.rows) * wp.int64(outs), first, wp.int64(outs))
     if job.start != wp.uint64(0):
         start = _offset(job.start, net, wp.int64(job.rows // job.shared) * wp.int64(shape.units[1]), 0, wp.int64(0))
-        _spread(b, shape.unit[1], shape.units[1], first, rows, start, job.shared)
+        _broadcast(b, shape.unit[1], shape.units[1], first, rows, start, job.shared)
     _read(b, 0, b.inputs, rows, _offset(job.x, net, job.x_net, first, job.x_row), job.x_row, job.x_unit)
     for layer in range(shape.layers):
         _product(shape, b, layer, False)
         if shape.activation > 0 and layer + 1 < shape.layers:
-            _bend(shape, b, layer)
+            _apply_activation(shape, b, layer)
     if job.mode == wp.static(int(Mode.FORWARD)):
         _write(b, end, outs, rows, y)
         return
     if job.mode == wp.static(int(Mode.BACKWARD)):
         _read(b, end, outs, rows, y, wp.int64(outs), wp.int64(1))
         for unit in range(end, end + outs):
-            _clear(_offset(b.memory, unit, wp.int64(b.room), rows, wp.int64(1)), b.rows - rows)
+            _clear(_offset(b.memory, unit, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)
     else:
         data, column = _offset(job.data, net, job.data_net, first, wp.int64(1)), shape.unit[shape.layers + 1]
         _read(b, column, job.columns, rows, data, wp.int64(1), job.data_column)
         weight = column if job.mode == wp.static(int(Mode.VALUE)) else column + job.columns - 1
-        _clear(_offset(b.memory, weight, wp.int64(b.room), rows, wp.int64(1)), b.rows - rows)  # those rows add nothing
+        _clear(_offset(b.memory, weight, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)  # they add nothing
         if job.mode == wp.static(int(Mode.VALUE)):
             _value_loss(shape, b, job.clip)
         else:
@@ -426,9 +426,9 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
     job = jobs[0]
     b = Block()
     b.memory = _offset(job.memory, thread, wp.int64(job.memory_size), 0, wp.int64(0))
-    b.room = job.room
+    b.stride = job.block_rows
     b.inputs = job.inputs
-    blocks = (job.rows + job.room - 1) // job.room
+    blocks = (job.rows + job.block_rows - 1) // job.block_rows
     size = shape.parameters + job.sums
     task = _take(job.counter)
     while task < job.count * job.parts:
@@ -438,8 +438,8 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
         if job.mode != wp.static(int(Mode.FORWARD)):
             _clear(b.gradient, size)
         for block in range(part * blocks // job.parts, (part + 1) * blocks // job.parts):
-            first = block * job.room
-            rows = wp.min(job.room, job.rows - first)
+            first = block * job.block_rows
+            rows = wp.min(job.block_rows, job.rows - first)
             b.rows = (rows + STEP - 1) // STEP * STEP
             _work_on(shape, job, b, net, first, rows)
         task = _take(job.counter)

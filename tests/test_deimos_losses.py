@@ -1,4 +1,4 @@
-"""Losses: their gradients against autograd in float64, and the kernel's twins against them."""
+"""Losses: their gradients against autograd in float64, and the kernel's against them."""
 
 import copy
 import math
@@ -105,7 +105,7 @@ def learners():
 
 @pytest.mark.parametrize("rows", [1, 50, ROWS])
 @pytest.mark.parametrize("clip", [0.2, math.inf])
-def test_the_kernels_twins_are_these(rows, clip):
+def test_the_kernels_are_these(rows, clip):
     """Sums and gradients of the kernel are those of the functions here in float64, up to float32's rounding."""
     data, x = transitions(rows, seed=rows), torch.randn(rows, 8, generator=torch.Generator().manual_seed(rows))
     nets = learners()
@@ -143,7 +143,7 @@ def test_what_fills_a_block_does_not_overflow(rows):
 
 
 @pytest.mark.parametrize("name", ["log_prob", "advantage", "weight", "old", "target"])
-def test_what_is_no_number_breaks_the_loss(name):
+def test_nan_breaks_the_loss(name):
     """In the kernel as in torch, NaN in the data shows in the loss or in the gradient."""
     data = transitions().float()
     data[0, 2 * ACTIONS + ["log_prob", "advantage", "weight", "old", "target"].index(name), 17] = torch.nan

@@ -118,7 +118,7 @@ def test_a_small_workspace_is_kept_to():
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])
 def test_nan_stays_nan(backend, activation):
-    """What is no number in an input or a weight is none in every output that it belongs to, and in no other."""
+    """A NaN in an input or a weight is one in every output that it belongs to, and in no other."""
     nets = networks((4, 16, 16, 2), 2, activation)
     built = build(nets, backend)
     x = torch.randn(60, 4)

@@ -7,7 +7,7 @@ import time
 import pytest
 import torch
 
-from deimos.nn.threads import Crew, available, on_threads, torch_on_one
+from deimos.nn.threads import ThreadPool, available, on_threads, torch_on_one
 
 
 def test_torch_alone_keeps_to_one_thread():
@@ -25,7 +25,7 @@ def test_torch_alone_keeps_to_one_thread():
 @pytest.mark.parametrize("where", ["working", "waiting"])
 def test_an_interrupt_leaves_no_thread_behind(where):
     """Ctrl-C while it works or waits is raised once all threads are done, and they work again afterwards."""
-    crew, finished = Crew(), []
+    pool, finished = ThreadPool(), []
 
     def work(i):
         if i == (0 if where == "working" else 1):
@@ -34,18 +34,18 @@ def test_an_interrupt_leaves_no_thread_behind(where):
         finished.append(i)
 
     with pytest.raises(KeyboardInterrupt):
-        crew.run(work, 4)
+        pool.run(work, 4)
     assert {1, 2, 3} <= set(finished)
     for count in (4, 2, 4):
         done = []
-        crew.run(done.append, count)
+        pool.run(done.append, count)
         assert sorted(done) == list(range(count))
 
 
 @pytest.mark.parametrize("thread", [0, 1, 2])
 def test_an_error_on_a_thread_is_raised(thread):
     """What the work raises on any thread reaches the caller once all are done, and the threads work on."""
-    crew, finished = Crew(), []
+    pool, finished = ThreadPool(), []
 
     def work(i):
         if i == thread:
@@ -54,8 +54,8 @@ def test_an_error_on_a_thread_is_raised(thread):
 
     for _ in range(2):
         with pytest.raises(MemoryError, match=f"on thread {thread}"):
-            crew.run(work, 3)
+            pool.run(work, 3)
     assert sorted(finished) == sorted(2 * [i for i in range(3) if i != thread])
     done = []
-    crew.run(done.append, 3)
+    pool.run(done.append, 3)
     assert sorted(done) == [0, 1, 2]

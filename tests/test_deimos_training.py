@@ -246,7 +246,7 @@ def test_same_seed_same_run(undisturbed, tmp_path):
 )
 def test_threads_change_no_number(selector, tmp_path, monkeypatch):
     """On one thread and on several, all of which have work, ``progress.csv`` has the same bytes."""
-    monkeypatch.setattr("deimos.nn.cpu.LEAST", 1.0)
+    monkeypatch.setattr("deimos.nn.cpu.MIN_OPERATIONS", 1.0)
     config = replace(CONFIG, num_envs=1500, env_steps=48, selector=selector)
     before, written = torch.get_num_threads(), []
     try:

@@ -1,7 +1,7 @@
 """Losses of networks and their gradients by the outputs, written out in torch: the reference.
 
-``kernels.mlp`` has twins of ``ValueLoss`` and ``Surrogate``, which a CPU computes while a block of rows lies in its
-caches. Tests hold these functions to autograd in float64, and the twins to them.
+``kernels.mlp`` has ``ValueLoss`` and ``Surrogate`` too, which a CPU computes while a block of rows lies in its caches.
+Tests hold these functions to autograd in float64, and the kernel's to them.
 """
 
 import math

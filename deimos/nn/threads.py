@@ -81,7 +81,7 @@ class _Worker(threading.Thread):
         self._done.acquire()
 
 
-class Crew:
+class ThreadPool:
     """Threads of Python that sleep while there is nothing to do; made when they are first needed.
 
     Work must release Python's lock to gain by them, and find its own share of what there is to do.
@@ -118,8 +118,8 @@ class Crew:
             raise errors[0]
 
 
-CREW = Crew()
+POOL = ThreadPool()
 """The process's."""
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=CREW.__init__)  # type: ignore[misc]  # threads do not survive a fork
+    os.register_at_fork(after_in_child=POOL.__init__)  # type: ignore[misc]  # threads do not survive a fork
