@@ -55,7 +55,7 @@ class Job:
     count: int  # networks
     rows: int
     parts: int  # of the rows: what a thread takes at a time
-    room: int  # rows of a whole block
+    block_rows: int  # of a whole block
     counter: wp.uint64  # parts that have been taken, int32
     memory: wp.uint64  # of a block for every thread
     memory_size: int
@@ -63,14 +63,14 @@ class Job:
     gradient: wp.uint64  # of every network and part: its parameters' and the sums of the loss
     sums: int
     x: wp.uint64
-    x_net: int
-    x_row: int
-    x_unit: int
+    x_net: wp.int64
+    x_row: wp.int64
+    x_unit: wp.int64
     inputs: int  # that ``x`` has
     y: wp.uint64  # outputs, or the gradients by them, shape (count, rows, outputs)
     data: wp.uint64  # of the loss, shape (count, columns, rows)
-    data_net: int
-    data_column: int
+    data_net: wp.int64
+    data_column: wp.int64
     columns: int
     clip: float
     start: wp.uint64  # if not 0, what the first layer's sums start from, shape (count, rows / shared, units)
@@ -84,7 +84,7 @@ class Block:
     parameters: wp.uint64
     gradient: wp.uint64
     memory: wp.uint64
-    room: int  # numbers from a unit to the next one
+    stride: int  # numbers from a unit to the next one
     rows: int
     inputs: int  # of the first layer, without those whose share it starts from
 
@@ -93,8 +93,8 @@ class Block:
 _VECTORS = """
 typedef float Vector __attribute__((vector_size(64)));
 typedef int Whole __attribute__((vector_size(64)));
-typedef Vector Loose __attribute__((aligned(4), may_alias));
-auto at = [](const float* p) __attribute__((always_inline)) -> Loose& { return *(Loose*)p; };
+typedef Vector Unaligned __attribute__((aligned(4), may_alias));
+auto at = [](const float* p) __attribute__((always_inline)) -> Unaligned& { return *(Unaligned*)p; };
 auto total = [](Vector v) __attribute__((always_inline)) {
     typedef float Eight __attribute__((vector_size(32)));
     typedef float Four __attribute__((vector_size(16)));
@@ -135,13 +135,13 @@ constexpr int lanes = 8, most = 4;  // 12 sums in 16
 constexpr int lanes = 4, most = 8;
 #endif
 typedef float Vector __attribute__((vector_size(4 * lanes)));
-typedef Vector Loose __attribute__((aligned(4), may_alias));
-auto at = [](const float* p) __attribute__((always_inline)) -> Loose& { return *(Loose*)p; };
-const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], room = b.room;
+typedef Vector Unaligned __attribute__((aligned(4), may_alias));
+auto at = [](const float* p) __attribute__((always_inline)) -> Unaligned& { return *(Unaligned*)p; };
+const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], stride = b.stride;
 const int skipped = layer == 0 ? ins - b.inputs : 0;
 const bool relu = shape.activation == 0, elu = shape.activation == 1, linear = layer + 1 == shape.layers;
-float* below = (float*)b.memory + shape.unit.data[layer] * room;
-float* above = (float*)b.memory + shape.unit.data[layer + 1] * room;
+float* below = (float*)b.memory + shape.unit.data[layer] * stride;
+float* above = (float*)b.memory + shape.unit.data[layer + 1] * stride;
 const float* weight = (const float*)b.parameters + shape.weight.data[layer];
 const float* bias = weight + ins * outs;
 const float* x = back ? above : below;
@@ -150,14 +150,14 @@ const int depth = back ? outs : ins - skipped, width = back ? ins : outs;
 const int to_next = back ? 1 : ins, to_deeper = back ? ins : 1;  // distances of weights
 auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
     constexpr int height = sizeof(sum) / sizeof(sum[0]);
-    float* const to = y + unit * room + row;
+    float* const to = y + unit * stride + row;
     #pragma unroll
     for (int n = 0; n < 3 * height; ++n)
-        sum[n / 3][n % 3] = back ? Vector{} : skipped ? Vector(at(to + n / 3 * room + n % 3 * lanes))
+        sum[n / 3][n % 3] = back ? Vector{} : skipped ? Vector(at(to + n / 3 * stride + n % 3 * lanes))
                                  : Vector{} + bias[unit + n / 3];
     const float* w = weight + skipped + unit * to_next;
     const float* v = x + row;
-    for (int k = 0; k < depth; ++k, w += to_deeper, v += room) {
+    for (int k = 0; k < depth; ++k, w += to_deeper, v += stride) {
         const Vector v0 = at(v), v1 = at(v + lanes), v2 = at(v + 2 * lanes);
         #pragma unroll
         for (int i = 0; i < height; ++i) {
@@ -169,7 +169,7 @@ auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
     }
     #pragma unroll
     for (int n = 0; n < 3 * height; ++n) {
-        Loose& out = at(to + n / 3 * room + n % 3 * lanes);
+        Unaligned& out = at(to + n / 3 * stride + n % 3 * lanes);
         const Vector s = sum[n / 3][n % 3], h = out;
         if (!back) out = relu && !linear ? (s <= 0.0f ? Vector{} : s) : s;  // NaN stays NaN
         else if (relu) out = h <= 0.0f ? Vector{} : s;
@@ -196,23 +196,21 @@ constexpr int most = 8;
 #else
 constexpr int most = 2;
 #endif
-const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], room = b.room;
+const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], stride = b.stride;
 float* gradient = (float*)b.gradient + shape.weight.data[layer];
-const float* x = (const float*)b.memory + shape.unit.data[layer] * room;
-const float* delta = (const float*)b.memory + shape.unit.data[layer + 1] * room;
+const float* x = (const float*)b.memory + shape.unit.data[layer] * stride;
+const float* delta = (const float*)b.memory + shape.unit.data[layer + 1] * stride;
 auto tile = [&](auto& sum, int unit, int in) __attribute__((always_inline)) {
     constexpr int height = sizeof(sum) / sizeof(sum[0]);
     const int left = ins - in;  // less than three: some sums are made twice, and dropped
-    const float* d = delta + unit * room;
-    const float* v = x + in * room;
-    const int one = left > 1 ? room : 0, two = left > 2 ? 2 * room : 0;
-    #pragma unroll
-    for (int i = 0; i < height; ++i) sum[i][0] = sum[i][1] = sum[i][2] = Vector{};
+    const float* d = delta + unit * stride;
+    const float* v = x + in * stride;
+    const int one = left > 1 ? stride : 0, two = left > 2 ? 2 * stride : 0;
     for (int row = 0; row < b.rows; row += 16, d += 16, v += 16) {
         const Vector v0 = at(v), v1 = at(v + one), v2 = at(v + two);
         #pragma unroll
         for (int i = 0; i < height; ++i) {
-            const Vector u = at(d + i * room);
+            const Vector u = at(d + i * stride);
             sum[i][0] += u * v0;
             sum[i][1] += u * v1;
             sum[i][2] += u * v2;
@@ -230,12 +228,12 @@ for (int unit = 0, height; unit < outs; unit += height) {
     const int tiles = (outs - unit + most - 1) / most;
     height = (outs - unit + tiles - 1) / tiles;
     for (int in = 0; in < ins; in += 3) {
-        """ + _by_height("{ Vector sum[N][3]; tile(sum, unit, in); }") + """
+        """ + _by_height("{ Vector sum[N][3] = {}; tile(sum, unit, in); }") + """
     }
 }
 for (int unit = 0; unit < outs; ++unit) {
     Vector sum = {};
-    for (int row = 0; row < b.rows; row += 16) sum += at(delta + unit * room + row);
+    for (int row = 0; row < b.rows; row += 16) sum += at(delta + unit * stride + row);
     gradient[ins * outs + unit] += total(sum);
 }
 """  # fmt: skip
@@ -246,9 +244,9 @@ def _add_gradient(shape: Shape, b: Block, layer: int):
     """Add the gradient by a layer's weights and biases."""
 
 
-_CURVE = _VECTORS + _EXP + """
-float* y = (float*)b.memory + shape.unit.data[layer + 1] * b.room;
-for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.room)
+_ACTIVATION = _VECTORS + _EXP + """
+float* y = (float*)b.memory + shape.unit.data[layer + 1] * b.stride;
+for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.stride)
     for (int row = 0; row < b.rows; row += 16) {
         const Vector s = at(y + row);
         if (shape.activation == 1) at(y + row) = s <= 0.0f ? expm1(s) : s;
@@ -260,15 +258,15 @@ for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.room)
 """  # fmt: skip
 
 
-@wp.func_native(_CURVE)
-def _bend(shape: Shape, b: Block, layer: int):
+@wp.func_native(_ACTIVATION)
+def _apply_activation(shape: Shape, b: Block, layer: int):
     """Apply ELU or tanh to a layer's outputs; ReLU costs nothing while they are in registers."""
 
 
 # The data of a loss lie behind the outputs, column by column as ``losses`` has them.
 _VALUE = _VECTORS + """
-float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.room;
-const float *weight = value + b.room, *old = weight + b.room, *target = old + b.room;
+float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.stride;
+const float *weight = value + b.stride, *old = weight + b.stride, *target = old + b.stride;
 Vector loss = {};
 for (int row = 0; row < b.rows; row += 16) {
     const Vector v = at(value + row), w = at(weight + row), error = v - at(target + row), step = v - at(old + row);
@@ -276,7 +274,7 @@ for (int row = 0; row < b.rows; row += 16) {
     const Vector kept = at(old + row) + held - at(target + row), plain = error * error, clipped = kept * kept;
     const Vector slope = 2.0f * w * error;
     loss += w * (plain >= clipped ? plain : clipped);
-    at(value + row) = (step == held) | (plain >= clipped) ? slope : slope * 0.0f;  // 0 times NaN is NaN
+    at(value + row) = ((step == held) | (plain >= clipped)) ? slope : slope * 0.0f;  // 0 times NaN is NaN
 }
 ((float*)b.gradient)[shape.parameters] += total(loss);
 """  # fmt: skip
@@ -288,10 +286,10 @@ def _value_loss(shape: Shape, b: Block, clip: float):
 
 
 _SURROGATE = _VECTORS + _EXP + """
-const int room = b.room, actions = shape.units.data[shape.layers];
-float* mean = (float*)b.memory + shape.unit.data[shape.layers] * room;
-float *action = mean + actions * room, *old_mean = action + actions * room, *log_prob = old_mean + actions * room;
-float *advantage = log_prob + room, *weight = advantage + room, *slope = log_prob;  // by log r
+const int stride = b.stride, actions = shape.units.data[shape.layers];
+float* mean = (float*)b.memory + shape.unit.data[shape.layers] * stride;
+float *action = mean + actions * stride, *old_mean = action + actions * stride, *log_prob = old_mean + actions * stride;
+float *advantage = log_prob + stride, *weight = advantage + stride, *slope = log_prob;  // by log r
 const float* std = (const float*)b.parameters + shape.free;
 float *std_gradient = (float*)b.gradient + shape.free, *sums = (float*)b.gradient + shape.parameters;
 float normaliser = 0.918938533f * actions;
@@ -300,7 +298,7 @@ Vector loss = {};
 for (int row = 0; row < b.rows; row += 16) {
     Vector squares = {};
     for (int a = 0; a < actions; ++a) {
-        const Vector z = (at(action + a * room + row) - at(mean + a * room + row)) / std[a];
+        const Vector z = (at(action + a * stride + row) - at(mean + a * stride + row)) / std[a];
         squares += z * z;
     }
     const Vector ratio = expm1(-0.5f * squares - normaliser - at(log_prob + row)) + 1.0f, gain = -at(advantage + row);
@@ -314,8 +312,8 @@ sums[0] += total(loss);
 for (int a = 0; a < actions; ++a) {
     Vector by_std = {}, moved = {};
     for (int row = 0; row < b.rows; row += 16) {
-        Loose& m = at(mean + a * room + row);
-        const Vector z = (at(action + a * room + row) - m) / std[a], step = m - at(old_mean + a * room + row);
+        Unaligned& m = at(mean + a * stride + row);
+        const Vector z = (at(action + a * stride + row) - m) / std[a], step = m - at(old_mean + a * stride + row);
         by_std += (z * z - 1.0f) * at(slope + row);
         moved += at(weight + row) * step * step;
         m = z / std[a] * at(slope + row);
@@ -332,42 +330,42 @@ def _surrogate(shape: Shape, b: Block, clip: float):
 
 
 @wp.func_native("return address + 4 * ((wp::uint64)i * (wp::uint64)size + (wp::uint64)j * (wp::uint64)step);")
-def _offset(address: wp.uint64, i: int, size: int, j: int, step: int) -> wp.uint64:
-    """Where number i * size + j * step lies."""
+def _offset(address: wp.uint64, i: int, size: wp.int64, j: int, step: wp.int64) -> wp.uint64:
+    """Where number i * size + j * step lies; there may be more than 2^31."""
 
 
 @wp.func_native("""
-float* y = (float*)b.memory + unit * b.room;
-for (int i = 0; i < units; ++i, y += b.room) {
+float* y = (float*)b.memory + unit * b.stride;
+for (int i = 0; i < units; ++i, y += b.stride) {
     for (int row = 0; row < rows; ++row) y[row] = ((const float*)source)[row * to_row + i * to_unit];
-    for (int row = rows; row < b.rows; ++row) y[row] = 0.0f;
+    for (int row = rows; row < b.rows; ++row) y[row] = y[rows - 1];
 }
 """)
-def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row: int, to_unit: int):
-    """Copy units of rows into a block, and 0 behind them."""
+def _read(b: Block, unit: int, units: int, rows: int, source: wp.uint64, to_row: wp.int64, to_unit: wp.int64):
+    """Copy units of rows into a block; behind them the last row is repeated, which overflows only if it does itself."""
 
 
 @wp.func_native("""
-const float* y = (const float*)b.memory + unit * b.room;
+const float* y = (const float*)b.memory + unit * b.stride;
 for (int row = 0; row < rows; ++row)
-    for (int i = 0; i < units; ++i) ((float*)to)[row * units + i] = y[i * b.room + row];
+    for (int i = 0; i < units; ++i) ((float*)to)[row * units + i] = y[i * b.stride + row];
 """)
 def _write(b: Block, unit: int, units: int, rows: int, to: wp.uint64):
     """Copy units of rows out of a block, row by row."""
 
 
 @wp.func_native("""
-float* y = (float*)b.memory + unit * b.room;
+float* y = (float*)b.memory + unit * b.stride;
 for (int row = 0, until; row < b.rows; row = until) {
     const int group = (first + row) / shared, end = (group + 1) * shared - first;
-    until = row >= rows ? b.rows : end < rows ? end : rows;
+    until = end < rows ? end : b.rows;
     for (int i = 0; i < units; ++i) {
-        const float value = row < rows ? ((const float*)start)[group * units + i] : 0.0f;
-        for (int r = row; r < until; ++r) y[i * b.room + r] = value;
+        const float value = ((const float*)start)[(long long)group * units + i];
+        for (int r = row; r < until; ++r) y[i * b.stride + r] = value;
     }
 }
 """)
-def _spread(b: Block, unit: int, units: int, first: int, rows: int, start: wp.uint64, shared: int):
+def _broadcast(b: Block, unit: int, units: int, first: int, rows: int, start: wp.uint64, shared: int):
     """Write what the first layer's sums start from, the same for ``shared`` consecutive rows."""
 
 
@@ -394,25 +392,27 @@ def _backward(shape: Shape, b: Block):
 def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
     """Take some rows through a network, and back."""
     outs, end = shape.units[shape.layers], shape.unit[shape.layers]
-    y = _offset(job.y, net, job.rows * outs, first, outs)
+    y = _offset(job.y, net, wp.int64(job.rows) * wp.int64(outs), first, wp.int64(outs))
     if job.start != wp.uint64(0):
-        units = shape.units[1]
-        start = _offset(job.start, net, (job.rows // job.shared) * units, 0, 0)
-        _spread(b, shape.unit[1], units, first, rows, start, job.shared)
-    x = _offset(job.x, net, job.x_net, first, job.x_row)
-    _read(b, 0, b.inputs, rows, x, job.x_row, job.x_unit)
+        start = _offset(job.start, net, wp.int64(job.rows // job.shared) * wp.int64(shape.units[1]), 0, wp.int64(0))
+        _broadcast(b, shape.unit[1], shape.units[1], first, rows, start, job.shared)
+    _read(b, 0, b.inputs, rows, _offset(job.x, net, job.x_net, first, job.x_row), job.x_row, job.x_unit)
     for layer in range(shape.layers):
         _product(shape, b, layer, False)
         if shape.activation > 0 and layer + 1 < shape.layers:
-            _bend(shape, b, layer)
+            _apply_activation(shape, b, layer)
     if job.mode == wp.static(int(Mode.FORWARD)):
         _write(b, end, outs, rows, y)
         return
     if job.mode == wp.static(int(Mode.BACKWARD)):
-        _read(b, end, outs, rows, y, outs, 1)
+        _read(b, end, outs, rows, y, wp.int64(outs), wp.int64(1))
+        for unit in range(end, end + outs):
+            _clear(_offset(b.memory, unit, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)
     else:
-        data = _offset(job.data, net, job.data_net, first, 1)
-        _read(b, shape.unit[shape.layers + 1], job.columns, rows, data, 1, job.data_column)
+        data, column = _offset(job.data, net, job.data_net, first, wp.int64(1)), shape.unit[shape.layers + 1]
+        _read(b, column, job.columns, rows, data, wp.int64(1), job.data_column)
+        weight = column if job.mode == wp.static(int(Mode.VALUE)) else column + job.columns - 1
+        _clear(_offset(b.memory, weight, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)  # they add nothing
         if job.mode == wp.static(int(Mode.VALUE)):
             _value_loss(shape, b, job.clip)
         else:
@@ -425,21 +425,21 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
     """Take parts until there are none left: cores that others use too are not equally fast."""
     job = jobs[0]
     b = Block()
-    b.memory = _offset(job.memory, thread, job.memory_size, 0, 0)
-    b.room = job.room
+    b.memory = _offset(job.memory, thread, wp.int64(job.memory_size), 0, wp.int64(0))
+    b.stride = job.block_rows
     b.inputs = job.inputs
-    blocks = (job.rows + job.room - 1) // job.room
+    blocks = (job.rows + job.block_rows - 1) // job.block_rows
     size = shape.parameters + job.sums
     task = _take(job.counter)
     while task < job.count * job.parts:
         net, part = task // job.parts, task % job.parts
-        b.parameters = _offset(job.parameters, net, shape.parameters, 0, 0)
-        b.gradient = _offset(job.gradient, task, size, 0, 0)
+        b.parameters = _offset(job.parameters, net, wp.int64(shape.parameters), 0, wp.int64(0))
+        b.gradient = _offset(job.gradient, task, wp.int64(size), 0, wp.int64(0))
         if job.mode != wp.static(int(Mode.FORWARD)):
             _clear(b.gradient, size)
         for block in range(part * blocks // job.parts, (part + 1) * blocks // job.parts):
-            first = block * job.room
-            rows = wp.min(job.room, job.rows - first)
+            first = block * job.block_rows
+            rows = wp.min(job.block_rows, job.rows - first)
             b.rows = (rows + STEP - 1) // STEP * STEP
             _work_on(shape, job, b, net, first, rows)
         task = _take(job.counter)

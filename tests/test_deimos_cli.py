@@ -53,7 +53,7 @@ TRAIN_ERRORS = {
     "--num-envs": "Missing value for argument '--num-envs'",
     "--env-steps 0": "env_steps must be at least 1, got 0",
     "--env-steps -5": "env_steps must be at least 1, got -5",
-    "--threads -1": "threads must be at least 0, got -1",
+    "--threads -1": r"threads must be in \[0, 4096\], got -1",
     "--threads 1000000": r"threads must be in \[0, 4096\], got 1000000",
     "--seed -1": r"seed must be in \[0, 2\^32\), got -1",
     "--seed 4294967296": r"seed must be in \[0, 2\^32\), got 4294967296",

@@ -1,5 +1,6 @@
-"""Losses: their gradients against autograd in float64, and the kernel's twins against them."""
+"""Losses: their gradients against autograd in float64, and the kernel's against them."""
 
+import copy
 import math
 
 import pytest
@@ -104,7 +105,7 @@ def learners():
 
 @pytest.mark.parametrize("rows", [1, 50, ROWS])
 @pytest.mark.parametrize("clip", [0.2, math.inf])
-def test_the_kernels_twins_are_these(rows, clip):
+def test_the_kernels_are_these(rows, clip):
     """Sums and gradients of the kernel are those of the functions here in float64, up to float32's rounding."""
     data, x = transitions(rows, seed=rows), torch.randn(rows, 8, generator=torch.Generator().manual_seed(rows))
     nets = learners()
@@ -122,8 +123,27 @@ def test_the_kernels_twins_are_these(rows, clip):
         torch.testing.assert_close(own.grad[0].double(), grads, rtol=1e-3, atol=1e-5 * float(grads.abs().max()))
 
 
+@pytest.mark.parametrize("rows", [97, 100, 143, 144])
+def test_what_fills_a_block_does_not_overflow(rows):
+    """With a narrow policy, whose density overflows a little away from its mean, gradients are torch's, and finite."""
+    actor = Actor(6, (64, 64), 12, "relu", 1e-4)
+    x, noise = torch.randn(rows, 6), torch.randn(12, rows)
+    data = torch.zeros(1, 27, rows)
+    data[0, :12] = 1e-4 * noise
+    data[0, 24] = log_prob(noise, torch.full((12, 1), 1e-4))
+    data[0, 25:] = torch.stack([torch.randn(rows), torch.full((rows,), 1 / rows)])
+    found = []
+    for kernel in (True, False):
+        own = MLPs([copy.deepcopy(actor)])
+        own._kernel = own._kernel if kernel else None
+        found.append((own.gradient(x, Surrogate(data, 0.2)), own.grad))
+    for mine, torchs in zip(*found, strict=True):
+        assert torchs.isfinite().all()
+        torch.testing.assert_close(mine, torchs, rtol=1e-3, atol=1e-6 + 1e-5 * float(torchs.abs().max()))
+
+
 @pytest.mark.parametrize("name", ["log_prob", "advantage", "weight", "old", "target"])
-def test_what_is_no_number_breaks_the_loss(name):
+def test_nan_breaks_the_loss(name):
     """In the kernel as in torch, NaN in the data shows in the loss or in the gradient."""
     data = transitions().float()
     data[0, 2 * ACTIONS + ["log_prob", "advantage", "weight", "old", "target"].index(name), 17] = torch.nan

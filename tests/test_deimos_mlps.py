@@ -2,22 +2,23 @@
 
 import copy
 import os
-import signal
+import pickle
 import threading
-import time
 
 import pytest
 import torch
 
+from deimos.goals.fear import Fear, FearConfig
+from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn import mlps
 from deimos.nn.adam import Adam
-from deimos.nn.losses import ValueLoss
+from deimos.nn.losses import Surrogate, ValueLoss
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Actor, mlp
-from deimos.nn.threads import Crew, available, on_threads, torch_on_one
+from deimos.nn.threads import on_threads
 
 # Depths; widths that fill no register, some, and all; few and many inputs and outputs.
-SHAPES = [(5, 7, 1), (12, 64, 64, 3), (11, 50, 33, 9, 6), (3, 130, 2), (48, 1100, 256, 128, 12)]
+SHAPES = [(5, 1), (5, 7, 1), (12, 64, 64, 3), (11, 50, 33, 9, 6), (3, 130, 2), (48, 1100, 256, 128, 12)]
 ROWS = [1, 47, 500]  # less than a register, not a multiple of its lanes, more than a block
 BACKENDS = ["kernel", "torch"]
 
@@ -109,7 +110,7 @@ def test_a_small_workspace_is_kept_to():
     """Products of torch's take parts of rows whose activations fit, and give the same."""
     nets = networks((6, 64, 1), 2)
     small, large = build(nets, "torch", workspace=1), build(nets, "torch", workspace=64)
-    assert len(list(small._parts(5000))) > 1 == len(list(large._parts(5000)))
+    assert len(list(small.parts(5000))) > 1 == len(list(large.parts(5000)))
     x = torch.randn(5000, 6)
     torch.testing.assert_close(small.forward(x), large.forward(x), rtol=1e-5, atol=1e-6)
 
@@ -117,7 +118,7 @@ def test_a_small_workspace_is_kept_to():
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])
 def test_nan_stays_nan(backend, activation):
-    """What is no number in an input or a weight is none in every output that it belongs to, and in no other."""
+    """A NaN in an input or a weight is one in every output that it belongs to, and in no other."""
     nets = networks((4, 16, 16, 2), 2, activation)
     built = build(nets, backend)
     x = torch.randn(60, 4)
@@ -148,7 +149,7 @@ def test_infinities_are_torchs(activation):
 @pytest.mark.parametrize("threads", [2, 5])
 def test_threads_change_no_bit(threads):
     """Outputs, scores, losses and gradients have the same bits on one thread and on several, again and again."""
-    nets, critics = networks((12, 64, 48, 3), 1, "elu"), networks((12, 40, 1), 7)
+    nets, critics = networks((12, 40, 48, 3), 1, "elu"), networks((12, 40, 1), 7)
     built = []
     for count in (1, threads):
         with on_threads(count):
@@ -157,27 +158,16 @@ def test_threads_change_no_bit(threads):
     data = ValueLoss(torch.rand(7, 3, 5000) * torch.tensor([1 / 5000, 1.0, 1.0]).unsqueeze(1), 0.2)
     for _ in range(5):
         found = []
-        for own, ensemble in built:
+        for count, (own, ensemble) in zip((1, threads), built, strict=True):
             sums = gradients((own, x, given(slopes)), (ensemble, x, data))
-            score = ensemble.score(x[:90, :9], x.view(-1, 20, 3)[:90])
-            found.append([own.forward(x), *sums, own.grad, ensemble.grad, score])
+            with on_threads(count):
+                scores = [nets.score(x[:90, :9], x.view(-1, 20, 3)[:90]) for nets in (own, ensemble)]
+            found.append([own.forward(x), *sums, own.grad, ensemble.grad, *scores])
         assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
         assert all(tensor.isfinite().all() and tensor.any() for tensor in found[0])
         for own, ensemble in built:
             own.parameters -= 1e-5 * own.grad
             ensemble.parameters -= 1e-3 * ensemble.grad
-
-
-def test_torch_alone_keeps_to_one_thread():
-    """``torch_on_one`` leaves shared work its threads, whatever is nested, and gives torch its own back."""
-    with on_threads(3):
-        with torch_on_one():
-            assert (torch.get_num_threads(), available()) == (1, 3)
-            with on_threads(2):
-                assert (torch.get_num_threads(), available()) == (2, 2)
-            with torch_on_one():
-                assert (torch.get_num_threads(), available()) == (1, 3)
-        assert (torch.get_num_threads(), available()) == (3, 3)
 
 
 def test_two_threads_of_the_host_share_the_kernel():
@@ -211,26 +201,6 @@ def test_a_fork_has_threads_of_its_own():
         os._exit(0 if torch.equal(built.forward(x), expected) else 1)
     assert os.waitpid(child, 0)[1] == 0
     assert torch.equal(built.forward(x), expected)
-
-
-@pytest.mark.parametrize("where", ["working", "waiting"])
-def test_an_interrupt_leaves_no_thread_behind(where):
-    """Ctrl-C while it works or waits is raised once all threads are done, and they work again afterwards."""
-    crew, finished = Crew(), []
-
-    def work(i):
-        if i == (0 if where == "working" else 1):
-            os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.05 * (i > 0))
-        finished.append(i)
-
-    with pytest.raises(KeyboardInterrupt):
-        crew.run(work, 4)
-    assert {1, 2, 3} <= set(finished)
-    for count in (4, 2, 4):
-        done = []
-        crew.run(done.append, count)
-        assert sorted(done) == list(range(count))
 
 
 def test_the_hosts_default_dtype_does_not_matter():
@@ -326,6 +296,100 @@ def test_other_inputs_are_refused(backend, x, message):
         built.forward(x)
     with pytest.raises(ValueError, match=message):
         built.gradient(x, given(torch.zeros(2, 4, 1)))
+
+
+def critics(count, outputs=1):
+    """Networks of 9 inputs."""
+    return networks((9, 16, outputs), count)
+
+
+def actors(count):
+    """Policies of two actions."""
+    return [Actor(9, (16,), 2, "relu", 0.5) for _ in range(count)]
+
+
+def wrong(*shape):
+    """A loss that gives gradients by the outputs of some shape."""
+    return lambda y, free: (y.sum((1, 2)).unsqueeze(1), torch.zeros(shape), free)
+
+
+@pytest.mark.parametrize(
+    ("nets", "loss", "message"),
+    [
+        (
+            critics(3),
+            ValueLoss(torch.zeros(1, 3, 40), 0.2),
+            r"ValueLoss must have the shape \(3, 3, 40\) .* \(1, 3, 40\)",
+        ),
+        (critics(1), ValueLoss(torch.zeros(1, 3, 39), 0.2), r"the shape \(1, 3, 40\) on cpu, got \(1, 3, 39\)"),
+        (critics(1), ValueLoss(torch.zeros(1, 9, 40), 0.2), r"the shape \(1, 3, 40\) on cpu, got \(1, 9, 40\)"),
+        (critics(1), ValueLoss(torch.zeros(1, 3, 40, device="meta"), 0.2), "on cpu, got .* on meta"),
+        (critics(1, 2), ValueLoss(torch.zeros(1, 3, 40), 0.2), "ValueLoss needs networks with one output, got 2"),
+        (
+            actors(1),
+            Surrogate(torch.zeros(1, 9, 40), 0.2),
+            r"Surrogate must have the shape \(1, 7, 40\) .* \(1, 9, 40\)",
+        ),
+        (actors(1), Surrogate(torch.zeros(1, 7, 30), 0.2), r"the shape \(1, 7, 40\) on cpu, got \(1, 7, 30\)"),
+        (actors(2), Surrogate(torch.zeros(1, 7, 40), 0.2), "Surrogate needs one network .* got 2 with 2 outputs and 2"),
+        (critics(1, 2), Surrogate(torch.zeros(1, 7, 40), 0.2), "got 1 with 2 outputs and 0 free parameters"),
+        (critics(3, 2), wrong(1, 40, 2), r"gradients by its outputs of shape \(3, 40, 2\) on cpu, got \(1, 40, 2\)"),
+        (critics(1, 2), wrong(1, 39, 2), r"outputs of shape \(1, 40, 2\) on cpu, got \(1, 39, 2\)"),
+    ],
+)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_other_losses_are_refused(backend, nets, loss, message):
+    """Data, or gradients by outputs, that do not fit networks and rows raise ``ValueError``: the kernel trusts them."""
+    built = build(nets, backend)
+    with pytest.raises(ValueError, match=message):
+        built.gradient(torch.zeros(40, 9), loss)
+    assert not built.grad.any()
+
+
+class Apart(torch.nn.Module):
+    """A network whose free parameters lie before and between its layers."""
+
+    def __init__(self):
+        super().__init__()
+        self.shift = torch.nn.Parameter(torch.ones(1))
+        self.first, self.activation = torch.nn.Linear(3, 4), torch.nn.ReLU()
+        self.rest = Actor(4, (), 1, "relu", 0.5)
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (
+            torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.GELU(), torch.nn.Linear(4, 1)),
+            "got Linear, GELU, Linear",
+        ),
+        (torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Linear(4, 1)), "must be linear layers with biases and"),
+        (torch.nn.Linear(3, 1, bias=False), "linear layers with biases and one of relu, elu, tanh between them"),
+        (
+            torch.nn.Sequential(*mlp(3, (4,), 4, "relu"), torch.nn.Tanh(), torch.nn.Linear(4, 1)),
+            "got Linear, ReLU, Lin",
+        ),
+        (Apart(), "parameters that belong to no layer must follow each other"),
+    ],
+)
+def test_other_networks_are_refused(module, message):
+    """Layers that neither backend computes raise ``ValueError``, and so do networks of different shapes."""
+    with pytest.raises(ValueError, match=message):
+        MLPs([module])
+    with pytest.raises(ValueError, match="must all have the same layers"):
+        MLPs([mlp(3, (4,), 1, "relu"), mlp(3, (4,), 1, "elu")])
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, pickle.dumps])
+def test_copies_name_the_way_out(duplicate):
+    """What holds networks of which the kernel knows the address is not copied; the message names ``state_dict``."""
+    for held in (
+        build(critics(1)),
+        PPO(PPOConfig(), 4, 3, 2, torch.device("cpu"), 0),
+        Fear(FearConfig(), 3, 2, torch.device("cpu"), 0),
+    ):
+        with pytest.raises(TypeError, match=r"cannot be copied or pickled.*state_dict\(\)"):
+            duplicate(held)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -62,6 +62,21 @@ def test_scores_are_the_predictors_errors(monkeypatch, kernel):
     torch.testing.assert_close(selector.surprise(state, goal, candidates), expected, rtol=1e-3, atol=1e-5)
 
 
+def test_surprises_fit_the_workspace():
+    """Many decisions are scored in parts, whose numbers do not depend on where they are split."""
+    world = World()
+    world.update()
+    selector, (_, state, goal, candidates, _) = world.selector, world.decision()
+    whole, nets, sizes = selector.surprise(state, goal, candidates), selector._predictor, []
+    nets._workspace = 2**18
+    score = nets.score
+    nets.score = lambda context, goals: (sizes.append(len(context)), score(context, goals))[1]
+    torch.testing.assert_close(selector.surprise(state, goal, candidates), whole, rtol=1e-5, atol=1e-6)
+    assert sum(sizes) == NUM_ENVS
+    assert max(sizes) * CANDIDATES * 2 * 64 * 4 <= 2**18  # a layer's inputs and outputs, of 4 bytes each
+    assert len(selector.surprise(state[:0], goal[:0], candidates[:0])) == 0
+
+
 @pytest.mark.parametrize("rule", ["argmax", "proportional"])
 def test_the_most_surprising_goal_or_in_proportion(rule):
     """Argmax takes the largest surprise; proportional draws the others too, and larger ones more often."""

@@ -24,7 +24,7 @@ from deimos.files import load_tensors
 from deimos.goals.fear import FearConfig
 from deimos.goals.methods import METHODS, method
 from deimos.goals.selector import SelectorConfig
-from deimos.goals.selectors import director, uniform
+from deimos.goals.selectors import director, rnd, uniform
 from deimos.learn.ppo import PPOConfig
 from deimos.learn.rollout import Rollout
 from deimos.nn.random import Purpose, normals
@@ -235,11 +235,19 @@ def test_same_seed_same_run(undisturbed, tmp_path):
     assert rows(tmp_path / "other")[0] != rows(undisturbed)[0]
 
 
-@pytest.mark.parametrize("name", ["director", "vds"])
-def test_threads_change_no_number(name, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "selector",
+    [
+        method("p75"),
+        method("vds"),
+        rnd.Config(target=64, predictor=128, features=128),  # so large that torch shares out the weights' decomposition
+    ],
+    ids=kind,
+)
+def test_threads_change_no_number(selector, tmp_path, monkeypatch):
     """On one thread and on several, all of which have work, ``progress.csv`` has the same bytes."""
-    monkeypatch.setattr("deimos.nn.cpu.LEAST", 1.0)
-    config = replace(CONFIG, num_envs=1500, env_steps=48, selector=None, method={"director": "p75", "vds": "vds"}[name])
+    monkeypatch.setattr("deimos.nn.cpu.MIN_OPERATIONS", 1.0)
+    config = replace(CONFIG, num_envs=1500, env_steps=48, selector=selector)
     before, written = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 5):

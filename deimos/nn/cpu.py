@@ -10,13 +10,13 @@ import warp as wp
 from torch import Tensor
 
 from deimos.kernels.mlp import ACTIVATIONS, STEP, Job, Mode, Shape, record
-from deimos.nn.losses import Loss, Surrogate, ValueLoss
-from deimos.nn.threads import CREW, available
+from deimos.nn.losses import Loss, Surrogate, ValueLoss, by_outputs
+from deimos.nn.threads import POOL, available
 
-ROOM = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
-BLOCK = 3 * 2**17  # numbers in a block, 1.5 MiB: what a core's caches hold
+BLOCK_ROWS = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
+BLOCK_SIZE = 3 * 2**17  # numbers in a block, 1.5 MiB: what a core's caches hold
 PARTS = 16  # of the rows of all networks together, each with a gradient of its own
-LEAST = 1e7  # operations that are worth waking a thread for, about 100 us
+MIN_OPERATIONS = 1e7  # operations that are worth waking a thread for, about 100 us
 
 
 class Kernel:
@@ -48,15 +48,15 @@ class Kernel:
             setattr(shape, name, wp.array(values, dtype=int, device="cpu"))
         self._operations = 2 * count * sum(a * b for a, b in itertools.pairwise(units))
         columns = 2 * units[-1] + 3  # of the largest loss
-        self._room = max(STEP, min(ROOM, BLOCK // (sum(units) + columns)) // STEP * STEP)
-        self._memory = torch.zeros(self._threads, (sum(units) + columns) * self._room, dtype=torch.float32)
+        self._block_rows = max(STEP, min(BLOCK_ROWS, BLOCK_SIZE // (sum(units) + columns)) // STEP * STEP)
+        self._memory = torch.zeros(self._threads, (sum(units) + columns) * self._block_rows, dtype=torch.float32)
         self._gradient = torch.zeros(0)
         self._counter = ctypes.c_int32()
         jobs = wp.zeros(1, dtype=Job, device="cpu")
         self._job: Any = jobs.numpy()
         self._fill(
-            count=count, room=self._room, counter=ctypes.addressof(self._counter), memory=self._memory.data_ptr(),
-            memory_size=self._memory.shape[1], parameters=parameters.data_ptr(),
+            count=count, block_rows=self._block_rows, counter=ctypes.addressof(self._counter),
+            memory=self._memory.data_ptr(), memory_size=self._memory.shape[1], parameters=parameters.data_ptr(),
         )  # fmt: skip
         self._launches = [record(shape, jobs, thread) for thread in range(self._threads)]
 
@@ -75,9 +75,10 @@ class Kernel:
         rows = x.shape[-2]
         y = torch.empty(len(self._parameters), rows, self._outputs, dtype=torch.float32)
         start = None if start is None else start.contiguous()
-        with CREW.lock:
+        with POOL.lock:
             self._prepare(Mode.FORWARD, x, y)
-            self._fill(parts=-(-rows // self._room), shared=shared, start=0 if start is None else start.data_ptr())
+            address = 0 if start is None else start.data_ptr()
+            self._fill(parts=-(-rows // self._block_rows), shared=shared, start=address)
             _run([self], rows * self._operations)
         return y
 
@@ -93,7 +94,7 @@ class Kernel:
     def prepare_gradient(self, mode: Mode, x: Tensor, sums: int, data: Tensor, clip: float = 0.0) -> float:
         """Fill in a job that adds up gradients; ``data`` are the loss's, or gradients by outputs. Gives operations."""
         rows, count = x.shape[-2], len(self._parameters)
-        parts = max(1, min(-(-rows // self._room), max(4, PARTS // count)))
+        parts = max(1, min(-(-rows // self._block_rows), max(4, PARTS // count)))
         shape = count, parts, self._size + sums
         if self._gradient.shape != shape:
             with torch.inference_mode(False):
@@ -119,11 +120,11 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
     if not all(isinstance(loss, ValueLoss | Surrogate) for _, _, loss in work):
         return [_by_outputs(*item) for item in work]
     kernels, operations, kept = [kernel for kernel, _, _ in work], 0.0, []
-    with CREW.lock:
+    with POOL.lock:
         for kernel, x, loss in work:
             assert isinstance(loss, ValueLoss | Surrogate)
             mode = Mode.VALUE if isinstance(loss, ValueLoss) else Mode.SURROGATE
-            kept.append(loss.data.float() if loss.data.stride(-1) == 1 else loss.data.float().contiguous())
+            kept.append(loss.data if loss.data.stride(-1) == 1 else loss.data.contiguous())
             operations += kernel.prepare_gradient(mode, x, loss.sums, kept[-1], loss.clip)
         _run(kernels, operations)
         return [kernel.collect() for kernel in kernels]
@@ -131,9 +132,9 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
 
 def _by_outputs(kernel: Kernel, x: Tensor, loss: Loss) -> Tensor:
     """The gradient of a loss that torch computes between two passes."""
-    sums, delta, free = loss(kernel.forward(x), kernel._parameters[:, kernel._free])
-    delta = delta.float().contiguous()
-    with CREW.lock:
+    sums, delta, free = by_outputs(loss, kernel.forward(x), kernel._parameters[:, kernel._free])
+    delta = delta.contiguous()
+    with POOL.lock:
         _run([kernel], kernel.prepare_gradient(Mode.BACKWARD, x, 0, delta))
         kernel.collect()
     kernel._grad[:, kernel._free] = free
@@ -147,4 +148,4 @@ def _run(kernels: list[Kernel], operations: float) -> None:
         for kernel in kernels:
             kernel._launches[thread].launch()  # Python's lock is free meanwhile
 
-    CREW.run(work, max(1, min(min(kernel._threads for kernel in kernels), int(operations / LEAST))))
+    POOL.run(work, max(1, min(min(kernel._threads for kernel in kernels), int(operations / MIN_OPERATIONS))))

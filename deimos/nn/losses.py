@@ -1,7 +1,7 @@
 """Losses of networks and their gradients by the outputs, written out in torch: the reference.
 
-``kernels.mlp`` has twins of ``ValueLoss`` and ``Surrogate``, which a CPU computes while a block of rows lies in its
-caches. Tests hold these functions to autograd in float64, and the twins to them.
+``kernels.mlp`` has ``ValueLoss`` and ``Surrogate`` too, which a CPU computes while a block of rows lies in its caches.
+Tests hold these functions to autograd in float64, and the kernel's to them.
 """
 
 import math
@@ -35,6 +35,16 @@ class ValueLoss:
     def __getitem__(self, rows: slice) -> "ValueLoss":
         return replace(self, data=self.data[..., rows])
 
+    def data_shape(self, networks: int, rows: int, outputs: int, free: int) -> tuple[int, ...]:
+        """The shape that ``data`` must have.
+
+        Raises:
+            ValueError: If no data fit networks with so many outputs.
+        """
+        if outputs != 1:
+            raise ValueError(f"ValueLoss needs networks with one output, got {outputs}.")
+        return networks, 3, rows
+
     def __call__(self, value: Tensor, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See ``Loss``; there is one output."""
         weight, old, target = self.data.unbind(1)
@@ -64,6 +74,19 @@ class Surrogate:
     def __getitem__(self, rows: slice) -> "Surrogate":
         return replace(self, data=self.data[..., rows])
 
+    def data_shape(self, networks: int, rows: int, outputs: int, free: int) -> tuple[int, ...]:
+        """The shape that ``data`` must have.
+
+        Raises:
+            ValueError: If no data fit so many networks, or networks with so many outputs and free parameters.
+        """
+        if networks != 1 or outputs != free:
+            raise ValueError(
+                "Surrogate needs one network with a free parameter for every output, its standard deviation; got "
+                f"{networks} with {outputs} outputs and {free} free parameters."
+            )
+        return 1, 2 * outputs + 3, rows
+
     @property
     def sums(self) -> int:
         """How many sums it gives."""
@@ -82,6 +105,21 @@ class Surrogate:
         sums = torch.cat([loss.unsqueeze(0), (mean - old_mean).square() @ weight])
         by_mean, by_std = z / std * slope, (z.square() - 1.0) @ slope / std[:, 0]
         return sums.unsqueeze(0), by_mean.t().unsqueeze(0), by_std.unsqueeze(0)
+
+
+def by_outputs(loss: Loss, y: Tensor, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What a loss gives for outputs; its gradient by them in float32.
+
+    Raises:
+        ValueError: If that has another shape or device than the outputs.
+    """
+    sums, slopes, by_free = loss(y, free)
+    if slopes.shape != y.shape or slopes.device != y.device:
+        raise ValueError(
+            f"A loss must give gradients by its outputs of shape {tuple(y.shape)} on {y.device}, got "
+            f"{tuple(slopes.shape)} on {slopes.device}."
+        )
+    return sums, slopes.float(), by_free
 
 
 def log_prob(z: Tensor, std: Tensor) -> Tensor:

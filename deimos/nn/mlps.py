@@ -1,13 +1,16 @@
 """K multilayer perceptrons of one shape: forward, gradient, and scores of many candidates per context."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from deimos.nn.losses import Loss
+from deimos.nn.losses import Loss, Surrogate, ValueLoss, by_outputs
+from deimos.nn.threads import torch_on_one
 
 if TYPE_CHECKING:
     from deimos.nn.cpu import Kernel
@@ -27,29 +30,21 @@ class MLPs:
             parameters and their gradients become views of ``parameters`` and ``grad``.
         memory: Where parameters and gradients shall lie, float32, shape (2, K, numbers); ``None`` allocates it.
         workspace: Memory for activations in torch's products [MiB]; what takes more is computed in parts.
+
+    Raises:
+        ValueError: If a module has other layers, or they are not of one shape.
     """
 
     def __init__(self, modules: Sequence[nn.Module], memory: Tensor | None = None, workspace: int = 64) -> None:
         self.modules = list(modules)
-        first = self.modules[0]
-        linears = [layer for layer in first.modules() if isinstance(layer, nn.Linear)]
-        self.units = (linears[0].in_features, *(layer.out_features for layer in linears))
-        """Inputs, and outputs of every layer."""
-        self.activation = next(ACTIVATIONS[type(layer)] for layer in first.modules() if type(layer) in ACTIVATIONS)
-        offsets: dict[Tensor, int] = {}
-        size = 0
-        for parameter in first.parameters():
-            offsets[parameter] = size
-            size += parameter.numel()
-        self.weights = [offsets[layer.weight] for layer in linears]
-        """Where every layer's weights start, shape (outputs, inputs); its biases follow them."""
-        in_layers = {parameter for layer in linears for parameter in layer.parameters()}
-        free = [parameter for parameter in offsets if parameter not in in_layers]
-        start = offsets[free[0]] if free else size
-        self.free = slice(start, start + sum(parameter.numel() for parameter in free))
-        """Where the free parameters lie."""
+        first, *others = (_layout(module) for module in self.modules)
+        if any(other != first for other in others):
+            raise ValueError("modules must all have the same layers.")
+        self.units, self.activation, self.weights, self.free = first
         if memory is None:
-            memory = torch.zeros(2, len(self.modules), size, device=linears[0].weight.device, dtype=torch.float32)
+            parameters = list(self.modules[0].parameters())
+            size, device = sum(parameter.numel() for parameter in parameters), parameters[0].device
+            memory = torch.zeros(2, len(self.modules), size, device=device, dtype=torch.float32)
         self.parameters, self.grad = memory
         """Shape (K, numbers) each."""
         for module, *rows in zip(self.modules, *memory, strict=True):
@@ -59,6 +54,12 @@ class MLPs:
 
     def __len__(self) -> int:
         return len(self.modules)
+
+    def __getstate__(self) -> dict:
+        raise TypeError(
+            "Networks whose parameters are views of one vector cannot be copied or pickled, nor can what holds them; "
+            "make another one and load this one's state_dict()."
+        )
 
     @torch.no_grad()
     def forward(self, x: Tensor) -> Tensor:
@@ -73,7 +74,7 @@ class MLPs:
         x = self._rounded(x)
         if self._kernel is not None:
             return self._kernel.forward(x)
-        parts = [self._layers(x[..., rows, :].expand(len(self), -1, -1))[-1] for rows in self._parts(x.shape[-2])]
+        parts = [self._layers(x[..., rows, :].expand(len(self), -1, -1))[-1] for rows in self.parts(x.shape[-2])]
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     @torch.no_grad()
@@ -97,12 +98,13 @@ class MLPs:
             )
         context, candidates = context.float(), candidates.float()
         weight, bias = self._layer(0)
-        start = torch.baddbmm(bias, context.expand(len(self), -1, -1), weight[..., :known].mT)
+        with torch_on_one() if self._kernel is not None else nullcontext():
+            start = torch.baddbmm(bias, context.expand(len(self), -1, -1), weight[..., :known].mT)
         if self._kernel is not None:
             y = self._kernel.forward(candidates.reshape(rows * count, size), start, count)
             return y.view(len(self), rows, count, self.units[-1])
         parts = []
-        for few in self._parts(rows, count):
+        for few in self.parts(rows, count):
             hidden = torch.matmul(candidates[few], weight[:, None, :, known:].mT) + start[:, few, None]
             parts.append(self._layers(hidden.flatten(1, 2), first=1)[-1])
         return torch.cat(parts, dim=1).view(len(self), rows, count, self.units[-1])
@@ -117,13 +119,16 @@ class MLPs:
 
         Returns:
             The loss's sums, shape (K, sums).
+
+        Raises:
+            ValueError: If shape or device of the inputs, or of the loss's data, do not fit the networks.
         """
         return gradients((self, x, loss))[0]
 
     def _gradient(self, x: Tensor, loss: Loss) -> Tensor:
         """``gradient`` by torch's products."""
         activations = self._layers(x.expand(len(self), -1, -1))
-        sums, delta, free = loss(activations.pop(), self.parameters[:, self.free])
+        sums, delta, free = by_outputs(loss, activations.pop(), self.parameters[:, self.free])
         self.grad[:, self.free] = free
         for layer in reversed(range(len(self.weights))):
             below = activations.pop()
@@ -150,7 +155,7 @@ class MLPs:
         weight, bias = numbers.split([inputs * outputs, outputs, numbers.shape[1] - (inputs + 1) * outputs], dim=1)[:2]
         return weight.unflatten(1, (outputs, inputs)), bias.unsqueeze(1)
 
-    def _parts(self, rows: int, each: int = 1) -> Iterator[slice]:
+    def parts(self, rows: int, each: int = 1) -> Iterator[slice]:
         """Parts of rows whose activations fit the workspace; ``each`` row stands for so many."""
         size = max(1, self._workspace // (8 * len(self) * each * max(self.units)))  # a layer's inputs and outputs
         return (slice(start, start + size) for start in range(0, max(rows, 1), size))
@@ -171,16 +176,56 @@ class MLPs:
             )
         return x.float()
 
+    def _rounded_loss(self, loss: Loss, rows: int) -> Loss:
+        """A loss with its data in float32; they must fit the networks, for the kernel reads them by address."""
+        if not isinstance(loss, ValueLoss | Surrogate):
+            return loss
+        data, device = loss.data, self.parameters.device
+        shape = loss.data_shape(len(self), rows, self.units[-1], self.free.stop - self.free.start)
+        if data.shape != shape or data.device != device:
+            raise ValueError(
+                f"data of {type(loss).__name__} must have the shape {shape} on {device}, got {tuple(data.shape)} on "
+                f"{data.device}."
+            )
+        return replace(loss, data=data.float())
+
 
 def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
     """``MLPs.gradient`` of several, by threads that pass from one to the next without waiting for each other."""
-    rounded = [(nets, nets._rounded(x), loss) for nets, x, loss in work]
+    rounded = [(nets, nets._rounded(x), nets._rounded_loss(loss, x.shape[-2:-1].numel())) for nets, x, loss in work]
     prepared = [(nets._kernel, x, loss) for nets, x, loss in rounded if nets._kernel is not None]
     if len(prepared) < len(work):
         return [nets._gradient(x, loss) for nets, x, loss in rounded]
     from deimos.nn import cpu
 
     return cpu.gradients(prepared)
+
+
+def _layout(module: nn.Module) -> tuple[tuple[int, ...], str, list[int], slice]:
+    """A network's units, its activation, where layers' weights start among its parameters, and where free ones lie."""
+    leaves = [part for part in module.modules() if not list(part.children())]
+    linears = [layer for layer in leaves[::2] if isinstance(layer, nn.Linear) and layer.bias is not None]
+    between = {type(layer) for layer in leaves[1::2]}
+    if len(linears) != len(leaves) // 2 + 1 or len(between) > 1 or not between <= ACTIVATIONS.keys():
+        names = ", ".join(type(layer).__name__ for layer in leaves)
+        raise ValueError(
+            f"A network must be linear layers with biases and one of {', '.join(ACTIVATIONS.values())} between them, "
+            f"got {names}."
+        )
+    offsets: dict[Tensor, int] = {}
+    size = 0
+    for parameter in module.parameters():
+        offsets[parameter] = size
+        size += parameter.numel()
+    in_layers = {parameter for layer in linears for parameter in layer.parameters()}
+    free = [parameter for parameter in offsets if parameter not in in_layers]
+    start = offsets[free[0]] if free else size
+    free_end = start + sum(parameter.numel() for parameter in free)
+    if free and offsets[free[-1]] + free[-1].numel() != free_end:
+        raise ValueError("A network's parameters that belong to no layer must follow each other.")
+    activation = ACTIVATIONS[between.pop()] if between else "relu"  # a single layer has none
+    units = linears[0].in_features, *(layer.out_features for layer in linears)
+    return units, activation, [offsets[layer.weight] for layer in linears], slice(start, free_end)
 
 
 def _move(module: nn.Module, parameters: Tensor, grad: Tensor) -> None:

@@ -48,6 +48,8 @@ class _Worker(threading.Thread):
         super().__init__(daemon=True)
         self.work: Callable[[int], object] | None = None
         """What it is to do; ``None`` once it has."""
+        self.error: BaseException | None = None
+        """What its last work raised."""
         self._number = number
         self._gate, self._done = threading.Lock(), threading.Lock()
         self._gate.acquire()
@@ -62,10 +64,11 @@ class _Worker(threading.Thread):
                 continue
             try:
                 work(self._number)
-            finally:
-                self.work = None
-                if self._done.locked():
-                    self._done.release()
+            except BaseException as error:
+                self.error = error
+            self.work = None
+            if self._done.locked():
+                self._done.release()
 
     def wake(self) -> None:
         """Let it look for work; doing so once too often does no harm."""
@@ -78,7 +81,7 @@ class _Worker(threading.Thread):
         self._done.acquire()
 
 
-class Crew:
+class ThreadPool:
     """Threads of Python that sleep while there is nothing to do; made when they are first needed.
 
     Work must release Python's lock to gain by them, and find its own share of what there is to do.
@@ -92,29 +95,31 @@ class Crew:
     def run(self, work: Callable[[int], object], count: int) -> None:
         """Call ``work(i)`` on ``count`` threads, i from 0, the first of them the caller's.
 
-        Returns, or raises what interrupted it, when all of them are done: then nobody touches the work's memory.
+        Returns when all of them are done, for then nobody touches the work's memory, or raises the first error: what
+        interrupted the caller, or what the work raised on a thread.
         """
         while len(self._workers) < count - 1:
             self._workers.append(_Worker(len(self._workers) + 1))
-        workers, interrupt = self._workers[: count - 1], None
+        workers, errors = self._workers[: count - 1], []
         try:
             for worker in workers:
-                worker.work = work
+                worker.work, worker.error = work, None
                 worker.wake()
             work(0)
         except BaseException as error:  # Ctrl-C may come at any time
-            interrupt = error
+            errors.append(error)
         while busy := [worker for worker in workers if worker.work is not None]:
             try:
                 busy[0].wait()
             except BaseException as error:
-                interrupt = error
-        if interrupt is not None:
-            raise interrupt
+                errors.append(error)
+        errors += [worker.error for worker in workers if worker.error is not None]
+        if errors:
+            raise errors[0]
 
 
-CREW = Crew()
+POOL = ThreadPool()
 """The process's."""
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=CREW.__init__)  # type: ignore[misc]  # threads do not survive a fork
+    os.register_at_fork(after_in_child=POOL.__init__)  # type: ignore[misc]  # threads do not survive a fork

@@ -54,7 +54,6 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_at_least("num_envs", self.num_envs, 1)
         check_at_least("env_steps", self.env_steps, 1)
-        check_at_least("threads", self.threads, 0)
         check_range("threads", self.threads, 0, MOST_THREADS)
         check_choice("device", self.device, ["auto", "cpu", "cuda"])
         if not 0 <= self.seed < 2**32:
@@ -90,6 +89,7 @@ class TrainConfig:
 class Trainer:
     """Everything that a run holds in memory, and one iteration of it."""
 
+    @torch_on_one()  # sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.config = config
         self.env = config.env.build(config.num_envs, device, config.seed)
@@ -133,6 +133,7 @@ class Trainer:
             clock.lap("goals")
         rollout.obs[-1] = env.obs
 
+    @torch_on_one()
     def iterate(self) -> dict[str, float]:
         """One rollout and what is learnt from it.
 
@@ -142,11 +143,6 @@ class Trainer:
         Raises:
             SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
         """
-        # Sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not.
-        with torch_on_one():
-            return self._iterate()
-
-    def _iterate(self) -> dict[str, float]:
         try:
             self.collect()
             self.iteration += 1

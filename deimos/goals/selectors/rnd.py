@@ -17,6 +17,7 @@ from deimos.nn.mlps import MLPs
 from deimos.nn.networks import Activation, mlp
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.seeds import generator
+from deimos.nn.threads import torch_on_one
 
 CLIP = 5.0  # bound of whitened inputs, as in the paper
 
@@ -71,6 +72,7 @@ class RND(GoalSelector):
         "fitted",
     )  # fmt: skip
 
+    @torch_on_one()  # orthogonal weights come from a decomposition whose sums depend on torch's threads
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.num_candidates = config.candidates
@@ -119,9 +121,12 @@ class RND(GoalSelector):
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""
         context = self._whiten(torch.cat([state, goal], dim=1), self._context)
-        candidates = self._whiten(candidates, self._goal)
-        error = self._predictor.score(context, candidates) - self._target.score(context, candidates)
-        return error[0].square_().mean(2)
+        parts = []
+        for few in self._predictor.parts(*candidates.shape[:2]):  # a candidate has many outputs, not one score
+            goals = self._whiten(candidates[few], self._goal)
+            error = self._predictor.score(context[few], goals) - self._target.score(context[few], goals)
+            parts.append(error[0].square_().mean(2))
+        return torch.cat(parts)
 
     def _whiten(self, inputs: Tensor, part: slice) -> Tensor:
         return (inputs - self._mean[part]).mul_(self._scale[part]).clamp_(-self._clip, self._clip)
