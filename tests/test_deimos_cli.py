@@ -16,13 +16,16 @@ import pytest
 import torch
 
 import deimos
+from deimos import plugins
 from deimos.app import cli
+from deimos.goals import selectors
 from deimos.goals.methods import METHODS, method
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.config import from_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
+from deimos.sim import envs
 from deimos.sim.envs import particle
 
 HOME = Path(deimos.__file__).resolve().parent.parent
@@ -468,6 +471,22 @@ def test_help_explains_a_selector(capsys):
     for flag, text in described_fields(method("p25"), "selector."):
         assert f" {flag} " in shown.replace(",", " "), flag
         assert text in shown, flag
+
+
+@pytest.mark.parametrize("command", ["train", "train env:quad selector:schedule", "study run", "terrain grid"])
+def test_help_does_not_show_none(capsys, command):
+    """An option that may be left out shows what it takes; what it is by default is in its text, and never None."""
+    shown = shown_help(command.split(), capsys)
+    assert not re.search(r"\bNone\b", shown)
+    assert "(default: " in shown
+    assert re.search(r" --(method|methods|preset|file) (\{\[)?(STR|PATH) ", shown)
+
+
+def test_plugins_are_one_line_in_a_list():
+    """What a selector or an environment is fits the list of them: one paragraph."""
+    for package in (selectors, envs):
+        for name, module in plugins.load_all(package).items():
+            assert "\n\n" not in module.Config.__doc__.strip(), name
 
 
 @pytest.mark.parametrize("command", ["evaluate", "play", "study", "study run", "study show", "terrain", "terrain grid"])

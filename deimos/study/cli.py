@@ -50,7 +50,7 @@ class RunOptions(_FolderOptions):
     device: Literal["auto", "cpu", "cuda"] | None = None
     """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
-    """CPU threads of every worker, in place of the file's, which is 1 unless said. Part of what fixes its numbers."""
+    """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell."""
     workers: int = 1
     """Parallel runs, at least 1."""
     retry_failed: bool = False
