@@ -2,23 +2,29 @@
 
 import importlib
 import math
+import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from deimos.kernels.legged.state import RATE_SCALE, VELOCITY_SCALE
 
+from deimos.app import cli
 from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.run import attackers
 from deimos.run.attack import Explorer, argmax_director, attacker, learn_fear, names, quality, uniform_goals
-from deimos.run.attackers import search
+from deimos.run.attackers import q_fear, search
 from deimos.run.attackers.pooled import make_pool
 from deimos.run.attackers.scripted import Scripted
 from deimos.run.evaluation import EvalConfig, _identities, evaluate, make_target
-from deimos.sim.envs import particle
+from deimos.sim.envs import particle, quad, quad_arm
 
+OLD = Path(__file__).parent / "data" / "run_0_1_0"  # of a policy that crashes
 CPU = torch.device("cpu")
 VARIANTS = ["absolute", "directional", "relative"]
 SMALL = EvalConfig(
@@ -79,6 +85,18 @@ def test_scripted_goals_are_outward_and_valid(variant):
     assert cosine == pytest.approx(torch.ones(49), abs=1e-5)
 
 
+@pytest.mark.parametrize("config", [quad.Config(engine="native"), quad_arm.Config(engine="native")])
+def test_scripted_turns_robots_round(config):
+    """A robot is asked for the reverse of its velocity at the limits, and for a uniform, valid place of its arm."""
+    env, rows = config.build(4, CPU, 0), torch.arange(4)
+    candidates = env.sample_goals(rows, 1).clone()
+    goal = Scripted(env).propose(rows, env.state(env.obs), env.goal, candidates, env.draw(rows)).goal
+    limits = torch.tensor([VELOCITY_SCALE, VELOCITY_SCALE, RATE_SCALE])
+    assert torch.equal(goal[:, :3], -env.goal[:, :3].sign() * limits)
+    assert torch.equal(goal[:, 3:], candidates[:, 0, 3:])
+    assert (env.goal_bounds(rows) is None) == isinstance(config, quad_arm.Config)
+
+
 def test_scripted_is_uniform_where_nobody_knows_better():
     """In an environment without scripted goals it issues Uniform's, and its row says so."""
     env = particle.Config().build(20, CPU, 0)
@@ -113,14 +131,15 @@ def test_the_thesis_adversary_learns_from_uniform_goals():
 
 
 def test_q_fear_sees_beyond_a_goal():
-    """Where no goal can crash a policy within its T steps, it asks for speed towards the wall that is next."""
+    """Where no goal can crash a policy within T steps it asks for speed towards a wall, and fears it far more."""
     config = particle.Config(goal_period=10)  # at 10 u a step nobody crosses the 250 u that are left
     target = make_target(blind(), config, replace(SMALL, worlds=300, adversary_steps=500), CPU)
     env, rows = config.build(200, CPU, 3), torch.arange(200)
     still = torch.tensor([0.0, 0.0, 0.0, 0.75, 0.0, 0.0, 0.0, 0.0, 0.0]).expand(200, 9)
     arguments = (rows, still, still[:, :3], env.sample_goals(rows, 100).clone(), env.draw(rows))
-    speed = attacker("q-fear").prepare(target).selector(env).propose(*arguments).goal[:, 0]
-    assert speed.mean() > 0.7
+    far, near = (q_fear.Config(beta=beta).prepare(target).selector(env).propose(*arguments) for beta in (0.9, 0.0))
+    assert far.goal[:, 0].mean() > 0.7
+    assert far.score.mean() > near.score.mean() + 5.0  # in log odds
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -192,6 +211,24 @@ def test_a_pool_attacks_policies_that_it_has_not_seen(tmp_path):
     assert before[1] != after[1]
 
 
+def test_a_pool_is_made_and_used_by_commands(tmp_path, capsys):
+    """``deimos pool`` makes the file, once, and ``deimos evaluate`` attacks with it, beside the run's own attackers."""
+    shutil.copytree(OLD, tmp_path / "run")
+    stored = tmp_path / "run" / "config.json"
+    stored.write_text(stored.read_text().replace('"goal_period": 100', '"goal_period": 20'))  # some goals are survived
+    run, pool = str(tmp_path / "run"), str(tmp_path / "pool.pt")
+    make = ["pool", run, run, "--out", pool, "--worlds", "16", "--adversary-steps", "600", "--device", "cpu"]
+    assert cli.main(make) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^2 policies, [\d,]+ goals, [1-9][\d,]* crashes; AUROC .*\n.*pool\.pt\n$", said)
+    assert cli.main(make) == 2
+    assert "pool.pt exists and is not overwritten" in capsys.readouterr().err
+    assert cli.main(["evaluate", run, "--attackers", "pooled", "--device", "cpu"]) == 2
+    assert "pool must be a file of deimos pool" in capsys.readouterr().err
+    assert cli.main(["evaluate", run, "--attackers", "pooled", "--pool", pool, "--device", "cpu"]) == 0
+    assert re.search(r"\(Naive\) +argmax +scripted +pooled\n", capsys.readouterr().out)
+
+
 def test_a_pool_is_refused_in_one_line(tmp_path):
     """None, one of another environment, one that is not there, and policies that never crash."""
     config, pool = particle.Config(), tmp_path / "pool.pt"
@@ -200,7 +237,7 @@ def test_a_pool_is_refused_in_one_line(tmp_path):
     sizes = replace(SMALL, attackers=("pooled",), pool=pool)
     with pytest.raises(RunError, match=r"pool.pt cannot be read \(No such file"):
         evaluate(stay, config, sizes, CPU)
-    with pytest.raises(RunError, match="None of the policies crashed"):
+    with pytest.raises(RunError, match="These policies never crashed, or always"):
         make_pool([make_target(stay, config, SMALL, CPU)], pool)
     make_pool([make_target(blind(), config, SMALL, CPU)], pool)
     with pytest.raises(RunError, match=r"pool\.pt is of other observations"):

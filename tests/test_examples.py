@@ -62,7 +62,7 @@ def test_the_notebook_runs(tmp_path):
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert len(re.findall(r"of goals crash", done.stdout)) == 4
+    assert len(re.findall(r"of goals crash", done.stdout)) == 6
 
 
 def test_the_notebooks_outputs_are_its_own():

@@ -75,7 +75,7 @@ def conclude(rows: list[dict]) -> str:
         said += (
             f" Goals of {' and '.join(without)} are uniform: there was nothing to learn from, so they prove nothing."
         )
-    for most in worst([rows]) if len(shares) > 1 else []:
+    for most in worst([rows]) if len(shares) > 1 and any(shares.values()) else []:
         said += f" The worst attacker is {most['attacker']}: {percent(most['crash_rate'])} in the worlds that did not"
         said += " choose it."
     return said

@@ -54,8 +54,6 @@ def main(arguments: list[str], program: str) -> None:
             for folder in folders
         ]
         facts = make_pool(targets, options.out)
-    print(
-        f"{facts['adversary_crashes']:,} crashes in {facts['adversary_interactions']:,} goals of {len(folders)}", end=""
-    )
-    print(f" policies; AUROC {known(facts['adversary_auroc'])} on worlds that were not learnt from.")
+    crashes, goals, quality = (facts[f"adversary_{name}"] for name in ("crashes", "interactions", "auroc"))
+    print(f"{len(folders)} policies, {goals:,} goals, {crashes:,} crashes; AUROC on other worlds {known(quality)}")
     print(options.out)

@@ -194,8 +194,7 @@ def make_target(policy: Policy, env_config: EnvConfig, config: EvalConfig, devic
     quiet = env_config.for_evaluation().resolved(device)
     return Target(
         policy=policy, build=lambda worlds, seed: quiet.build(worlds, device, seed), worlds=config.worlds,
-        steps=config.adversary_steps, seed=config.seed, fear=config.fear,
-        pool=config.pool,
+        steps=config.adversary_steps, seed=config.seed, fear=config.fear, pool=config.pool,
     )  # fmt: skip
 
 
@@ -212,24 +211,26 @@ def worst(policies: Sequence[Sequence[dict]]) -> list[dict]:
         For each policy the ``attacker``, its ``crash_rate``, and how many ``interactions`` that is the rate of; empty
         where no attacker met all of them. Of attackers that tie it is the first.
     """
-    by_name = [{row["goals"]: row for row in rows if row["goals"] != "naive" and _halves(row)} for rows in policies]
+    by_name = [
+        {row["goals"]: halves for row in rows if row["goals"] != "naive" and (halves := _halves(row))}
+        for rows in policies
+    ]
     shared = [name for name in (by_name[0] if by_name else {}) if all(name in own for own in by_name)]
-    found = []
-    for own in by_name:
-        if not shared:
-            return []
-        name = max(shared, key=lambda name: _halves(own[name])[0])
-        _, rate, count = _halves(own[name])
-        found.append({"attacker": name, "crash_rate": rate, "interactions": count})
-    return found
+    if not shared:
+        return []
+    names = [max(shared, key=lambda name: own[name][0]) for own in by_name]
+    return [
+        {"attacker": name, "crash_rate": own[name][1], "interactions": own[name][2]}
+        for name, own in zip(names, by_name, strict=True)
+    ]
 
 
 def _halves(row: dict) -> tuple[float, float, int] | None:
     """Share of interactions that crashed in even worlds, in odd ones, and how many there were in odd ones."""
-    even, crashed = row.get("even_interactions"), row.get("even_interaction_crashes")
-    if not even or row["interactions"] == even:  # of an earlier version, or too few to tell
+    even = row.get("even_interactions") or 0
+    if not 0 < even < row["interactions"]:  # of an earlier version, or too few to tell
         return None
-    odd = row["interactions"] - even
+    crashed, odd = row["even_interaction_crashes"], row["interactions"] - even
     return crashed / even, (row["interaction_crashes"] - crashed) / odd, odd
 
 

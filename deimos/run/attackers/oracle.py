@@ -4,7 +4,6 @@ Where none does within T steps, it asks for the one that the network of ``argmax
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from deimos.run.attack import Attack, Target, learn_fear
 from deimos.run.attackers import argmax_long
@@ -15,7 +14,7 @@ from deimos.run.oracle import Clones, Oracle
 class Config(argmax_long.Config):
     """N T steps of a clone for every goal."""
 
-    few_worlds: ClassVar[bool] = True
+    few_worlds = True
 
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``."""

@@ -7,7 +7,7 @@ the very same attacker (after Uesato et al. 2019, who train an adversary on weak
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 
@@ -25,7 +25,7 @@ SCHEMA = 1  # of the file
 class Config(AttackerConfig):
     """Its network comes from the file ``EvalConfig.pool``."""
 
-    needs_pool: ClassVar[bool] = True
+    needs_pool = True
 
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``.
@@ -58,7 +58,7 @@ def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
         The facts that rows of the attacker have: see ``learn_fear``.
 
     Raises:
-        RunError: If the environments differ, no policy crashed, or the file cannot be written.
+        RunError: If the environments differ, crashes or survivals are missing, or the file cannot be written.
     """
     envs = [target.build(1, target.seed) for target in targets]
     if len({str(env.layout) for env in envs}) > 1:
@@ -72,7 +72,7 @@ def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
     fear.fit(learnt_from(data))
     fear.check()
     if not fear.fitted:
-        raise RunError("None of the policies crashed, so there is nothing to fear; pool worse ones or more steps.")
+        raise RunError("These policies never crashed, or always, so there is nothing to learn; pool others.")
     facts = {
         "adversary_steps": sum(target.steps for target in targets), "adversary_interactions": len(data),
         "adversary_crashes": int(data.crashed.sum()),

@@ -77,7 +77,8 @@ class Search(GoalSelector):
         low, high = low.unsqueeze(1), high.unsqueeze(1)
         place = 2.0 * (candidates - low) / (high - low) - 1.0  # uniform in [-1, 1]
         normal = 2.0**0.5 * place.clamp(-1 + 1e-6, 1 - 1e-6).erfinv()
-        tried, scores = [], []
+        tried: list[Tensor] = []
+        scores: list[Tensor] = []
         for noise in normal.split(self._config.samples, dim=1):
             if tried:
                 best = scores[-1].topk(self._config.elite, dim=1).indices.unsqueeze(2).expand(-1, -1, goal.shape[1])
