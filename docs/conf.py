@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import warp as wp
+from deimos.kernels import episodes, random
 from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
 
 from deimos import __version__
-from deimos.kernels import episodes, random
 
 project, author = "Deimos", "The Deimos developers"
 project_copyright = "The Deimos developers, Apache-2.0"
