@@ -12,6 +12,7 @@ from deimos.kernels.particle import PARTICLES
 
 from deimos.checks import RunError, SimulationError
 from deimos.goals.selectors import uniform
+from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.learn.ppo import PPOConfig
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig, Trainer
@@ -677,15 +678,30 @@ def test_checkpoints_of_before_the_penalty_load(torch_device):
         trainer.load_state_dict(state)
 
 
-def test_training_refuses_a_field_that_one_network_sees(torch_device, monkeypatch):
-    """A field for the critic alone stops training with its name: both networks would see it."""
+def test_each_network_sees_what_it_is_shown(torch_device, monkeypatch, tmp_path):
+    """A field for one network moves the outputs of that one alone, in training and in the stored policy."""
     build_env = Config.build
 
     def build_private(self, *arguments):
         env = build_env(self, *arguments)
-        env.layout = (replace(env.layout[0], seen_by="critic"), *env.layout[1:])
+        velocity, position, *others = env.layout
+        env.layout = (replace(velocity, seen_by="critic"), replace(position, seen_by="actor"), *others)
         return env
 
     monkeypatch.setattr(Config, "build", build_private)
-    with pytest.raises(ValueError, match=r"PPO shows all .* velocity must be seen by both"):
-        Trainer(train_config(), torch_device)
+    trainer = Trainer(train_config(), torch_device)
+    trainer.iterate()
+    policy = Policy(trainer.ppo.actor, trainer.config.ppo.hidden, "relu", trainer.env.layout, 1.0, 1.0)
+    save_policy(tmp_path / "policy.pt", policy)
+    stored = load_policy(tmp_path / "policy.pt", str(torch_device))
+    obs = torch.rand(5, 12, device=torch_device)
+    for seen, hidden, network in (
+        (slice(3, 6), slice(0, 3), stored.scaled), (slice(0, 3), slice(3, 6), trainer.ppo.value),
+    ):  # fmt: skip
+        before = network(obs).clone()
+        changed = obs.clone()
+        changed[:, hidden] += 1.0
+        assert torch.equal(network(changed), before)
+        changed[:, seen] += 1.0
+        assert not torch.equal(network(changed), before)
+    assert torch.equal(stored.scaled(obs), policy.scaled(obs))

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -276,6 +277,8 @@ def arguments(**changes):
         ),
         ({"candidates": torch.zeros(4, 0, 2)}, r"candidates must have the shape .*, got \(4, 0, 2\)"),
         ({"candidates": torch.zeros(4, 9, 3)}, r"candidates must have the shape .*, got \(4, 9, 3\)"),
+        ({"goal": torch.zeros(4)}, r"goal must have the shape \(num_envs, goal_dim\), got \(4,\)"),
+        ({"terminated": np.zeros(4, bool)}, r"terminated must be a tensor, got numpy\.ndarray; torch\.as_tensor makes"),
     ],
 )
 def test_shapes_are_checked(changes, message):

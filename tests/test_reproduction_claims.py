@@ -215,6 +215,18 @@ def test_weak_adversaries_stay_out():
     assert len(naive) == len(attacked) == 4
 
 
+def test_argmax_is_the_thesis_adversary():
+    """What evaluations call argmax is what claims and figures call the Adversary; other attackers are themselves."""
+    results = population(5, ["directional"], methods=["uniform"])
+    before = Data(results).sample(Where("directional", "adversary", 100), "uniform", "crashes")
+    for row in results.rows:
+        row["goals"] = {"adversary": "argmax"}.get(row["goals"], row["goals"])
+    results.rows += [row | {"goals": "scripted", "crashes": 9} for row in results.rows if row["goals"] == "naive"]
+    data = Data(results)
+    assert data.sample(Where("directional", "adversary", 100), "uniform", "crashes").tolist() == before.tolist()
+    assert data.sample(Where("directional", "scripted", 100), "uniform", "crashes").tolist() == [9.0] * 5
+
+
 def test_best_p_needs_twenty_seeds():
     """With fewer than twenty seeds the headline cannot be split and is not testable."""
     for seeds, verdict in ((19, {"not testable"}), (20, set(claims.VERDICTS) - {"not testable"})):

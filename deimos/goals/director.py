@@ -148,9 +148,17 @@ class GoalDirector:
         self._draws = uniforms(self._seed, Purpose.GOAL, worlds, self._count)
 
     def _check(self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor) -> None:
-        n, state_dim, goal_dim = self._sizes or (len(state), state.shape[-1], goal.shape[-1])
-        sizes = {"state": (n, state_dim), "goal": (n, goal_dim), "terminated": (n,), "truncated": (n,)}
         given = {"state": state, "goal": goal, "terminated": terminated, "truncated": truncated}
+        for name, value in (given | {"candidates": candidates}).items():
+            if not isinstance(value, Tensor):
+                kind = f"{type(value).__module__}.{type(value).__qualname__}"
+                raise ValueError(f"{name} must be a tensor, got {kind}; torch.as_tensor makes one.")
+        for name, components in (("state", "state_dim"), ("goal", "goal_dim")):
+            if given[name].dim() != 2:
+                shape = tuple(given[name].shape)
+                raise ValueError(f"{name} must have the shape (num_envs, {components}), got {shape}.")
+        n, state_dim, goal_dim = self._sizes or (len(state), state.shape[1], goal.shape[1])
+        sizes = {"state": (n, state_dim), "goal": (n, goal_dim), "terminated": (n,), "truncated": (n,)}
         for name, shape in sizes.items():
             if given[name].shape != shape:
                 raise ValueError(f"{name} must have the shape {shape}, got {tuple(given[name].shape)}.")

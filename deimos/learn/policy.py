@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from deimos.checks import RunError
 from deimos.files import load_tensors, save_tensors
-from deimos.nn.layout import ObsField, goal_slice
+from deimos.nn.layout import ObsField, goal_slice, seen_by
 from deimos.nn.networks import Activation, Actor, weights_of
 
 SCHEMA = 1
@@ -85,7 +85,9 @@ def load_policy(path: Path | str, device: str = "cpu") -> Policy:
     try:
         layout = [ObsField(**field) for field in data["layout"]]
         weights = data["actor"]
-        actor = Actor(sum(field.size for field in layout), data["hidden"], len(weights["std"]), data["activation"], 1.0)
+        sizes = sum(field.size for field in layout), data["hidden"], len(weights["std"])
+        seen = seen_by("actor", layout, torch.device(device))
+        actor = Actor(*sizes, data["activation"], init_std=1.0, seen=seen)
         actor.load_state_dict(weights)
         actor.to(device)
         return Policy(actor, data["hidden"], data["activation"], layout, data["action_bound"], data["dt"])

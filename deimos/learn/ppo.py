@@ -15,6 +15,7 @@ from torch import Tensor
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.learn.rollout import Rollout
 from deimos.nn.adam import Adam
+from deimos.nn.layout import ALL, Seen, count
 from deimos.nn.losses import Loss, Surrogate, ValueLoss, log_prob
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Activation, Actor, mlp
@@ -116,6 +117,8 @@ class PPO(Stateful):
         action_dim: Components of an action.
         device: Where they live.
         seed: Seed of the weights, the exploration and the order of the minibatches, in [0, 2^32).
+        actor_sees: What the actor sees of an observation.
+        critic_sees: What the critic sees of it.
 
     Raises:
         ValueError: If there are more minibatches than transitions in a rollout.
@@ -124,8 +127,9 @@ class PPO(Stateful):
     saved = ("actor", "critic", "optimizer", "generator")
 
     def __init__(
-        self, config: PPOConfig, num_envs: int, obs_dim: int, action_dim: int, device: torch.device, seed: int
-    ) -> None:
+        self, config: PPOConfig, num_envs: int, obs_dim: int, action_dim: int, device: torch.device, seed: int, *,
+        actor_sees: Seen = ALL, critic_sees: Seen = ALL,
+    ) -> None:  # fmt: skip
         rows = config.num_steps * num_envs
         if config.minibatches > rows:
             raise ValueError(
@@ -134,8 +138,11 @@ class PPO(Stateful):
         self.config = config
         self._size = rows // config.minibatches
         weights = generator(seed, "policy weights")
-        self.actor = Actor(obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights).to(device)
-        self.critic = mlp(obs_dim, config.hidden, 1, config.activation, weights).to(device)
+        self.actor = Actor(
+            obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights, actor_sees
+        ).to(device)
+        self.critic = mlp(count(critic_sees, obs_dim), config.hidden, 1, config.activation, weights).to(device)
+        self._critic_sees = critic_sees
         self.generator = generator(seed, "policy minibatches", device)
         sizes = [sum(p.numel() for p in module.parameters()) for module in (self.actor, self.critic)]
         memory = torch.zeros(2, sum(sizes), dtype=torch.float32, device=device)  # one vector: Adam makes few passes
@@ -185,13 +192,13 @@ class PPO(Stateful):
             action: Actions, shape (n, action_dim). Written.
             mean: Means of their distribution, same shape. Written.
         """
-        mean.copy_(self._actor.forward(obs)[0])
+        mean.copy_(self._actor.forward(obs[:, self.actor.seen])[0])
         torch.addcmul(mean, noise, self.actor.std, out=action)
 
     @torch.no_grad()
     def value(self, obs: Tensor) -> Tensor:
         """Values of observations of any leading shape."""
-        return self._critic.forward(obs.flatten(0, -2)).view(obs.shape[:-1])
+        return self._critic.forward(obs.flatten(0, -2)[:, self._critic_sees]).view(obs.shape[:-1])
 
     @torch.no_grad()
     def update(
@@ -276,10 +283,10 @@ class PPO(Stateful):
         config, std = self.config, self.actor.std
         assert std.grad is not None
         work: list[tuple[MLPs, Tensor, Loss]]
-        work = [(self._actor, minibatch.obs, Surrogate(minibatch.policy, config.clip))]
+        work = [(self._actor, minibatch.obs[:, self.actor.seen], Surrogate(minibatch.policy, config.clip))]
         if learn_value:
             clip = config.clip if config.clip_value else math.inf
-            work.append((self._critic, minibatch.obs, ValueLoss(minibatch.value, clip)))
+            work.append((self._critic, minibatch.obs[:, self._critic_sees], ValueLoss(minibatch.value, clip)))
         surrogate, *value = gradients(*work)
         std.grad -= config.entropy_coef / std
         self._critic.grad *= config.value_coef

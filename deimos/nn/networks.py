@@ -8,6 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from deimos.nn.layout import ALL, Seen, count
+
 Activation = Literal["relu", "elu", "tanh"]
 
 _MODULES: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU, "tanh": nn.Tanh}
@@ -58,12 +60,14 @@ class Actor(nn.Module):
 
     def __init__(
         self, obs_dim: int, hidden: Sequence[int], action_dim: int, activation: Activation, init_std: float,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | None = None, seen: Seen = ALL,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.mean = mlp(obs_dim, hidden, action_dim, activation, generator)
+        self.seen = seen
+        """What it sees of an observation."""
+        self.mean = mlp(count(seen, obs_dim), hidden, action_dim, activation, generator)
         self.std = nn.Parameter(torch.full((action_dim,), init_std, dtype=torch.float32))
 
     def forward(self, obs: Tensor) -> Tensor:
         """Mean action, shape (n, action_dim)."""
-        return self.mean(obs)
+        return self.mean(obs[..., self.seen])

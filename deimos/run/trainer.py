@@ -11,6 +11,7 @@ from deimos.checks import RunError, SimulationError, check_at_least, check_choic
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
+from deimos.nn.layout import seen_by
 from deimos.nn.threads import torch_on_one
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
@@ -92,13 +93,13 @@ class Trainer:
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.config = config
         self.env = config.env.build(config.num_envs, device, config.seed)
-        if partial := [field.name for field in self.env.layout if field.seen_by != "both"]:
-            raise ValueError(
-                f"PPO shows all of the observation to actor and critic; {', '.join(partial)} must be seen by both."
-            )
         total_steps = config.iterations * config.ppo.num_steps
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
-        self.ppo = PPO(config.ppo, config.num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed)
+        actor_sees, critic_sees = (seen_by(who, self.env.layout, device) for who in ("actor", "critic"))
+        self.ppo = PPO(
+            config.ppo, config.num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed,
+            actor_sees=actor_sees, critic_sees=critic_sees,
+        )  # fmt: skip
         self.rollout = self.ppo.new_rollout()
         clones = Clones(lambda count: config.env.build(count, device, config.seed), self.ppo.actor)
         for part in with_parts(self.loop.selector):

@@ -14,6 +14,7 @@ import warp as wp
 from deimos.checks import SimulationError
 from deimos.kernels.legged.rows import ROWS, Rows, narrow, reset_rows, widen
 from deimos.kernels.legged.state import SIMULATION
+from deimos.nn.threads import available
 from deimos.sim.legged.engines import Physics, PhysicsConfig
 from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.engines.model import build_model
@@ -203,7 +204,7 @@ def _make_batch(model: "mujoco.MjModel", num_envs: int) -> "Batch":
     from mujoco.batch import Batch
 
     try:
-        return Batch(model, num_envs, torch.get_num_threads())
+        return Batch(model, num_envs, available())
     except ValueError as error:  # std::bad_alloc
         size = 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
         raise MemoryError(f"a world takes {size / 1024:.1f} KiB and more") from error
