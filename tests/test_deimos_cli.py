@@ -538,7 +538,7 @@ def test_run_leaves_its_files(finished):
     assert out.splitlines()[-1] == str(path)
     assert re.search(r"uniform goals +attacked by +attacked by\n +\(Naive\) +argmax +scripted\n", out)
     assert re.search(r"\n\nUnder uniform goals .* of the goals end in a crash; argmax .*; scripted .*\n", out)
-    assert re.search(r"\nTraining took \d+\.\d s: env \d+%, policy ", out)
+    assert re.match(r"Training took \d+\.\d s: env \d+%, policy .*\.\nEvaluation: ", out)
     assert (path / "summary.png").read_bytes().startswith(b"\x89PNG")
     folder = RunFolder(path)
     assert [row["iteration"] for row in folder.read_csv("progress.csv")] == ["1", "2"]

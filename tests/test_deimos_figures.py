@@ -9,6 +9,7 @@ from PIL import Image
 from scipy.stats import binomtest
 
 from deimos.app import figures
+from deimos.app.findings import wilson
 from deimos.run.folder import RunFolder
 
 HEADER = "env_steps,reward,crashes_per_1000,explained_variance,fear/auroc\n"
@@ -113,7 +114,7 @@ def test_intervals_of_rates_are_wilsons():
     """The interval of every proportion is SciPy's, at 0 and 1 too."""
     count = np.array([1, 7, 50, 50, 1000])
     share = np.array([1, 2, 0, 50, 333]) / count
-    low, high = figures.wilson(share, count)
+    low, high = wilson(share, count)
     for k, n, found in zip(share * count, count, zip(low, high, strict=True), strict=True):
         expected = binomtest(round(k), n).proportion_ci(method="wilson")
         np.testing.assert_allclose(found, (expected.low, expected.high), atol=1e-7)

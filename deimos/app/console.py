@@ -230,6 +230,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def number(value: float, digits: int = 3) -> str:
     """A number with as many significant digits, in full: never in powers of ten, and 0 for nothing but zero."""
+    value += 0.0  # no -0
+    if 0 < abs(value) < 1e-6:
+        return "< 0.000001" if value > 0 else "> -0.000001"
     if abs(value) >= 10.0**digits:
         return f"{value:,.0f}"
     return f"{Decimal(f'{value:.{digits}g}'):f}"

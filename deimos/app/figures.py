@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from deimos.app.console import number
-from deimos.app.findings import conditions, heading, percent
+from deimos.app.findings import conditions, heading, percent, wilson
 from deimos.files import write_whole
 from deimos.goals.calibration import reliability
 from deimos.run.folder import RunFolder
@@ -66,13 +66,6 @@ def draw_summary(folder: RunFolder, title: str) -> None:
         _bars(axes[EVALUATION], evaluated)
     figure.suptitle(title)
     _save(figure, folder.path / "summary.png")
-
-
-def wilson(share: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the 95 % intervals of proportions, by Wilson's score (1927), each of the arguments' shape."""
-    z = 1.959964  # of the normal distribution, two-sided
-    middle, spread = share + z * z / (2 * count), z * np.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
-    return (middle - spread) / (1 + z * z / count), (middle + spread) / (1 + z * z / count)
 
 
 def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor]]") -> Path:

@@ -88,14 +88,14 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(130)
+    total = sum(trainer.seconds.values())
+    if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
+        parts = [f"{name} {seconds / total:.0%}" for name, seconds in trainer.seconds.items()]
+        print(f"Training took {total:.1f} s: {', '.join(parts)}.", flush=True)
     if config.evaluation:
         show_evaluation(folder, config, config.env, config.eval, trainer.env.device)
     else:
         figures.draw_summary(folder, title(config))
-    total = sum(trainer.seconds.values())
-    if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
-        parts = [f"{name} {seconds / total:.0%}" for name, seconds in trainer.seconds.items()]
-        print(f"Training took {total:.1f} s: {', '.join(parts)}.")
     print(folder.path)
 
 
