@@ -81,7 +81,7 @@ def test_a_share_that_is_not_known_is_a_dash():
 )
 def test_no_panel_is_empty(tmp_path, saved, progress, rows, panels):
     """There is a panel for what the run has numbers of, with a line or bars in it, and no other."""
-    figures.draw_summary(folder_of(tmp_path, progress, rows), "title")
+    figures.draw_summary(folder_of(tmp_path, progress, rows), "title", "w")
     (figure,) = saved
     assert len(figure.axes) == panels
     for axes in figure.axes:
@@ -92,20 +92,22 @@ def test_no_panel_is_empty(tmp_path, saved, progress, rows, panels):
 
 def test_a_run_without_numbers_has_no_picture(tmp_path, saved):
     """Where nothing was trained and nothing evaluated, nothing is drawn."""
-    figures.draw_summary(folder_of(tmp_path), "title")
+    figures.draw_summary(folder_of(tmp_path), "title", "w")
     assert not saved
 
 
 def test_evaluations_of_an_earlier_policy_are_not_drawn(tmp_path, saved):
     """A run that went on is drawn with what was found of its policy as it is now."""
     rows = [*evaluated(weights="old", worlds=2000), *evaluated(weights="new")]
-    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n", rows), "title")
+    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n", rows), "title", "new")
     assert len(saved[0].axes[-1].patches) == 2
+    figures.draw_summary(folder_of(tmp_path), "title", "trained on since")
+    assert not any(axes.patches for axes in saved[1].axes)
 
 
 def test_summary_is_a_picture(tmp_path):
     """The file is a picture with something in it."""
-    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n48,0.2,2.0,0.5,\n", evaluated(math.nan)), "title")
+    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n48,0.2,2.0,0.5,\n", evaluated(math.nan)), "title", "w")
     with Image.open(tmp_path / "summary.png") as image:
         assert len(image.convert("RGB").getcolors(2**24)) > 10
 

@@ -34,7 +34,7 @@ MOST_EVALUATIONS = 4
 EVALUATION = "evaluation"
 
 
-def draw_summary(folder: RunFolder, title: str) -> None:
+def draw_summary(folder: RunFolder, title: str, weights: str) -> None:
     """Draw ``summary.png``: reward, crashes and the learners' quality over training, and what the evaluations found.
 
     There is no panel for what the folder has no numbers of, and no picture where it has none at all.
@@ -42,6 +42,7 @@ def draw_summary(folder: RunFolder, title: str) -> None:
     Args:
         folder: The run.
         title: Above it all.
+        weights: ``weights_hash`` of the policy as it is now. What was evaluated before it was trained on is left out.
 
     Raises:
         RunError: If it cannot be written.
@@ -50,7 +51,7 @@ def draw_summary(folder: RunFolder, title: str) -> None:
 
     rows = folder.read_csv("progress.csv")
     evaluated = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
-    evaluated = [row for row in evaluated if row["weights"] == evaluated[-1]["weights"]]  # of the policy as it is now
+    evaluated = [row for row in evaluated if row["weights"] == weights]
     curves = [curve for curve in CURVES if any(row.get(curve[0]) for row in rows)]
     if curves[-1:] == [FEAR]:
         curves.remove(VALUES)

@@ -14,7 +14,9 @@ from deimos.app import console, figures
 from deimos.app.evaluate import show_evaluation, title
 from deimos.checks import RunError
 from deimos.goals import selectors
+from deimos.learn.policy import load_policy
 from deimos.run import presets, training
+from deimos.run.evaluation import weights_hash
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
@@ -95,7 +97,7 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
     if config.evaluation:
         show_evaluation(folder, config, config.env, config.eval, trainer.env.device)
     else:
-        figures.draw_summary(folder, title(config))
+        figures.draw_summary(folder, title(config), weights_hash(load_policy(folder.path).actor))
     print(folder.path)
 
 

@@ -42,8 +42,9 @@ def check_env(env: Env) -> None:
         return config.build(num_envs, env.device, seed, env_offset)
 
     for check in (
-        _check_layout, _check_views, _check_start, _check_observation, _check_draws, _check_candidates, _check_step, _check_clocks,
-        _check_reset, _check_set_goals, _check_repeats, _check_clones, _check_resume, _check_penalty, _check_faults,
+        _check_layout, _check_views, _check_start, _check_observation, _check_draws, _check_candidates, _check_step,
+        _check_clocks, _check_reset, _check_set_goals, _check_repeats, _check_clones, _check_resume, _check_penalty,
+        _check_faults,
     ):  # fmt: skip
         for holds, message in check(build(), build):
             if not torch.as_tensor(holds).all():
@@ -147,7 +148,10 @@ def _check_views(env: Env, build: Build) -> Claims:
 def _check_start(env: Env, build: Build) -> Claims:
     """A built environment has begun its first episodes; ``restart`` begins them again."""
     begun = env.tensors["episode_count"] == 1
-    yield begun, "an episode must have begun in every world: end the constructor with begin()."
+    yield (
+        begun,
+        "an episode must have begun in every world: end the constructor with begin(), call begin_episode in the reset.",
+    )
     yield env.obs.isfinite(), "the first observation must be finite: the reset must write all of it."
     yield len(env.goal.unique(dim=0)) > 1, "first goals must differ and be seen: begin_episode, write_goal."
     first = env.state_dict()
@@ -287,9 +291,9 @@ def _check_set_goals(env: Env, build: Build) -> Claims:
 
 def _check_repeats(env: Env, build: Build) -> Claims:
     """Two environments of one seed do the same, bit for bit."""
-    twin = build()
+    twin, cause = build(), "draws must be addressed, and arrays, action_dim too, as large as what is read of them"
     for age, action in enumerate(_actions(env, STEPS), 1):
-        message = f"the same seed must give the same numbers, but {{name}} differs after {age} steps."
+        message = f"the same seed must give the same numbers, but {{name}} differs after {age} steps: {cause}."
         yield from _are_equal(_advance(twin, action), _advance(env, action), message)
     yield set(env.report()) == set(twin.report()), "report must have the same keys every time."
 

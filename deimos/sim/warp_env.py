@@ -65,6 +65,8 @@ class WarpEnv(Env):
         goal = self.goal_slice
         scale = next(field.scale for field in self.layout if field.name == "goal")
         scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim
+        if len(goal_range) != self.goal_dim:
+            raise ValueError(f"goal_range must have {self.goal_dim} components, got {len(goal_range)}.")
         groups = len(self.goal_groups)
         self.worlds = make_worlds(
             num_envs, warp_device(device), obs_dim=self.obs_dim, action_dim=action_dim, goal_start=goal.start,
