@@ -38,6 +38,10 @@ if not (_HOME / "kernels").is_dir():  # in a checkout; installed, both are insid
     sys.meta_path.insert(0, _Beside)  # before an editable install of another checkout
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 def __getattr__(name: str) -> Any:
     """Import what the package offers when it is first asked for; importing ``deimos`` alone stays light."""
     if name not in _OFFERED:

@@ -13,10 +13,11 @@ from typing import Any, BinaryIO
 
 from deimos.checks import RunError
 
-_UNREADABLE = (  # what reading damaged and foreign archives was seen to raise
+UNREADABLE = (
     OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError,
     struct.error, zlib.error, zipfile.BadZipFile, pickle.UnpicklingError,
 )  # fmt: skip
+"""What reading damaged and foreign archives was seen to raise."""
 
 
 def save_tensors(path: Path, data: dict) -> None:
@@ -73,7 +74,7 @@ def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = Non
             data = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise RunError(f"There is no {what} at {path}.") from error
-    except _UNREADABLE as error:  # torch's own words on foreign objects advise to run them
+    except UNREADABLE as error:  # torch's own words on foreign objects advise to run them
         reason = "it holds more than tensors" if isinstance(error, pickle.UnpicklingError) else first_line(error)
         raise RunError(f"{path} is not a {what}, or it is broken ({reason}).") from error
     found = data.get("schema") if isinstance(data, dict) else None

@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import warp as wp
+from deimos.kernels import episodes, random
 from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
@@ -64,7 +66,16 @@ def prepare_docstring(app: Sphinx, what: str, name: str, obj: Any, options: Any,
             lines.insert(i + 1, line[: len(line) - len(line.lstrip())] + "    \\ ")
 
 
+def uncover_warp_functions() -> None:
+    """Put in the place of the Warp functions that environments call the Python functions that they are made of."""
+    for module in (episodes, random):
+        for name, value in list(vars(module).items()):
+            if isinstance(value, wp.Function):
+                setattr(module, name, value.func)
+
+
 def setup(app: Sphinx) -> None:
     """What Sphinx calls first."""
+    uncover_warp_functions()
     app.connect("autodoc-process-docstring", prepare_docstring, priority=400)  # before Napoleon
     app.add_transform(DarkPictures)

@@ -6,16 +6,18 @@ from pathlib import Path
 import numpy as np
 from deimos.kernels.ray_cast import SNAP
 
-from deimos.checks import check_positive
-from deimos.files import first_line
+from deimos.checks import check_positive, check_range
+from deimos.files import UNREADABLE, first_line
 
 from .export import GREY_NOTE
-from .grid import Terrain, check_heights, on_ground
+from .grid import FARTHEST, Terrain, check_heights, on_ground
 from .heightfield import rasterise
 from .mesh import from_triangles
 from .world import BYTES_PER_SAMPLE, require_memory
 
 RESOLUTION = 0.05  # [m]; the finest that robots walk on
+FINEST = 1e-6  # [m]
+BYTES_PER_TILE = 100  # its origin, and what it is made of
 OPTIONS = {
     **dict.fromkeys((".glb", ".obj", ".ply", ".stl"), ("resolution", "scale", "tile")),
     ".png": ("resolution", "height_range", "tile"),
@@ -69,8 +71,10 @@ def import_file(
         raise ValueError(f"A file to import must end in one of {', '.join(OPTIONS)}, got {path}.")
     for name, value in (("resolution", resolution), ("scale", scale), ("tile", tile)):
         check_positive(name, 1.0 if value is None else value, finite=True)
-    if height_range is not None and not -np.inf < height_range[0] < height_range[1] < np.inf:
-        raise ValueError(f"height_range must rise from one finite height to another, got {height_range}.")
+    if height_range is not None and not -FARTHEST <= height_range[0] < height_range[1] <= FARTHEST:
+        raise ValueError(
+            f"height_range must rise from one height to another, both within {FARTHEST:g} m, got {height_range}."
+        )
     options = {"resolution": resolution, "height_range": height_range, "scale": scale, "tile": tile}
     is_terrain = ending == ".npz" and _is_terrain(path)
     takes = () if is_terrain else OPTIONS[ending]
@@ -78,16 +82,20 @@ def import_file(
         raise ValueError(f"{unfit[0]} does not apply to {path}, which takes {', '.join(takes) or 'no options'}.")
     if is_terrain:
         return Terrain.load(path)
+    check_range("resolution", resolution or RESOLUTION, FINEST, FARTHEST)
     try:
-        if ending == ".png":
-            field = _read_picture(path, resolution, height_range)
-        elif ending in (".npy", ".npz"):
-            field = _read_array(path, resolution or RESOLUTION)
-        else:
-            field = _read_mesh(path, resolution or RESOLUTION, scale or 1.0, device)
-        return _with_tiles(path.stem, field, tile)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+            if ending == ".png":
+                field = _read_picture(path, resolution, height_range)
+            elif ending in (".npy", ".npz"):
+                field = _read_array(path, resolution or RESOLUTION)
+            else:
+                field = _read_mesh(path, resolution or RESOLUTION, scale or 1.0, device)
+            return _with_tiles(path.stem, field, tile)
     except ValueError as error:
         raise ValueError(f"{path} cannot be imported: {error}") from error
+    except MemoryError as error:
+        raise ValueError(f"{path} cannot be imported: it does not fit in memory ({first_line(error)}).") from error
 
 
 def _is_terrain(path: Path) -> bool:
@@ -113,14 +121,19 @@ def _read_mesh(path: Path, cell: float, scale: float, device: str) -> _Field:
     vertices = scale * np.asarray(mesh.vertices, np.float64)
     if path.suffix.lower() == ".glb":  # glTF 2.0, section 3.4: y is up
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
-    if not np.isfinite(vertices).all():
-        raise ValueError("its vertices must be finite.")
+    if not (np.abs(vertices) <= FARTHEST).all():
+        raise ValueError(f"its vertices must be finite, and within {FARTHEST:g} m of the origin.")
     unit = cell / SNAP  # float32 numbers are not quite where they should be; vertices are rounded to this too
     low, high = (np.round(end(axis=0)[:2] / unit) * unit for end in (vertices.min, vertices.max))
     nx, ny = (int(cells) + 1 for cells in (high - low) / cell + 1e-6)
     if min(nx, ny) < 2:
         raise ValueError(f"it must extend over a cell of {cell:g} m along x and y, got {nx - 1} x {ny - 1} cells.")
-    require_memory((nx, ny), BYTES_PER_SAMPLE * nx * ny, "resolution", cell)
+    try:
+        require_memory((nx, ny), BYTES_PER_SAMPLE * nx * ny, "resolution", cell)
+    except ValueError as error:
+        length = float((high - low).max())
+        way_out = "if its unit is a millimetre, give the scale 0.001."
+        raise ValueError(f"{error} The mesh is {length:g} m long; {way_out}") from error
     corner = float(low[0]), float(low[1])
     heights = rasterise(from_triangles(vertices, mesh.faces), corner, cell, (nx, ny), device=device)
     return heights, cell, corner
@@ -153,12 +166,13 @@ def _read_picture(path: Path, resolution: float | None, height_range: tuple[floa
 
 def _read_array(path: Path, cell: float) -> _Field:
     """The one array of a NumPy file, around the origin."""
-    try:
-        with path.open("rb") as file:
+    with path.open("rb") as file:
+        try:
             found = np.load(file, allow_pickle=False)
-            arrays = [found] if isinstance(found, np.ndarray) else [found[name] for name in found.files]
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"it is no NumPy file of numbers, or it is broken ({first_line(error)}).") from error
+            members = [found] if isinstance(found, np.ndarray) else [found[name] for name in found.files]
+        except UNREADABLE as error:
+            raise ValueError(f"it is no NumPy file of numbers, or it is broken ({first_line(error)}).") from error
+    arrays = [member if isinstance(member, np.ndarray) else np.array(member) for member in members]  # some are bytes
     if len(arrays) != 1 or arrays[0].ndim != 2 or arrays[0].dtype.kind not in "fiu":
         shapes = ", ".join(f"{array.dtype}{list(array.shape)}" for array in arrays)
         raise ValueError(f"it must hold one array of numbers with two axes, got {shapes}.")
@@ -176,7 +190,10 @@ def _with_tiles(name: str, field: _Field, tile: float | None) -> Terrain:
     check_heights(heights)
     size = cell * (np.array(heights.shape) - 1)
     side = float(size.min()) if tile is None else tile
-    levels, columns = (1, 1) if tile is None else (size / side + 1e-6).astype(int)
+    if tile is not None and tile < cell:
+        raise ValueError(f"tile must be at least {cell:g} m, the distance of two samples, got {tile:g} m.")
+    levels, columns = (1, 1) if tile is None else (int(tiles) for tiles in size / side + 1e-6)
+    require_memory((levels, columns), BYTES_PER_TILE * levels * columns, "tile", side)
     if min(levels, columns) < 1:
         raise ValueError(f"tile must be at most {size.min():g} m, the shorter side of the ground, got {tile:g} m.")
     index = np.moveaxis(np.indices((levels, columns)), 0, -1)

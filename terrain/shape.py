@@ -13,6 +13,7 @@ from .mesh import Mesh
 
 Ramp = tuple[float, float]
 """A number at difficulty 0 and at difficulty 1, linear in between."""
+TOLERANCE = 1e-6  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,13 +63,21 @@ class TileShape(abc.ABC):
         """
 
     def build(self, difficulty: float, generator: np.random.Generator) -> Mesh:
-        """See ``surface``; raises ``ValueError`` if ``difficulty`` is out of its range."""
+        """See ``surface``; raises ``ValueError`` if ``difficulty`` is out of its range, or it is no such square."""
         check_range("difficulty", difficulty, 0, 1)
-        return self.surface(difficulty, generator)
+        mesh = self.surface(difficulty, generator)
+        across = np.abs(mesh.vertices[:, :2])
+        if not np.allclose(mesh.bounds[:, :2], [[-self.tile / 2] * 2, [self.tile / 2] * 2], rtol=0, atol=TOLERANCE):
+            raise ValueError(f"{type(self).__module__}: its mesh must extend over the tile of {self.tile:g} m.")
+        edge = mesh.vertices[across.max(axis=1) > self.tile / 2 - TOLERANCE, 2]
+        if not (np.abs(edge) <= TOLERANCE).all():
+            off = edge[np.abs(edge).argmax()]
+            raise ValueError(f"{type(self).__module__}: its mesh must be at height 0 along its edge, got {off:g} m.")
+        return mesh
 
+    @abc.abstractmethod
     def step(self, difficulty: float) -> float:
         """Highest step that a robot may have to take up or down [m]; gaps are crossed, not stepped into."""
-        return 0.0
 
 
 def at(ramp: Ramp, difficulty: float) -> float:

@@ -1,6 +1,8 @@
 """Training and evaluation from a program, and runs of earlier versions."""
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -100,11 +102,20 @@ def test_policy_of_an_old_run_acts_and_is_evaluated(tmp_path):
     ]  # fmt: skip
 
 
-def test_an_old_run_is_resumed_or_refused_in_one_line(tmp_path, capsys):
-    """A checkpoint of 0.1.0 is not resumed half understood."""
+def test_dir_names_what_the_package_offers():
+    """An interpreter completes what ``deimos`` offers before any of it was imported, and nothing private."""
+    code = "import deimos; print(dir(deimos) == sorted(deimos.__all__))"
+    home = Path(__file__).parent.parent
+    assert subprocess.run([sys.executable, "-c", code], cwd=home, capture_output=True, check=True).stdout == b"True\n"
+
+
+@pytest.mark.parametrize("schema", [1, 2])
+def test_an_old_run_is_resumed_or_refused_in_one_line(tmp_path, capsys, schema):
+    """A checkpoint of 0.1.0, or of an unreleased 0.2 before the last change, is not resumed half understood."""
     path = tmp_path / "run"
     shutil.copytree(OLD, path)
+    torch.save(torch.load(path / "checkpoint.pt") | {"schema": schema}, path / "checkpoint.pt")
     code = cli.main(["train", "--resume", str(path), "--env-steps", "72"])
     said = capsys.readouterr().err.strip().splitlines()
     assert (code, len(said)) == (2, 1)
-    assert "schema" in said[0]
+    assert f"has the schema {schema}, of an earlier version, and cannot be resumed" in said[0]

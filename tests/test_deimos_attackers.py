@@ -266,6 +266,23 @@ def test_setting_tells_attackers_apart():
         assert settings(attackers=("argmax",), **change)[1] != both[1]
 
 
+def test_rows_tell_tasks_apart():
+    """Every row is another's where the evaluated task is another; what evaluation switches off changes nothing."""
+
+    def identities(config):
+        return _identities(config, replace(SMALL, attackers=("argmax",)))
+
+    config = quad.Config(engine="native", terrain="/here/ground.npz")
+    before = identities(config)
+    assert identities(config.for_evaluation()) == identities(replace(config, crash_penalty=2.0)) == before
+    assert identities(replace(config, terrain="/there/terrain.npz")) == before  # a run folder that was moved
+    for old, new in zip(before, identities(replace(config, episode_steps=1077)), strict=True):
+        assert old | {"environment": ""} == new | {"environment": ""}
+        assert old != new
+    for old, new in zip(before, identities(replace(config, engine="warp")), strict=True):
+        assert old | {"engine": "warp"} == new
+
+
 ATTACKER = """
 from dataclasses import dataclass
 from deimos.run.attack import Attack, AttackerConfig, uniform_goals

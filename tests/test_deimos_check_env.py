@@ -93,6 +93,23 @@ FORGOTTEN = {
         "begin_episode(env, worlds)  #", "worlds.episode_count[env]  #", "an episode must have begun in every world",
     ),
     "half of obs": ("obs[env, 1] = cart.velocity[env]", "obs[env, 1] = 0.0 / 0.0", "the first observation must be"),
+    "a column of the layout": (
+        '                ObsField("velocity", 1, "m/s", 1.0),\n', "", "the step must write nothing but the goal into",
+    ),
+    "the goal's place": (
+        'ObsField("velocity", 1, "m/s", 1.0),\n                ObsField("goal", 1, "m", 1 / HALF_LENGTH),',
+        'ObsField("goal", 1, "m", 1 / HALF_LENGTH),\n                ObsField("velocity", 1, "m/s", 1.0),',
+        "the step must write nothing but the goal into the goal's slot",
+    ),
+    "how wide obs is": (
+        'ObsField("velocity", 1, "m/s", 1.0)', 'ObsField("velocity", 3, "m/s", 1.0)',
+        r"the first observation must be|the step must write all of obs, but left out the columns \[2, 3\]",
+    ),
+    "columns behind the layout": (
+        "    obs[env, 1] = cart.velocity[env]\n",
+        "    obs[env, 1] = cart.velocity[env]\n    obs[env, 3] = 1.0\n    obs[env, 4] = 2.0\n",
+        "the step must not write beyond the 3 columns of the layout, which is too narrow",
+    ),
     "the draw of goals": ("goal_range=(1.2 * HALF_LENGTH,)", "goal_range=(0.0,)", "first goals must differ and be se"),
     "world_offset": ("worlds.world_offset + env", "env", r"draws must be addressed by world_offset \+ env"),
     "the reset's state": ("cart.velocity[env] = 0.0", "pass", "restart must begin the first episodes again, but"),
@@ -124,6 +141,12 @@ def test_what_a_plug_in_forgot_is_named(torch_device, plant, forgotten):
     env = plant(torch_device, old, new)
     with pytest.raises(ValueError, match=f"CartEnv: .*({message})"):
         check_env(env)
+
+
+def test_a_range_of_goals_has_their_components(torch_device, plant):
+    """A range with a component too many is refused by the constructor, in one line."""
+    with pytest.raises(ValueError, match=r"^goal_range must have 1 components, got 2\.$"):
+        plant(torch_device, "goal_range=(1.2 * HALF_LENGTH,)", "goal_range=(1.2 * HALF_LENGTH, 1.0)")
 
 
 def wrap(method, after):
@@ -164,7 +187,7 @@ def forget_the_view(self, result, *arguments):
 
 def forget_the_seed(self, result, *arguments):
     """A step that draws from a global generator."""
-    self.tensors["position"] += torch.rand(1)
+    result.reward.add_(torch.rand(1).item())
     return result
 
 

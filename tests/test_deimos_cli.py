@@ -16,13 +16,16 @@ import pytest
 import torch
 
 import deimos
+from deimos import plugins
 from deimos.app import cli
+from deimos.goals import selectors
 from deimos.goals.methods import METHODS, method
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.config import from_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
+from deimos.sim import envs
 from deimos.sim.envs import particle
 
 HOME = Path(deimos.__file__).resolve().parent.parent
@@ -470,6 +473,22 @@ def test_help_explains_a_selector(capsys):
         assert text in shown, flag
 
 
+@pytest.mark.parametrize("command", ["train", "train env:quad selector:schedule", "study run", "terrain grid"])
+def test_help_does_not_show_none(capsys, command):
+    """An option that may be left out shows what it takes; what it is by default is in its text, and never None."""
+    shown = shown_help(command.split(), capsys)
+    assert not re.search(r"\bNone\b", shown)
+    assert "(default: " in shown
+    assert re.search(r" --(method|methods|preset|file) (\{\[)?(STR|PATH) ", shown)
+
+
+def test_plugins_are_one_line_in_a_list():
+    """What a selector or an environment is fits the list of them: one paragraph."""
+    for package in (selectors, envs):
+        for name, module in plugins.load_all(package).items():
+            assert "\n\n" not in module.Config.__doc__.strip(), name
+
+
 @pytest.mark.parametrize("command", ["evaluate", "play", "study", "study run", "study show", "terrain", "terrain grid"])
 def test_other_commands_explain_themselves(capsys, command):
     """The other commands have a help too."""
@@ -519,7 +538,7 @@ def test_run_leaves_its_files(finished):
     assert out.splitlines()[-1] == str(path)
     assert re.search(r"uniform goals +attacked by +attacked by\n +\(Naive\) +argmax +scripted\n", out)
     assert re.search(r"\n\nUnder uniform goals .* of the goals end in a crash; argmax .*; scripted .*\n", out)
-    assert re.search(r"\nTraining took \d+\.\d s: env \d+%, policy ", out)
+    assert re.match(r"Training took \d+\.\d s: env \d+%, policy .*\.\nEvaluation: ", out)
     assert (path / "summary.png").read_bytes().startswith(b"\x89PNG")
     folder = RunFolder(path)
     assert [row["iteration"] for row in folder.read_csv("progress.csv")] == ["1", "2"]

@@ -760,6 +760,8 @@ def test_a_run_keeps_its_terrain(tmp_path, monkeypatch, hills):
     assert np.array_equal(trainer.env.terrain.heights, terrain.load(hills).heights)
     training.train(trainer, folder)
     again, _ = training.resume(Path("run"), env_steps=576)  # once more: resuming wrote the configuration anew
+    stored = folder.read_json("config.json")["config"]
+    assert (stored["env"]["terrain"], stored["env_steps"]) == ("mine.npz", 576)  # where it came from is not forgotten
     assert again.env.terrain.shapes == ("stairs-up", "stairs-down")
     monkeypatch.chdir(tmp_path)
     naive, *_ = deimos.evaluate("after/run", worlds=4, steps=20)

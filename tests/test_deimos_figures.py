@@ -9,6 +9,7 @@ from PIL import Image
 from scipy.stats import binomtest
 
 from deimos.app import figures
+from deimos.app.findings import wilson
 from deimos.run.folder import RunFolder
 
 HEADER = "env_steps,reward,crashes_per_1000,explained_variance,fear/auroc\n"
@@ -80,7 +81,7 @@ def test_a_share_that_is_not_known_is_a_dash():
 )
 def test_no_panel_is_empty(tmp_path, saved, progress, rows, panels):
     """There is a panel for what the run has numbers of, with a line or bars in it, and no other."""
-    figures.draw_summary(folder_of(tmp_path, progress, rows), "title")
+    figures.draw_summary(folder_of(tmp_path, progress, rows), "title", "w")
     (figure,) = saved
     assert len(figure.axes) == panels
     for axes in figure.axes:
@@ -91,20 +92,22 @@ def test_no_panel_is_empty(tmp_path, saved, progress, rows, panels):
 
 def test_a_run_without_numbers_has_no_picture(tmp_path, saved):
     """Where nothing was trained and nothing evaluated, nothing is drawn."""
-    figures.draw_summary(folder_of(tmp_path), "title")
+    figures.draw_summary(folder_of(tmp_path), "title", "w")
     assert not saved
 
 
 def test_evaluations_of_an_earlier_policy_are_not_drawn(tmp_path, saved):
     """A run that went on is drawn with what was found of its policy as it is now."""
     rows = [*evaluated(weights="old", worlds=2000), *evaluated(weights="new")]
-    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n", rows), "title")
+    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n", rows), "title", "new")
     assert len(saved[0].axes[-1].patches) == 2
+    figures.draw_summary(folder_of(tmp_path), "title", "trained on since")
+    assert not any(axes.patches for axes in saved[1].axes)
 
 
 def test_summary_is_a_picture(tmp_path):
     """The file is a picture with something in it."""
-    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n48,0.2,2.0,0.5,\n", evaluated(math.nan)), "title")
+    figures.draw_summary(folder_of(tmp_path, "24,0.1,3.0,,\n48,0.2,2.0,0.5,\n", evaluated(math.nan)), "title", "w")
     with Image.open(tmp_path / "summary.png") as image:
         assert len(image.convert("RGB").getcolors(2**24)) > 10
 
@@ -113,7 +116,7 @@ def test_intervals_of_rates_are_wilsons():
     """The interval of every proportion is SciPy's, at 0 and 1 too."""
     count = np.array([1, 7, 50, 50, 1000])
     share = np.array([1, 2, 0, 50, 333]) / count
-    low, high = figures.wilson(share, count)
+    low, high = wilson(share, count)
     for k, n, found in zip(share * count, count, zip(low, high, strict=True), strict=True):
         expected = binomtest(round(k), n).proportion_ci(method="wilson")
         np.testing.assert_allclose(found, (expected.low, expected.high), atol=1e-7)

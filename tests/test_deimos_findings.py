@@ -31,11 +31,17 @@ def attacked(goals, even, odd):
     }  # fmt: skip
 
 
+def few_crashes(naive, adversary):
+    """The rows of a small evaluation whose attacker saw no crash in the worlds that it is tested on."""
+    return evaluated(naive, adversary, interactions=299, adversary_crashes=4, adversary_auroc=math.nan)
+
+
 @pytest.mark.parametrize(
     ("value", "spelled"),
     [
         (0.0, "0"), (1.0, "1"), (0.5, "0.5"), (0.123456, "0.123"), (12.3456, "12.3"), (999.4, "999"),
-        (12345.6, "12,346"), (2.5e-7, "0.00000025"), (-0.5678, "-0.568"), (-2e4, "-20,000"),
+        (12345.6, "12,346"), (2.5e-6, "0.0000025"), (1e-12, "< 0.000001"), (-1e-12, "> -0.000001"), (-0.0, "0"),
+        (-0.5678, "-0.568"), (-2e4, "-20,000"),
     ],
 )  # fmt: skip
 def test_a_number_keeps_its_first_digits(value, spelled):
@@ -96,6 +102,12 @@ def test_rows_of_an_earlier_version_are_described():
         (evaluated(), "Under uniform goals 0.5 % of the goals end in a crash; argmax raises that to 36 %."),
         (evaluated(0.0, 0.2), "Under uniform goals none of the goals end in a crash; .* raises that to 20 %."),
         (evaluated(0.3, 0.3), ".* 30 % of the goals end in a crash; argmax gets no more than 30 %."),
+        (
+            few_crashes(0.0, 1 / 299),
+            r"Under uniform goals none of the goals end in a crash; argmax gets 0\.334 %, which may be chance\. argmax "
+            r"learnt from 4 crashes, too few to tell whether it learnt anything: its column proves nothing\.",
+        ),
+        (few_crashes(0.0, 0.2), r"Under uniform goals none of the goals end in a crash; argmax raises that to 20 %\."),
         (evaluated(0.0, 0.0), ".* none of the goals end in a crash; argmax gets no more than 0 %."),
         (
             [evaluated()[0], evaluated(uninformed=True)[1]],

@@ -14,11 +14,13 @@ import torch
 from deimos.app import cli
 from deimos.app.drawing import BLUE, HEADER, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing
 from deimos.app.playback import PlayOptions
-from deimos.app.video import ENDINGS
+from deimos.app.video import ENDINGS, pictures, video
+from deimos.checks import RunError
 from deimos.sim.envs.particle import Config
 
 HOME = Path(__file__).parent.parent
 WALK = HOME / "docs" / "results" / "quad_flat"
+PICTURE = np.zeros((48, 64, 3), np.uint8)
 
 
 def play(*arguments, **environment):
@@ -69,17 +71,20 @@ def test_a_particle_is_drawn_where_it_is():
     drawing = Drawing(env, 640, 480)
     picture = drawing()
     assert picture.shape == (480, 640, 3)
-    side, gap = drawing._side, (640 - 2 * drawing._side) // 3
+    side, top, gap = drawing._side, drawing._top, (640 - 2 * drawing._side) // 3
 
     def pixel(place, x, y):
         half = REACH * 1000
         column = gap + place * (side + gap) + round(side / 2 * (1 + x / half))
-        return tuple(picture[HEADER + round(side / 2 * (1 - y / half)), column].tolist())
+        return tuple(picture[top + round(side / 2 * (1 - y / half)), column].tolist())
 
     assert pixel(0, 500, -500) == pixel(1, 500, 900) == BLUE
     assert pixel(0, -500, 500) == ORANGE
     assert pixel(0, -500, -500) == PAPER
     assert pixel(0, 1080, 0) == pixel(1, -1080, 0) == OUTSIDE
+    blank = (picture == 255).all(axis=(1, 2))
+    assert abs(top + side + 8 + (top - HEADER) - 480) <= 1  # as much is left below as above
+    assert blank[top + side :].all()
     counts = [int((picture == colour).all(axis=2).sum()) for colour in (ORANGE, RED)]
     assert counts[0] > 20
     env.step(torch.zeros(1, 3))
@@ -122,6 +127,47 @@ def test_what_cannot_be_written_is_refused(particle, tmp_path, monkeypatch, caps
     assert not list(tmp_path.iterdir())
 
 
+def write_into(writer, *pictures):
+    """Write pictures into a video or a folder, whole."""
+    with writer as write:
+        for picture in pictures:
+            write(picture)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_video_without_a_picture_is_one_line(tmp_path, ending):
+    """A video that no picture was written into is refused, and nothing is left."""
+    with pytest.raises(RunError, match=rf"x{ending} could not be written \(there is no picture"):
+        write_into(video(tmp_path / f"x{ending}", (64, 48), 25.0))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_video_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
+    """An encoder that is gone when a picture comes is one line, without its whole command."""
+
+    def broken(*arguments, **options):
+        yield
+        raise OSError("[Errno 32] Broken pipe\n\nFFMPEG COMMAND: ...")
+
+    monkeypatch.setattr(imageio_ffmpeg, "write_frames", broken)
+    with pytest.raises(RunError, match=r"/x.mp4 could not be written \(\[Errno 32\] Broken pipe\)\.$"):
+        write_into(video(tmp_path / "x.mp4", (64, 48), 25.0), PICTURE)
+    assert not list(tmp_path.iterdir())
+
+
+def test_pictures_that_cannot_be_written_are_one_line(tmp_path):
+    """A folder that exists or cannot be made, or that is gone when a picture comes, is named in one line."""
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="file exists already; name another folder"):
+        write_into(pictures(tmp_path / "file"))
+    with pytest.raises(RunError, match=r"file/x could not be written \(Not a directory\)"):
+        write_into(pictures(tmp_path / "file" / "x"))
+    with pictures(tmp_path / "x") as write:
+        (tmp_path / "x").rmdir()
+        with pytest.raises(RunError, match=r"000000.png could not be written \(No such file or directory\)"):
+            write(PICTURE)
+
+
 def test_frames_show_something(tmp_path):
     """Pictures have the size and the number that were asked for, and are neither of one colour nor all the same."""
     from PIL import Image
@@ -152,8 +198,8 @@ def test_an_unknown_back_end_is_one_line(tmp_path, backend):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "Give one of --video FILE and --frames FOLDER"),
-        ({"video": Path("x.mp4"), "frames": Path("x")}, "Give one of --video FILE and --frames FOLDER"),
+        ({}, "Give either --video FILE or --frames FOLDER"),
+        ({"video": Path("x.mp4"), "frames": Path("x")}, "Give either --video FILE or --frames FOLDER"),
         ({"video": Path("x.mp4"), "seconds": 0.0}, "seconds must be finite and positive, got 0.0"),
         ({"video": Path("x.mp4"), "fps": float("inf")}, "fps must be finite and positive, got inf"),
         ({"video": Path("x.mp4"), "width": 8}, r"width must be in \[16, 8192\], got 8"),

@@ -101,6 +101,19 @@ def test_empty_folder_is_refused(tmp_path, name):
         cli.COMMANDS[name](folder=tmp_path).run()
 
 
+def test_show_cuts_nothing(tmp_path, monkeypatch, capsys):
+    """On 80 columns too names and numbers are whole, and a score that nobody has is a dash."""
+    monkeypatch.setenv("COLUMNS", "80")
+    values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
+    row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()}
+    long = {"environment": "an-environment-of-a-long-name", "method": "vds-auxiliary-of-a-long-name"}
+    Results([row | long | {"score": float("nan"), "crashes_per_1000": 1234.0}]).write(tmp_path)
+    cli.ShowOptions(folder=tmp_path).run()
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if long["environment"] in line]
+    cells = [cell.strip() for cell in line.strip("│ ").split("│")]
+    assert cells == [long["environment"], long["method"], "x", "1", "1", "1.23e+03", "-", "0.5000", "0"]
+
+
 def test_progress_counts_what_is_done():
     """The share of a study that is done counts finished and failed cells in full and running ones by their training."""
     progress = Progress(5, 1, {"a": "it failed"}, {"b": 0.5, "c": 1.0}, seconds_left=90.0)

@@ -174,6 +174,28 @@ def test_empty_folder_has_no_report(tmp_path):
         report.write(tmp_path, tmp_path)
 
 
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_titles_fit_above_their_axes(folder, count):
+    """However few methods there are, the titles of the boxes keep apart and inside the figure."""
+    figure = figures.boxes(Data.read(folder).only(METHODS[:count]), "directional", 100)
+    figure.draw_without_rendering()
+    left, right = (axes.title.get_window_extent() for axes in figure.axes[:2])
+    assert figure.bbox.x0 <= left.x0 < left.x1 < right.x0 < right.x1 <= figure.bbox.x1
+
+
+def test_mean_without_an_interval_says_so(tmp_path, monkeypatch):
+    """Where resamples have no spread the mean stands alone; shares of goals are in percent."""
+    monkeypatch.setattr(stats, "RESAMPLES", 200)
+    fill(tmp_path, seeds=2)
+    report.write(tmp_path, tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "(no interval)" in text
+    assert "inf]" not in text
+    assert "| goals that ended in a crash: median |" in text
+    assert "| 50 % |" in text
+    assert "Run on v, v." in text
+
+
 def test_text_is_escaped():
     """What HTML or a Markdown table would take for markup is only text."""
     blocks = ["# a < b", [{"x": "P(a | b) & <c>"}]]

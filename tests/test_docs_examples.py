@@ -15,6 +15,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -135,11 +136,14 @@ class Session:
 
     def install(self, block):
         """Install the plug-in of a TOML block as another distribution."""
-        group, entry = re.fullmatch(r'\[project\.entry-points\."(.*)"\]\n(.*)\n', block.text).groups()
+        (group, entries), *others = tomllib.loads(block.text)["project"]["entry-points"].items()
+        assert not others
         information = self.folder / "page-1.0.dist-info"
         information.mkdir()
         (information / "METADATA").write_text("Metadata-Version: 2.1\nName: page\nVersion: 1.0\n")
-        (information / "entry_points.txt").write_text(f"[{group}]\n{entry.replace(chr(34), '')}\n")
+        (information / "entry_points.txt").write_text(
+            f"[{group}]\n" + "".join(f"{name} = {module}\n" for name, module in entries.items())
+        )
         importlib.invalidate_caches()
 
     def python(self, block):

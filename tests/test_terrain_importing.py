@@ -2,6 +2,8 @@
 
 import dataclasses
 import re
+import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -146,15 +148,49 @@ def with_a_hole(path):
     path.write_bytes(mesh.export(file_type="stl"))
 
 
+def of_other_things(name):
+    """A function that makes a zip archive of a file that is no array."""
+
+    def make(path):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr(name, "hello")
+
+    return make
+
+
+def boundless(path):
+    """A NumPy file whose header promises 728 TiB."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000, 10000000), }".ljust(117) + b"\n"
+    path.write_bytes(b"\x93NUMPY\x01\x00v\x00" + header)
+
+
+def sound(path):
+    """A mesh with nothing wrong."""
+    path.write_bytes(rings(np.array([1.0, 0.5]), np.array([0.0, 0.2])).export(file_type="stl"))
+
+
+FLAT = partial(np.save, arr=np.zeros((50, 50)))
+
+
 @pytest.mark.parametrize(
     ("name", "make", "options", "message"),
     [
+        ("a.npz", of_other_things("a.txt"), {}, "it must hold one array of numbers with two axes, got |S5[]"),
+        ("a.npz", of_other_things("schema.npy"), {}, "is not a terrain file of version 1, or it is broken"),
+        ("a.npy", boundless, {}, "it does not fit in memory (Unable to allocate 728. TiB"),
+        ("a.npy", lambda path: np.save(path, np.full((3, 3), 1e300)), {}, "heights must be finite everywhere, and"),
+        ("a.npy", FLAT, {"tile": 1e-9}, "tile must be at least 0.05 m, the distance of two samples, got 1e-09 m"),
+        ("a.npy", FLAT, {"resolution": 1e300}, "resolution must be in [1e-06, 1e+06], got 1e+300"),
+        ("a.stl", sound, {"resolution": 1e-320}, "resolution must be in [1e-06, 1e+06], got 1e-320"),
+        ("a.stl", sound, {"scale": 1e308}, "its vertices must be finite, and within 1e+06 m of the origin"),
+        ("a.png", lambda path: Image.new("L", (3, 3)).save(path), {"height_range": (0, 1e308)}, "both within 1e+06 m"),
         ("a.xyz", broken, {}, "must end in one of .glb, .obj, .ply, .stl, .png, .npy, .npz, got"),
         *((f"a{ending}", broken, {}, "cannot be imported: it ") for ending in importing.OPTIONS),
         ("a.png", cut_off, {"height_range": (0, 1)}, "it is no picture, or it is broken (image file is truncated"),
         ("a.stl", upright, {}, "it must extend over a cell of 0.05 m along x and y, got 40 x 0"),
         ("a.stl", with_a_hole, {}, "mesh must cover the grid, but there is nothing above x = "),
         ("a.stl", with_a_hole, {"resolution": 1e-5}, "resolution must be at least 0.000122 m for 16384 cells"),
+        ("a.stl", with_a_hole, {"scale": 1000.0}, "The mesh is 2000 m long; if its unit is a millimetre, give"),
         ("a.stl", with_a_hole, {"height_range": (0, 1)}, "height_range does not apply to"),
         ("a.npy", lambda path: np.save(path, np.zeros((3, 3))), {"scale": 2.0}, "takes resolution, tile"),
         ("a.npy", lambda path: np.save(path, np.zeros((3, 3))), {"resolution": -1.0}, "resolution must be finite and"),

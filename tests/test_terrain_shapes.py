@@ -2,11 +2,12 @@
 
 import dataclasses
 import sys
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from deimos.terrain import catalog, shapes
-from deimos.terrain.mesh import highest_riser, steepest_slope
+from deimos.terrain.mesh import highest_riser, rings, steepest_slope
 from deimos.terrain.shape import TileShape
 
 NAMES = catalog.names()
@@ -259,6 +260,36 @@ def test_refuses_with_a_reason(name, parameters, message):
         catalog.make(name, parameters)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Block(TileShape):
+    """A block in the middle, with an edge and an extent that may be wrong."""
+
+    edge: float = 1e-9
+    wide: float = 8.0
+
+    def step(self, difficulty):
+        """See ``TileShape.step``."""
+        return 0.5 * difficulty
+
+    def surface(self, difficulty, generator):
+        """See ``TileShape.surface``."""
+        return rings(np.array([self.wide, self.platform]) / 2, np.array([self.edge, 0.5 * difficulty]))
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        (Block(edge=0.2), "its mesh must be at height 0 along its edge, got 0.2 m"),
+        (Block(wide=7.9), "its mesh must extend over the tile of 8 m"),
+        (Block(wide=8.1), "its mesh must extend over the tile of 8 m"),
+    ],
+)
+def test_tiles_that_would_not_meet_are_refused(shape, message):
+    """A mesh that leaves a gap or a cliff between two tiles is not built, and the message says what is wrong."""
+    with pytest.raises(ValueError, match=f"^{Block.__module__}: {message}"):
+        build(shape, 0.5)
+
+
 def test_dropped_in_file_is_a_shape(tmp_path, monkeypatch):
     """One file in the package's folder, and nothing else, makes a new shape."""
     (tmp_path / "one_bump.py").write_text('''
@@ -274,6 +305,10 @@ import numpy as np
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
     """A block in the middle."""
+
+    def step(self, difficulty):
+        """See ``TileShape.step``."""
+        return difficulty
 
     def surface(self, difficulty, generator):
         """See ``TileShape.surface``."""
@@ -295,6 +330,14 @@ class Shape(TileShape):
         (
             "from deimos.terrain.shape import TileShape as Shape",
             "TypeError: Can't instantiate abstract class TileShape",
+        ),
+        (
+            """
+from deimos.terrain.shape import TileShape
+class Shape(TileShape):
+    def surface(self, difficulty, generator): ...
+""",
+            "TypeError: Can't instantiate abstract class Shape with.*step",
         ),
     ],
 )

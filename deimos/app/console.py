@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 from deimos.checks import RunError
 
@@ -78,21 +78,52 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
             stack.enter_context(on_parse_error(_refuse))
         if {"-h", "--help"} & set(arguments):
             more["registry"] = registry = tyro.constructors.ConstructorRegistry()
-            registry.struct_rule(_explain)
+            registry.struct_rule(_Explained())
             stack.enter_context(_wrapped_help())
         return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
 
 
-def _explain(struct: Any) -> None:
-    """Tell tyro the docstrings below the fields of a dataclass, without the line breaks that it would keep."""
-    if not (isinstance(struct.type, type) and dataclasses.is_dataclass(struct.type)):
-        return
-    texts: dict[str, str] = {}
-    for kind in reversed(inspect.getmro(struct.type)):
-        texts |= _docstrings(kind.__module__).get(kind.__name__, {})
-    for known in dataclasses.fields(struct.type):
-        if known.name in texts:
-            known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+class _Explained:
+    """A rule of tyro's: how a dataclass is explained by its help.
+
+    Docstrings below fields are shown without the line breaks that tyro would keep. None is not shown, neither as a
+    value nor as a default: what it stands for is in the docstring.
+    """
+
+    def __init__(self) -> None:
+        self._is_asking = False  # what tyro would say without this rule
+
+    def __call__(self, struct: Any) -> Any:
+        """What tyro is to show; ``None`` leaves it to the other rules."""
+        import tyro
+
+        if self._is_asking or not (isinstance(struct.type, type) and dataclasses.is_dataclass(struct.type)):
+            return None
+        texts: dict[str, str] = {}
+        for kind in reversed(inspect.getmro(struct.type)):
+            texts |= _docstrings(kind.__module__).get(kind.__name__, {})
+        for known in dataclasses.fields(struct.type):
+            if known.name in texts:
+                known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+        self._is_asking = True
+        try:
+            found = tyro.constructors.ConstructorRegistry.get_struct_spec(struct)
+        finally:
+            self._is_asking = False
+        if not isinstance(found, tyro.constructors.StructConstructorSpec):
+            return found
+        return dataclasses.replace(found, fields=tuple(map(_without_none, found.fields)))
+
+
+def _without_none(field: Any) -> Any:
+    """A field of tyro's that is a value and None by default, as its help is to show it; other fields as they are."""
+    from tyro import conf, constructors
+
+    info = constructors.PrimitiveTypeInfo.make(field.type, set())
+    spec = constructors.ConstructorRegistry.get_primitive_spec(info)
+    if field.default is not None or not isinstance(spec, constructors.PrimitiveConstructorSpec):
+        return field
+    return dataclasses.replace(field, type=Annotated[field.type, conf.DisallowNone, conf.arg(help_behavior_hint="")])
 
 
 @functools.cache
@@ -199,6 +230,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def number(value: float, digits: int = 3) -> str:
     """A number with as many significant digits, in full: never in powers of ten, and 0 for nothing but zero."""
+    value += 0.0  # no -0
+    if 0 < abs(value) < 1e-6:
+        return "< 0.000001" if value > 0 else "> -0.000001"
     if abs(value) >= 10.0**digits:
         return f"{value:,.0f}"
     return f"{Decimal(f'{value:.{digits}g}'):f}"

@@ -16,7 +16,6 @@ REACH = 1.15  # half sides of the box that are seen
 TRAIL = 150  # pictures that the trail goes back
 FINE = 2  # pixels drawn for every pixel shown, along both axes
 HEADER = 72  # [pixels] above the boxes, for the caption and the legend
-LEGEND = (("particle", BLUE), ("where its goal is or leads", ORANGE), ("ends of episodes", RED))
 
 
 class Drawing:
@@ -31,6 +30,9 @@ class Drawing:
     def __init__(self, env: Env, width: int, height: int) -> None:
         self._env, self._width, self._height = env, width, height
         self._side = max(1, min(width // 2, height - HEADER) - 8)
+        self._top = HEADER + max(0, height - HEADER - self._side - 8) // 2
+        ends = "ends of episodes" if env.time_limit else "crashes"
+        self._legend = (("particle", BLUE), ("goal (or where it leads)", ORANGE), (ends, RED))
         self._trail: list[np.ndarray] = []
         self._ends: list[np.ndarray] = []
         self._age = 0
@@ -50,10 +52,10 @@ class Drawing:
         gap = (self._width - 2 * self._side) // 3
         for place, (name, axes) in enumerate(VIEWS.items()):
             left = gap + place * (self._side + gap)
-            picture.paste(self._view(sketch, axes, name), (left, HEADER))
+            picture.paste(self._view(sketch, axes, name), (left, self._top))
         draw, left = ImageDraw.Draw(picture), gap
-        for text, colour in LEGEND:
-            draw.text((left, HEADER - 20), text, fill=colour, font_size=12)
+        for text, colour in self._legend:
+            draw.text((left, self._top - 20), text, fill=colour, font_size=12)
             left += round(draw.textlength(text, font_size=12)) + 16
         return np.asarray(picture)
 

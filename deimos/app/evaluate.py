@@ -123,7 +123,8 @@ def show_evaluation(
     """Evaluate the policy of a run, whose configuration is ``config``; draw the summary and print what was found."""
     with console.progress("evaluating") as report:
         rows = evaluate_run(folder, env_config, eval_config, device, report)
-    figures.draw_summary(folder, title(config))  # before anything is printed: whoever reads it may be gone
+    # Before anything is printed: whoever reads it may be gone.
+    figures.draw_summary(folder, title(config), rows[0]["weights"])
     print(describe(rows, elsewhere(folder, rows)))
 
 

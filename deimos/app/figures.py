@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from deimos.app.console import number
-from deimos.app.findings import conditions, heading, percent
+from deimos.app.findings import conditions, heading, percent, wilson
 from deimos.files import write_whole
 from deimos.goals.calibration import reliability
 from deimos.run.folder import RunFolder
@@ -34,7 +34,7 @@ MOST_EVALUATIONS = 4
 EVALUATION = "evaluation"
 
 
-def draw_summary(folder: RunFolder, title: str) -> None:
+def draw_summary(folder: RunFolder, title: str, weights: str) -> None:
     """Draw ``summary.png``: reward, crashes and the learners' quality over training, and what the evaluations found.
 
     There is no panel for what the folder has no numbers of, and no picture where it has none at all.
@@ -42,6 +42,7 @@ def draw_summary(folder: RunFolder, title: str) -> None:
     Args:
         folder: The run.
         title: Above it all.
+        weights: ``weights_hash`` of the policy as it is now. What was evaluated before it was trained on is left out.
 
     Raises:
         RunError: If it cannot be written.
@@ -50,7 +51,7 @@ def draw_summary(folder: RunFolder, title: str) -> None:
 
     rows = folder.read_csv("progress.csv")
     evaluated = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
-    evaluated = [row for row in evaluated if row["weights"] == evaluated[-1]["weights"]]  # of the policy as it is now
+    evaluated = [row for row in evaluated if row["weights"] == weights]
     curves = [curve for curve in CURVES if any(row.get(curve[0]) for row in rows)]
     if curves[-1:] == [FEAR]:
         curves.remove(VALUES)
@@ -66,13 +67,6 @@ def draw_summary(folder: RunFolder, title: str) -> None:
         _bars(axes[EVALUATION], evaluated)
     figure.suptitle(title)
     _save(figure, folder.path / "summary.png")
-
-
-def wilson(share: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the 95 % intervals of proportions, by Wilson's score (1927), each of the arguments' shape."""
-    z = 1.959964  # of the normal distribution, two-sided
-    middle, spread = share + z * z / (2 * count), z * np.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
-    return (middle - spread) / (1 + z * z / count), (middle + spread) / (1 + z * z / count)
 
 
 def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor]]") -> Path:

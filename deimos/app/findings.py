@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from deimos.app.console import number, table
 from deimos.run.evaluation import worst
 
@@ -13,8 +15,8 @@ _LINES = (
     ("crashes per 1000 steps", "crashes_per_1000"),
     ("crashes per robot-minute", "crashes_per_minute"),
     ("goals", "interactions"),
-    ("crashes, under first goals too", "crashes"),
-    ("crashes under first goals, which nobody chose", "first_goal_crashes"),
+    ("all crashes", "crashes"),
+    ("of these, under first goals", "first_goal_crashes"),
     ("goals that the attacker learnt from", "adversary_interactions"),
     ("crashes that the attacker learnt from", "adversary_crashes"),
     ("attacker's AUROC (0.5: chance, 1: perfect)", "adversary_auroc"),
@@ -63,22 +65,52 @@ def _per_part(rows: list[dict]) -> list[tuple[str, list[str]]]:
 
 def conclude(rows: list[dict]) -> str:
     """What the shares of goals that ended in a crash mean, in a sentence."""
-    shares = {row["goals"]: row["crash_rate"] for row in rows}
-    if any(_is_missing(share) for share in shares.values()):
+    if any(_is_missing(row["crash_rate"]) for row in rows):
         return "No goal was pursued to its end, so nothing can be said of crashes."
-    naive = shares.pop("naive")
-    said = f"Under uniform goals {percent(naive) if naive else 'none'} of the goals end in a crash"
-    for goals, share in shares.items():
-        said += f"; {goals} " + ("raises that to " if share > naive else "gets no more than ") + percent(share)
+    (naive,), attacked = ([row for row in rows if (row["goals"] == "naive") == own] for own in (True, False))
+    low = naive["crash_rate"]
+    said = f"Under uniform goals {percent(low) if low else 'none'} of the goals end in a crash"
+    for row in attacked:
+        share = percent(row["crash_rate"])
+        if row["crash_rate"] <= low:
+            said += f"; {row['goals']} gets no more than {share}"
+        else:
+            said += f"; {row['goals']} " + (
+                f"raises that to {share}" if _is_raised(row, naive) else f"gets {share}, which may be chance"
+            )
     said += "."
+    for row in attacked:
+        if _is_untested(row) and not _is_raised(row, naive):
+            said += (
+                f" {row['goals']} learnt from {row['adversary_crashes']:,} crashes, too few to tell whether it learnt"
+            )
+            said += " anything: its column proves nothing."
     if without := [row["goals"] for row in rows if row.get("uninformed")]:
         said += (
             f" Goals of {' and '.join(without)} are uniform: there was nothing to learn from, so they prove nothing."
         )
-    for most in worst([rows]) if len(shares) > 1 and any(shares.values()) else []:
+    for most in worst([rows]) if len(attacked) > 1 and any(row["crash_rate"] for row in attacked) else []:
         said += f" The worst attacker is {most['attacker']}: {percent(most['crash_rate'])} in the worlds that did not"
         said += " choose it."
     return said
+
+
+def _is_raised(row: dict, naive: dict) -> bool:
+    """Whether more goals ended in a crash than under uniform goals, beyond chance: their intervals lie apart."""
+    (_, highest), (lowest, _) = (wilson(each["crash_rate"], each["interactions"]) for each in (naive, row))
+    return bool(lowest > highest)
+
+
+def _is_untested(row: dict) -> bool:
+    """Whether an attacker has learnt from crashes, but too few for one in the worlds that it is tested on."""
+    return "adversary_auroc" in row and _is_missing(row["adversary_auroc"]) and not row.get("uninformed")
+
+
+def wilson(share: Any, count: Any) -> tuple[Any, Any]:
+    """Bounds of the 95 % intervals of proportions, by Wilson's score (1927), each of the arguments' shape."""
+    z = 1.959964  # of the normal distribution, two-sided
+    middle, spread = share + z * z / (2 * count), z * np.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
+    return (middle - spread) / (1 + z * z / count), (middle + spread) / (1 + z * z / count)
 
 
 def percent(share: float | None) -> str:

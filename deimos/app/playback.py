@@ -33,7 +33,7 @@ RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)
 
 @dataclass(frozen=True, kw_only=True)
 class PlayOptions:
-    """Render the policy of a run in one world under uniform goals; the goal and its fear are written in the picture.
+    """Render the policy of a run in one world under uniform goals; pictures have the goal and its crash probability.
 
     Robots are rendered without a display: MUJOCO_GL says how (egl or osmesa; Debian has libegl1 and libosmesa6).
     Particles are drawn, with their trail in blue, their goal in orange and a cross where they crashed.
@@ -70,7 +70,7 @@ class PlayOptions:
         if self.goal_period is not None:
             check_at_least("goal_period", self.goal_period, 1)
         if (self.video is None) == (self.frames is None):
-            raise ValueError("Give one of --video FILE and --frames FOLDER.")
+            raise ValueError("Give either --video FILE or --frames FOLDER.")
 
     @property
     def target(self) -> Path:
@@ -155,7 +155,7 @@ def _caption(env: Env, afraid: FearSelector | None, t: int, crashes: int) -> str
     if afraid is None:
         return text
     score = afraid.score(env.state(env.obs), goal, goal.unsqueeze(1))[:, 0]
-    return text + f"\nfear of keeping it {percent(afraid.calibration.probability(score).item())}"
+    return text + f"\npredicted crash probability of this goal {percent(afraid.calibration.probability(score).item())}"
 
 
 @contextmanager

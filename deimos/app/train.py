@@ -14,7 +14,9 @@ from deimos.app import console, figures
 from deimos.app.evaluate import show_evaluation, title
 from deimos.checks import RunError
 from deimos.goals import selectors
+from deimos.learn.policy import load_policy
 from deimos.run import presets, training
+from deimos.run.evaluation import weights_hash
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
@@ -88,14 +90,14 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(130)
-    if config.evaluation:
-        show_evaluation(folder, config, config.env, config.eval, trainer.env.device)
-    else:
-        figures.draw_summary(folder, title(config))
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
         parts = [f"{name} {seconds / total:.0%}" for name, seconds in trainer.seconds.items()]
-        print(f"Training took {total:.1f} s: {', '.join(parts)}.")
+        print(f"Training took {total:.1f} s: {', '.join(parts)}.", flush=True)
+    if config.evaluation:
+        show_evaluation(folder, config, config.env, config.eval, trainer.env.device)
+    else:
+        figures.draw_summary(folder, title(config), weights_hash(load_policy(folder.path).actor))
     print(folder.path)
 
 

@@ -4,14 +4,19 @@ import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from deimos.checks import RunError
+from deimos.files import first_line
 
-CODECS = {".mp4": "libx264", ".mkv": "libx264", ".mov": "libx264", ".webm": "libvpx-vp9"}
+CODECS = {".mp4": "libx264", ".mkv": "libx264", ".mov": "libx264", ".webm": "libvpx-vp9", ".gif": "gif"}
 """What ffmpeg encodes a video with, by the ending of its file."""
-ENDINGS = (*CODECS, ".gif")
+ENDINGS = tuple(CODECS)
+PALETTES = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=dither=none:new=1"
+"""ffmpeg's filter that gives every picture 256 colours of its own, for GIF."""
+FASTEST_GIF = 50.0  # pictures per second; viewers slow down what is faster
 
 Write = Callable[[np.ndarray], object]
 """Takes the next picture, uint8, shape (height, width, 3)."""
@@ -22,16 +27,22 @@ def pictures(folder: Path) -> Iterator[Write]:
     """Writes numbered PNG files into a new folder.
 
     Raises:
-        RunError: If the folder exists.
+        RunError: If the folder exists, or it cannot be made or written to.
     """
     from PIL import Image
 
-    try:
+    if folder.exists():
+        raise RunError(f"{folder} exists already; name another folder.")
+    with _writing(folder):
         folder.mkdir(parents=True)
-    except FileExistsError as error:
-        raise RunError(f"{folder} exists already; name another folder.") from error
     number = itertools.count()
-    yield lambda picture: Image.fromarray(picture).save(folder / f"{next(number):06d}.png")
+
+    def write(picture: np.ndarray) -> None:
+        path = folder / f"{next(number):06d}.png"
+        with _writing(path):
+            Image.fromarray(picture).save(path)
+
+    yield write
 
 
 @contextmanager
@@ -41,10 +52,10 @@ def video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
     Args:
         path: The file; what is there is overwritten once the new one is whole.
         size: Width and height [pixels].
-        fps: Pictures per second.
+        fps: Pictures per second; a GIF has 50 at most.
 
     Raises:
-        RunError: If the ending is another, or it cannot be written.
+        RunError: If the ending is another, it cannot be written, or no picture was.
     """
     ending = path.suffix.lower()
     if ending not in ENDINGS:
@@ -53,9 +64,19 @@ def video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
         raise RunError(f"The folder of {path} does not exist.")
     unfinished = path.with_name(f".unfinished-{path.name}")
     try:
-        with _gif(unfinished, fps) if ending == ".gif" else _encoder(unfinished, size, fps, CODECS[ending]) as write:
+        with _encoder(unfinished, size, fps, CODECS[ending]) as send:
+            count = itertools.count()
+
+            def write(picture: np.ndarray) -> None:
+                with _writing(path):
+                    send(np.ascontiguousarray(picture))
+                next(count)
+
             yield write
-        unfinished.replace(path)
+            if not next(count):
+                raise RunError(f"{path} could not be written (there is no picture to show).")
+        with _writing(path):
+            unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
 
@@ -64,22 +85,24 @@ def video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
 def _encoder(path: Path, size: tuple[int, int], fps: float, codec: str) -> Iterator[Write]:
     import imageio_ffmpeg
 
-    frames = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, macro_block_size=2, codec=codec, ffmpeg_log_level="error"
-    )
+    options: dict[str, Any] = {"fps": fps, "macro_block_size": 2}
+    if codec == "gif":
+        options = {
+            "fps": min(fps, FASTEST_GIF), "macro_block_size": 1, "pix_fmt_out": "pal8", "quality": None,
+            "output_params": ["-vf", PALETTES],
+        }  # fmt: skip
+    frames = imageio_ffmpeg.write_frames(str(path), size, codec=codec, ffmpeg_log_level="error", **options)
     frames.send(None)
     try:
-        yield lambda picture: frames.send(np.ascontiguousarray(picture))
+        yield frames.send
     finally:
         frames.close()
 
 
 @contextmanager
-def _gif(path: Path, fps: float) -> Iterator[Write]:
-    """Each picture has 256 colours of its own, and time is in hundredths of a second."""
-    from PIL import Image
-
-    frames: list[Image.Image] = []
-    yield lambda picture: frames.append(Image.fromarray(picture).quantize(dither=Image.Dither.NONE))
-    duration = max(20, 10 * round(100 / fps))  # [ms]; viewers slow down what is faster
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
+def _writing(path: Path) -> Iterator[None]:
+    """Turn what a system says that does not let a file be written into ``RunError``."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(f"{path} could not be written ({error.strerror or first_line(error)}).") from error

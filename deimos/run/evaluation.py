@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -110,9 +110,8 @@ def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
     """Rows of the folder that differ from these of an evaluation in nothing but the engine: how it did elsewhere."""
 
     def identity(row: dict) -> list:
-        return [
-            row.get(key) for key in ("goals", "goal_period", "seed", "worlds", "steps", "adversary_setting", "weights")
-        ]
+        keys = ("goals", "goal_period", "seed", "worlds", "steps", "environment", "adversary_setting", "weights")
+        return [row.get(key) for key in keys]
 
     here = {row.get("engine") for row in rows}
     same = [identity(row) for row in rows]
@@ -123,14 +122,28 @@ def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
 def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
     """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
     shared = {name: value for name, value in to_dict(config).items() if name in ("worlds", "seed", "fear")}
-    engine = {"engine": env_config.engine} if hasattr(env_config, "engine") else {}
+    environment, engine = (
+        _environment(env_config),
+        {"engine": env_config.engine} if hasattr(env_config, "engine") else {},
+    )
     return [
         {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed,
-         "worlds": config.worlds_against(goals), "steps": config.steps}
+         "worlds": config.worlds_against(goals), "steps": config.steps, "environment": environment}
         | engine
         | ({} if goals == "naive" else {"adversary_setting": _setting(shared, config, goals)})
         for goals in ("naive", *config.attackers)
     ]  # fmt: skip
+
+
+def _environment(env_config: EnvConfig) -> str:
+    """A hash of a task as it is evaluated, but for what rows say apart and for the places of its files."""
+    left_out = {"goal_period", "engine", *env_config.files}
+    task = {name: value for name, value in asdict(env_config.for_evaluation()).items() if name not in left_out}
+    return _digest(task)
+
+
+def _digest(data: dict) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:12]
 
 
 def _setting(shared: dict, config: EvalConfig, name: str) -> str:
@@ -139,7 +152,7 @@ def _setting(shared: dict, config: EvalConfig, name: str) -> str:
     if attacker(name).needs_pool:
         assert config.pool is not None
         made["pool"] = hashlib.sha256(_read(config.pool)).hexdigest()
-    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:12]
+    return _digest(made)
 
 
 def _read(path: Path) -> bytes:
@@ -166,7 +179,8 @@ def evaluate(
         A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` gives, and ``score``: the
         place of its ``return_per_step`` between that of the policy that does nothing (0) and that of the environment's
         reference policy (1), both under Naive goals; NaN where there is none. For an attacker also its facts, see
-        ``deimos.run.attack``, and ``adversary_setting``, a hash of all that fixed how it was made but the policy.
+        ``deimos.run.attack``, and ``adversary_setting``, a hash of all that fixed how it was made but the policy. In
+        ``environment`` each has a hash of the task.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.

@@ -23,7 +23,7 @@ from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 
 SCHEMA = 1  # of config.json
-CHECKPOINT_SCHEMA = 2  # of checkpoint.pt; of 0.1.0's, 1, the networks can be loaded, but not its worlds
+CHECKPOINT_SCHEMA = 3  # of checkpoint.pt; of earlier ones the networks can be loaded, but not the rest
 CHECKPOINT_SECONDS = 30.0
 _NO_MEMORY = re.compile(
     "out of memory|allocate|alloc_failed|allowed dimension|too big|storage size|representable", re.IGNORECASE
@@ -152,7 +152,7 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
 
 
 def load_checkpoint(folder: RunFolder) -> dict:
-    """What a run's checkpoint holds, of this version or of the one before; ``RunError`` as ``load_tensors`` has it."""
+    """What a run's checkpoint holds, of this version or of an earlier one; ``RunError`` as ``load_tensors`` has it."""
     return load_tensors(folder.path / "checkpoint.pt", "checkpoint", CHECKPOINT_SCHEMA, oldest=1)
 
 
@@ -189,7 +189,9 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
     if device is not None:
         config = replace(config, device="cuda" if resolve_device(device).type == "cuda" else "cpu")
     trainer = load(folder, config)
-    folder.write_json("config.json", folder.read_json("config.json") | {"config": to_dict(config)})
+    stored = folder.read_json("config.json")  # whose files keep the names that they were given by
+    stored["config"] |= {"env_steps": config.env_steps, "device": config.device}
+    folder.write_json("config.json", stored)
     for name in ("progress.csv", "timing.csv"):
         folder.cut_csv(name, trainer.iteration)
     return trainer, folder

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from deimos.checks import SimulationError
 from deimos.sim.env import Env, EnvConfig, Step
+from deimos.sim.warp_env import WarpEnv
 
 WORLDS = 6
 LONGEST_PERIOD = 6  # T of the copies: long enough to see that a goal is not due before
@@ -41,8 +42,9 @@ def check_env(env: Env) -> None:
         return config.build(num_envs, env.device, seed, env_offset)
 
     for check in (
-        _check_layout, _check_views, _check_start, _check_draws, _check_candidates, _check_step, _check_clocks,
-        _check_reset, _check_set_goals, _check_repeats, _check_clones, _check_resume, _check_penalty, _check_faults,
+        _check_layout, _check_views, _check_start, _check_observation, _check_draws, _check_candidates, _check_step,
+        _check_clocks, _check_reset, _check_set_goals, _check_repeats, _check_clones, _check_resume, _check_penalty,
+        _check_faults,
     ):  # fmt: skip
         for holds, message in check(build(), build):
             if not torch.as_tensor(holds).all():
@@ -146,7 +148,10 @@ def _check_views(env: Env, build: Build) -> Claims:
 def _check_start(env: Env, build: Build) -> Claims:
     """A built environment has begun its first episodes; ``restart`` begins them again."""
     begun = env.tensors["episode_count"] == 1
-    yield begun, "an episode must have begun in every world: end the constructor with begin()."
+    yield (
+        begun,
+        "an episode must have begun in every world: end the constructor with begin(), call begin_episode in the reset.",
+    )
     yield env.obs.isfinite(), "the first observation must be finite: the reset must write all of it."
     yield len(env.goal.unique(dim=0)) > 1, "first goals must differ and be seen: begin_episode, write_goal."
     first = env.state_dict()
@@ -158,6 +163,32 @@ def _check_start(env: Env, build: Build) -> Claims:
     env.restart(torch.full((env.goal_dim,), 0.25, device=env.device))
     changed = (env.obs[:, env.goal_slice] != first["obs"][:, env.goal_slice]).any()
     yield changed, "first goals must heed goal_scale: reset must use the range that it is given."
+
+
+def _check_observation(env: Env, build: Build) -> Claims:
+    """Kernels write all of the observation, nothing else where the goal is, and nothing behind it."""
+    if not isinstance(env, WarpEnv):
+        return  # others may keep their state in it
+    state = torch.ones(env.obs_dim, dtype=torch.bool, device=env.device)
+    state[env.goal_slice] = False
+    order = "write columns 0, 1, ... in the layout's order, the goal last"
+
+    def claims(what: str) -> Claims:
+        behind = env.beyond_obs.isnan()
+        yield behind, f"the {what} must not write beyond the {env.obs_dim} columns of the layout, which is too narrow."
+        shown = torch.isclose(env.goal, env.seen_goals(), rtol=1e-4, atol=1e-5)
+        yield shown, f"the {what} must write nothing but the goal into the goal's slot of obs: {order}."
+        columns = (~env.obs.isfinite()).any(0).nonzero().squeeze(1).tolist()
+        yield not columns, f"the {what} must write all of obs, but left out the columns {columns}: {order}."
+
+    for action in _actions(env, 3):
+        env.obs[:, state] = torch.nan
+        env.beyond_obs.fill_(torch.nan)
+        env.step(action)
+        yield from claims("step")
+    env.obs.fill_(torch.nan)
+    env.reset(torch.ones(WORLDS, dtype=torch.bool, device=env.device))
+    yield from claims("reset")
 
 
 def _check_draws(env: Env, build: Build) -> Claims:
@@ -260,9 +291,9 @@ def _check_set_goals(env: Env, build: Build) -> Claims:
 
 def _check_repeats(env: Env, build: Build) -> Claims:
     """Two environments of one seed do the same, bit for bit."""
-    twin = build()
+    twin, cause = build(), "draws must be addressed, and arrays, action_dim too, as large as what is read of them"
     for age, action in enumerate(_actions(env, STEPS), 1):
-        message = f"the same seed must give the same numbers, but {{name}} differs after {age} steps."
+        message = f"the same seed must give the same numbers, but {{name}} differs after {age} steps: {cause}."
         yield from _are_equal(_advance(twin, action), _advance(env, action), message)
     yield set(env.report()) == set(twin.report()), "report must have the same keys every time."
 

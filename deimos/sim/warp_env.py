@@ -17,6 +17,7 @@ from deimos.sim.env import Env, EnvConfig, ObsField, Step
 from deimos.sim.shared import Shared, warp_device
 
 MAX_INVALID_SHARE = 1e-3  # of all world-steps; more of them stop the run
+GUARD = 64  # rows behind the observations, which take what a kernel writes beyond the last one
 WINDOW = 10_000  # world-steps that the share is of at least, however often it is looked at
 
 
@@ -45,6 +46,8 @@ class WarpEnv(Env):
     """What all environments have for their worlds, for the kernels."""
     action: Shared
     """The actions of the step: ``worlds.action``."""
+    beyond_obs: Tensor
+    """Memory behind ``obs`` that no kernel may write, for ``check_env``."""
     launch_step: Callable[[], None]
     """Simulates one step under the actions that are in ``action``, for benchmarks too."""
 
@@ -62,12 +65,17 @@ class WarpEnv(Env):
         goal = self.goal_slice
         scale = next(field.scale for field in self.layout if field.name == "goal")
         scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim
+        if len(goal_range) != self.goal_dim:
+            raise ValueError(f"goal_range must have {self.goal_dim} components, got {len(goal_range)}.")
         groups = len(self.goal_groups)
         self.worlds = make_worlds(
             num_envs, warp_device(device), obs_dim=self.obs_dim, action_dim=action_dim, goal_start=goal.start,
             goal_scale=scales, goal_period=config.goal_period, time_limit=time_limit, stagger=stagger, seed=seed,
             world_offset=env_offset, crash_penalty=self.crash_penalty, num_groups=groups if groups > 1 else 0,
         )  # fmt: skip
+        guarded = wp.zeros((num_envs + GUARD, self.obs_dim), wp.float32, device=warp_device(device))
+        self.worlds.obs = guarded[:num_envs]
+        self.beyond_obs = wp.to_torch(guarded)[num_envs:]
         views = {name: wp.to_torch(getattr(self.worlds, name)) for name in WORLDS.names}
         self._views = views
         self._memory = [views[name] for name in (*Step.__dataclass_fields__, *RESUMED)]
@@ -186,6 +194,14 @@ class WarpEnv(Env):
         if self.worlds.origin.shape[0]:
             middle -= wp.to_torch(self.worlds.origin)[rows] * (self._seen_range / self._whole_range)
         return middle - self._seen_range, middle + self._seen_range
+
+    @final
+    def seen_goals(self) -> Tensor:
+        """What the goal's slot of every world's observation must hold, shape (num_envs, goal_dim)."""
+        goal = self._views["goal"]
+        if self.worlds.origin.shape[0]:
+            goal = goal - wp.to_torch(self.worlds.origin)
+        return goal * self._views["goal_scale"]
 
     @final
     def draw(self, rows: Tensor) -> Tensor:

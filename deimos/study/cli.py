@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import tyro
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from deimos.checks import RunError, check_at_least
@@ -20,6 +21,8 @@ from deimos.study.engine import LocalProcesses
 from deimos.study.folder import StudyFolder
 from deimos.study.results import check_comparable, identity, merge
 from deimos.study.runner import Progress, Runner
+
+WIDEST = 10_000  # columns of a table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +53,7 @@ class RunOptions(_FolderOptions):
     device: Literal["auto", "cpu", "cuda"] | None = None
     """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
-    """CPU threads of every worker, in place of the file's, which is 1 unless said. Part of what fixes its numbers."""
+    """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell."""
     workers: int = 1
     """Parallel runs, at least 1."""
     retry_failed: bool = False
@@ -103,6 +106,7 @@ class RunOptions(_FolderOptions):
                 f"--retry-failed tries them again."
             )
         print(study.path)
+        print(f"Next: deimos study report {study.path}", file=sys.stderr)
 
     def _described(self, file: Path) -> list[plan.Cell]:
         train = {name: getattr(self, name) for name in ("num_envs", "env_steps", "device", "threads")}
@@ -124,16 +128,21 @@ class ShowOptions(_FolderOptions):
             raise RunError(f"{study.path} holds no study and no results.")
         table = Table(title="Medians over seeds", title_justify="left")
         for name in ("environment", "method", "goals", "T", "seeds", "crashes/1000", "score", "reward", "FPS"):
-            table.add_column(name, justify="left" if name in ("environment", "method", "goals") else "right")
+            is_text = name in ("environment", "method", "goals")
+            table.add_column(name, justify="left" if is_text else "right", no_wrap=True)
         groups: dict[tuple, list[dict]] = defaultdict(list)
         for row in rows:
             groups[row["environment"], row["goals"], row["goal_period"], row["method"]].append(row)
         columns = {"crashes_per_1000": ".3g", "score": ".3f", "reward": ".4f", "fps": ".0f"}
         for (environment, goals, period, name), group in sorted(groups.items()):
             values = {column: [row[column] for row in group if not math.isnan(row[column])] for column in columns}
-            medians = [format(median(values[column] or [math.nan]), form) for column, form in columns.items()]
+            medians = [
+                format(median(values[column]), form) if values[column] else "-" for column, form in columns.items()
+            ]
             table.add_row(environment, name, goals, str(period), str(len(group)), *medians)
-        Console().print(table)
+        screen = Console()
+        needed = Measurement.get(screen, screen.options.update(width=WIDEST), table).maximum
+        Console(width=max(screen.width, needed)).print(table)  # the terminal wraps what does not fit; nothing is cut
         if cells:
             finished = study.finished(cells)
             print(f"{len(finished)} of {len(cells)} cells are finished.")

@@ -72,7 +72,7 @@ def boxes(data: Data, environment: str, period: int) -> "Figure":
     figure, axes = subplots(2, 2, (2.6 + 0.62 * len(methods), 6.4), sharex=True, sharey="row")
     for column, goals in enumerate(GOALS):
         where = Where(environment, goals, period)
-        axes[0, column].set_title(f"against the {goals.capitalize()}")
+        axes[0, column].set_title(goals.capitalize())
         for row, metric in enumerate(("crashes", "reward")):
             _boxes(axes[row, column], data.style, {name: data.sample(where, name, metric) for name in methods})
         axes[1, column].set_xticks(range(len(methods)), methods, rotation=45, ha="right")

@@ -4,6 +4,7 @@
 these sections and others.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -26,7 +27,8 @@ FIGURES = "figures"
 COVERAGE = (  # python -m reproduction coverage, its defaults
     "The intervals of IQMs and medians are percentile bootstraps: they cover 93 to 94 % at n = 10, on normal and on "
     "lognormal data. Means have bootstrap-t intervals (94 % and 91 %); the percentile bootstrap would cover 90 % and "
-    "81 %, BCa 90 % and 83 %. Intervals of ratios of spread cover more than 99 %: they are too wide, they only "
+    "81 %, BCa 90 % and 83 %; of few seeds, or many equal values, a mean has none. Intervals of ratios of spread cover "
+    "more than 99 %: they are too wide, they only "
     "describe, and no difference is called on them."
 )
 _median = partial(np.median, axis=-1)
@@ -84,7 +86,7 @@ def what_was_run(data: Data) -> list[Block]:
         })  # fmt: skip
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
     weak = [_weak_adversaries(data)] if data.weak else []  # of results of 0.1.0
-    return ["## What was run", rows, *weak, "By: " + "; ".join(versions) + "."]
+    return ["## What was run", rows, *weak, "Run on " + "; ".join(versions) + "."]
 
 
 def _values(rows: Sequence[dict], column: str) -> str:
@@ -132,10 +134,11 @@ def _table(data: Data, where: Where) -> list[Block]:
             "method": name, "seeds": str(len(crashes)),
             "crashes: median": _boot(crashes, _median), "IQM": _boot(crashes, stats.iqm),
             # Where most policies do not crash, the bootstrap-t is wide on both sides; counts are not below 0.
-            "mean": f"{replace(mean, low=max(mean.low, 0.0)):.3g}",
+            "mean": f"{replace(mean, low=max(mean.low, 0.0)):.3g}" if math.isfinite(mean.high)
+            else f"{mean.estimate:.3g} (no interval)",
             "worst 20 % (CVaR)": _boot(crashes, stats.cvar), "IQR": _boot(crashes, stats.iqr),
             "10 % to 90 %": " to ".join(f"{x:.3g}" for x in np.quantile(crashes, [0.1, 0.9])),
-            "crashes per interaction": f"{np.median(rate):.4f}" if len(rate) else "-",
+            "goals that ended in a crash: median": f"{100 * np.median(rate):.3g} %" if len(rate) else "-",
             "reward: IQM": _boot(reward, stats.iqm, ".4f"), "score: IQM": _boot(score, stats.iqm, ".3f"),
             f"P(more crashes than {data.style.reference})": more,
             **{f"{what}: IQM": _boot(data.sample(where, name, part), stats.iqm) for part, what in parts.items()},

@@ -12,6 +12,10 @@ from ..shape import TileShape
 class Shape(TileShape):
     """Flat ground at every difficulty."""
 
+    def step(self, difficulty: float) -> float:
+        """None: no face is vertical."""
+        return 0.0
+
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         return rings(np.array([self.tile / 2]), np.zeros(1))

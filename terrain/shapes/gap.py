@@ -21,6 +21,10 @@ class Shape(TileShape):
         super().__post_init__()
         self.check_room("platform + 2 width", self.platform + 2 * max(self.width))
 
+    def step(self, difficulty: float) -> float:
+        """The trench is crossed, not stepped into: no step."""
+        return 0.0
+
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         middle = self.platform / 2

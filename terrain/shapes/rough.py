@@ -29,6 +29,10 @@ class Shape(TileShape):
         super().__post_init__()
         check_range("spacing", self.spacing, 0.01, self.tile / 4)
 
+    def step(self, difficulty: float) -> float:
+        """None: no face is vertical."""
+        return 0.0
+
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         amplitude = at(self.amplitude, difficulty)

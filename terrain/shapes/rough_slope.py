@@ -35,6 +35,10 @@ class Shape(TileShape):
         if self.room > self.platform:
             raise ValueError(f"room must be at most platform = {self.platform:g} m, got {self.room:g} m.")
 
+    def step(self, difficulty: float) -> float:
+        """None: no face is vertical."""
+        return 0.0
+
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         amplitude = at(self.amplitude, difficulty)

@@ -22,6 +22,10 @@ class Shape(TileShape):
     gradient: Ramp = (0.0, 0.4)
     """Rise over run at difficulty 0 and at 1, each at least 0."""
 
+    def step(self, difficulty: float) -> float:
+        """None: no face is vertical."""
+        return 0.0
+
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         rise = at(self.gradient, difficulty) * (self.tile - self.platform) / 2

@@ -28,6 +28,10 @@ class Shape(TileShape):
             check_ramp(name, getattr(self, name), least=0.01)
         self.check_room("platform + 2 rim + 4 gap", self.platform + 2 * self.rim + 4 * max(self.gap))
 
+    def step(self, difficulty: float) -> float:
+        """The floor between the stones is crossed, not stepped into: no step."""
+        return 0.0
+
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         gap = at(self.gap, difficulty)

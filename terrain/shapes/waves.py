@@ -30,6 +30,10 @@ class Shape(TileShape):
         check_at_least("count", self.count, 1)
         check_range("spacing", self.spacing, 0.01, self.tile / self.count / 8)
 
+    def step(self, difficulty: float) -> float:
+        """None: no face is vertical."""
+        return 0.0
+
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         cells = round(self.tile / self.spacing)

@@ -14,17 +14,14 @@ from deimos.goals.selector import Delegate, GoalSelector, SelectorConfig, Spaces
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """The first method chooses the goals up to a share of the training, the second one from there on.
-
-    The second learns from the start what the first one's goals teach: outcomes and transitions. (Of candidates, which
-    RND, grid and PLR learn from as well, it sees none before it chooses.) The first keeps learning as long as it
-    chooses, and beyond where the learner has its baseline from it.
-    """
+    """The first method chooses the goals up to a share of the training, the second one from there on."""
 
     first: str = "vds"
-    """Name of the first method."""
+    """Name of the first method. It keeps learning as long as it chooses, and beyond where the learner has its baseline
+    from it."""
     second: str = "p75"
-    """Name of the second method."""
+    """Name of the second method. It learns from the start what the first one's goals teach: outcomes and transitions.
+    (Of candidates, which RND, grid and PLR learn from as well, it sees none before it chooses.)"""
     at: float = 0.5
     """Share of the training after which it switches, in (0, 1)."""
 
