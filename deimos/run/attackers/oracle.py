@@ -15,6 +15,7 @@ class Config(argmax_long.Config):
     """N T steps of a clone for every goal."""
 
     few_worlds = True
+    """Clones are dear: ``eval.oracle_worlds`` of the worlds meet it."""
 
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``."""
