@@ -14,7 +14,8 @@ from .grid import Terrain
 
 LENGTH = 760  # pixels along the longer side of long ground
 DPI = 100
-WORDS = 180  # pixels for titles, names and the bar of colours
+WORDS = 240  # pixels for titles, names and the bar of colours
+POINTS = 16  # size of the letters: they can be read where a page shows the picture at the width of a phone
 SAMPLES = 2  # samples per pixel, along each axis
 TURN, TILT = math.radians(25.0), math.radians(35.0)  # of the oblique view: about the vertical, above the horizon
 WALL = 0.45  # grey of the cut around the ground
@@ -47,13 +48,15 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     inches = (width / SAMPLES + WORDS) / DPI, (height / SAMPLES + WORDS) / DPI
     figure = Figure(inches, dpi=DPI, layout="constrained")
     axes = figure.subplots(2, 1, height_ratios=heights) if stacked else figure.subplots(1, 2, width_ratios=widths)
-    figure.suptitle(title, fontsize=13)
+    figure.suptitle(title, fontsize=POINTS)
     for axis, (picture, span) in zip(axes, views, strict=True):
         axis.imshow(picture, extent=span, interpolation="antialiased")
         axis.set_axis_off()
         _scale_bar(axis, *span)
     _name_tiles(axes[0], terrain)
-    figure.colorbar(colours, ax=list(axes), shrink=0.6, aspect=30, pad=0.02).set_label("height [m]")
+    bar = figure.colorbar(colours, ax=list(axes), shrink=0.6, aspect=30, pad=0.02)
+    bar.set_label("height [m]", fontsize=POINTS)
+    bar.ax.tick_params(labelsize=POINTS)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.1)  # no name is cut off, however long
     image = Image.open(buffer).convert("RGB")
@@ -126,7 +129,7 @@ def _scale_bar(axis: Any, left: float, right: float, bottom: float, top: float) 
     length = next(step * power for step in (5, 2, 1) if step * power <= rough)
     y = bottom - 0.03 * max(top - bottom, (right - left) / 3)
     axis.plot([left, left + length], [y, y], color="black", linewidth=3, solid_capstyle="butt", clip_on=False)
-    axis.text(left + length, y, f"  {length:g} m", va="center", ha="left", fontsize=10)
+    axis.text(left + length, y, f"  {length:g} m", va="center", ha="left", fontsize=POINTS)
     axis.set_ylim(y - (bottom - y), top)
 
 
@@ -142,11 +145,11 @@ def _name_tiles(axis: Any, terrain: Terrain) -> None:
     axis.set_axis_on()
     axis.set_frame_on(False)
     axis.xaxis.tick_top()
-    axis.tick_params(length=0, labelsize=9)
+    axis.tick_params(length=0, labelsize=POINTS)
     if _is_wide(terrain):
         axis.set_xticks(x.mean(axis=1), levels)
         axis.set_yticks(middles, columns)
     else:
-        narrow = {"rotation": 40, "rotation_mode": "anchor", "ha": "left"} if len(columns) > 4 else {}
+        narrow = {"rotation": 55, "rotation_mode": "anchor", "ha": "left"} if len(columns) > 4 else {}
         axis.set_xticks(middles, columns, **narrow)
         axis.set_yticks(-x.mean(axis=1), levels)
