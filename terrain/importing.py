@@ -1,7 +1,9 @@
 """Ground from elsewhere: meshes, grey pictures and arrays of heights become a terrain."""
 
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from deimos.kernels.ray_cast import SNAP
@@ -69,20 +71,11 @@ def import_file(
     ending = path.suffix.lower()
     if ending not in OPTIONS:
         raise ValueError(f"A file to import must end in one of {', '.join(OPTIONS)}, got {path}.")
-    for name, value in (("resolution", resolution), ("scale", scale), ("tile", tile)):
-        check_positive(name, 1.0 if value is None else value, finite=True)
-    if height_range is not None and not -FARTHEST <= height_range[0] < height_range[1] <= FARTHEST:
-        raise ValueError(
-            f"height_range must rise from one height to another, both within {FARTHEST:g} m, got {height_range}."
-        )
-    options = {"resolution": resolution, "height_range": height_range, "scale": scale, "tile": tile}
     is_terrain = ending == ".npz" and _is_terrain(path)
-    takes = () if is_terrain else OPTIONS[ending]
-    if unfit := [name for name, value in options.items() if value is not None and name not in takes]:
-        raise ValueError(f"{unfit[0]} does not apply to {path}, which takes {', '.join(takes) or 'no options'}.")
+    options = {"resolution": resolution, "height_range": height_range, "scale": scale, "tile": tile}
+    _check_options(path, () if is_terrain else OPTIONS[ending], options)
     if is_terrain:
         return Terrain.load(path)
-    check_range("resolution", resolution or RESOLUTION, FINEST, FARTHEST)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
             if ending == ".png":
@@ -96,6 +89,21 @@ def import_file(
         raise ValueError(f"{path} cannot be imported: {error}") from error
     except MemoryError as error:
         raise ValueError(f"{path} cannot be imported: it does not fit in memory ({first_line(error)}).") from error
+
+
+def _check_options(path: Path, takes: Sequence[str], options: dict[str, Any]) -> None:
+    """What is given must be within its range and apply to the file."""
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in ("resolution", "scale", "tile"):
+        check_positive(name, given.get(name, 1.0), finite=True)
+    low, high = given.get("height_range", (0.0, 1.0))
+    if not -FARTHEST <= low < high <= FARTHEST:
+        raise ValueError(
+            f"height_range must rise from one height to another, both within {FARTHEST:g} m, got {(low, high)}."
+        )
+    if unfit := [name for name in given if name not in takes]:
+        raise ValueError(f"{unfit[0]} does not apply to {path}, which takes {', '.join(takes) or 'no options'}.")
+    check_range("resolution", given.get("resolution", RESOLUTION), FINEST, FARTHEST)
 
 
 def _is_terrain(path: Path) -> bool:
