@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -11,15 +12,17 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import env_checker, passive_env_checker
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from rsl_rl.runners import OnPolicyRunner
 
-from deimos.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from deimos import plugins
+from deimos.adapters.gymnasium import ENVIRONMENTS, VERSION, GymnasiumEnv, GymnasiumVectorEnv
 from deimos.adapters.rsl_rl import RslRlVecEnv
 from deimos.checks import SimulationError
 from deimos.goals.fear import FearConfig
 from deimos.goals.selectors import director, uniform
 from deimos.run.loop import GoalLoop, spaces
+from deimos.sim import envs as sim_envs
 from deimos.sim.envs import particle, quad
 
 TIME_LIMIT = 12
@@ -327,10 +330,95 @@ class TestGymnasium:
         assert not np.isclose(other[0], expected[0])[:, 3:6].any()  # where particles start
         assert not np.isclose(other[0], expected[0])[:, 9:12].any()  # their goals
 
+    def test_without_a_seed_no_two_are_alike(self):
+        """Worlds that nobody gave a seed differ: four of them in gymnasium's own vector, and two vectors."""
+        four = SyncVectorEnv([lambda: GymnasiumEnv(CONFIG)] * 4)
+        assert len(np.unique(four.reset()[0][:, 3], axis=0)) == 4  # where particles start
+        two = [GymnasiumVectorEnv(CONFIG, 4).reset()[0] for _ in range(2)]
+        assert not np.isclose(*two)[:, 3:6].any()
+
+    def test_seeds_may_be_numpy_numbers(self):
+        """A seed that NumPy drew is one, and means what the same number of Python means."""
+        first, second = (GymnasiumVectorEnv(CONFIG, 4, seed=kind(7)) for kind in (np.int64, int))
+        np.testing.assert_array_equal(first.reset()[0], second.reset()[0])
+
+    @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+    def test_other_modes_give_the_same_episodes(self, mode):
+        """Under the same policy every world goes through what it does in ``SAME_STEP``, whenever episodes begin."""
+        n, gains = 6, np.random.default_rng(0).uniform(-150.0, 150.0, (12, 3)).astype(np.float32)
+        episodes = []
+        for envs in (GymnasiumVectorEnv(CONFIG, n, 5), GymnasiumVectorEnv(CONFIG, n, 5, autoreset_mode=mode)):
+            obs, _ = envs.reset()
+            found, over = [[] for _ in range(n)], np.zeros(n, bool)
+            for _ in range(60):
+                if mode is AutoresetMode.DISABLED and over.any():
+                    obs, _ = envs.reset(options={"reset_mask": over})
+                    over[:] = False
+                before = obs
+                obs, reward, terminated, truncated, infos = envs.step(np.clip(before @ gains, -100.0, 100.0))
+                last = obs.copy()
+                for world in np.flatnonzero(infos.get("_final_obs", np.zeros(n, bool))):
+                    last[world] = infos["final_obs"][world]
+                for world in np.flatnonzero(~over):
+                    found[world].append(
+                        (before[world], reward[world], terminated[world], truncated[world], last[world])
+                    )
+                same_step = envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+                ignored = over
+                over = np.zeros(n, bool) if same_step else terminated | truncated
+                assert not (ignored & over).any()
+                assert not reward[ignored].any()
+            episodes.append(found)
+        assert sum(step[2] for world in episodes[1] for step in world) > 5
+        for expected, found in zip(*episodes, strict=True):
+            assert len(found) > 40
+            assert all(same(a, b) for a, b in zip(expected, found, strict=False))
+
+    def test_observation_wrappers_of_gymnasium(self):
+        """``NormalizeObservation``, which takes ``NEXT_STEP`` alone, runs over many worlds."""
+        envs = NormalizeObservation(GymnasiumVectorEnv(CONFIG, 8, 0, autoreset_mode="NextStep"))
+        found = np.array(play(envs, random_actions(40, 8))[1:], dtype=object)[:, 0]
+        assert np.abs(np.concatenate(found)[-64:].mean()) < 0.5
+
+    def test_disabled_mode_waits_for_a_reset(self):
+        """A step while an episode is over is refused, with the world; a mask begins there and nowhere else."""
+        envs = GymnasiumVectorEnv(replace(CONFIG, time_limit=2), 3, 0, autoreset_mode=AutoresetMode.DISABLED)
+        idle = np.zeros((3, 3))
+        envs.reset()
+        envs.step(idle)
+        before = envs.reset(options={"reset_mask": np.array([True, False, False])})[0]
+        assert envs.step(idle)[3].tolist() == [False, True, True]
+        with pytest.raises(gymnasium.error.ResetNeeded, match="episode of world 1 has ended"):
+            envs.step(idle)
+        after = envs.reset(options={"reset_mask": np.array([False, True, True])})[0]
+        assert not np.isclose(after, before)[1:, 3:6].any()
+        assert envs.step(idle)[3].tolist() == [True, False, False]
+
+    @pytest.mark.parametrize("name", ENVIRONMENTS)
+    def test_registered_under_gymnasiums_names(self, name):
+        """Every environment is known by its name, and what it stands for can be configured."""
+        found = gymnasium.spec(f"Deimos/{name}-v{VERSION}")
+        assert found.entry_point.startswith("deimos.")
+        options = dict(found.kwargs)
+        assert plugins.load(sim_envs, options.pop("environment")).Config(**options) is not None
+
+    def test_made_by_name(self):
+        """``make`` and ``make_vec`` take options of the environment and of the adapter, and refuse others."""
+        one = gymnasium.make("Deimos/Particle-Absolute-v1", seed=1, max_speed=3.0)
+        assert one.unwrapped.worlds.loop.env.config == particle.Config(
+            variant="absolute", time_limit=1000, max_speed=3.0
+        )
+        many = gymnasium.make_vec("Deimos/Particle-Absolute-v1", 4, vectorization_mode="vector_entry_point", seed=1)
+        np.testing.assert_array_equal(many.reset()[0][0], one.reset()[0])
+        with pytest.raises(TypeError, match="wind"):
+            gymnasium.make("Deimos/Particle-Absolute-v1", wind=1.0)
+        with pytest.raises(ValueError, match="render_mode must be None, got 'human'"):
+            gymnasium.make("Deimos/Particle-Absolute-v1", render_mode="human")
+
     def test_reset_without_a_seed_goes_on(self):
         """The episodes after such a reset are new ones, and a second reset at once skips none of them."""
         actions = random_actions(3, 4)
-        once, twice = GymnasiumVectorEnv(CONFIG, 4), GymnasiumVectorEnv(CONFIG, 4)
+        once, twice = GymnasiumVectorEnv(CONFIG, 4, seed=0), GymnasiumVectorEnv(CONFIG, 4, seed=0)
         start, *_ = play(once, actions)
         play(twice, actions)
         following = once.reset()[0]
@@ -368,7 +456,7 @@ class TestGymnasium:
 
     def test_returns_copies(self):
         """Writing into what came back changes no world, and an action is not kept."""
-        ours, untouched = GymnasiumVectorEnv(CONFIG, 4), GymnasiumVectorEnv(CONFIG, 4)
+        ours, untouched = GymnasiumVectorEnv(CONFIG, 4, seed=0), GymnasiumVectorEnv(CONFIG, 4, seed=0)
         actions = random_actions(20, 4)
         expected = play(untouched, actions)
         ours.reset()[0].fill(7.0)
@@ -384,10 +472,16 @@ class TestGymnasium:
         envs.reset()
         with pytest.raises(ValueError, match=r"actions must have shape \(4, 3\), got \(3,\)"):
             envs.step(np.zeros(3))
-        with pytest.raises(ValueError, match=r"options must be empty, got .*reset_mask"):
-            envs.reset(options={"reset_mask": np.ones(4, bool)})
-        with pytest.raises(ValueError, match=r"seed must be in \[0, 2\^32\), got 4294967296"):
-            envs.reset(seed=2**32)
+        with pytest.raises(ValueError, match=r"options may hold reset_mask alone, got .*'goal'"):
+            envs.reset(options={"goal": 1})
+        for mask in (np.ones(3, bool), np.ones(4)):
+            with pytest.raises(ValueError, match=r"reset_mask must be bool and have shape \(4,\), got"):
+                envs.reset(options={"reset_mask": mask})
+        with pytest.raises(ValueError, match="seed must be None where there is a reset_mask, got 3"):
+            envs.reset(seed=3, options={"reset_mask": np.ones(4, bool)})
+        for seed in (2**32, -1, [1, 2, 3, 4], 1.5):
+            with pytest.raises(ValueError, match=r"seed must be a whole number in \[0, 2\^32\), one for all worlds"):
+                envs.reset(seed=seed)
         with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
             GymnasiumVectorEnv(CONFIG, 0)
         idle[3, 0] = np.nan

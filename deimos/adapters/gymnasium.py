@@ -1,7 +1,11 @@
-"""Environments as gymnasium's: many worlds as a ``VectorEnv``, one as an ``Env``."""
+"""Environments as gymnasium's: many worlds as a ``VectorEnv``, one as an ``Env``.
+
+Importing this module registers ``ENVIRONMENTS``: ``gymnasium.make("Deimos/Particle-Directional-v1")``.
+"""
 
 from functools import partial
-from typing import ClassVar
+from numbers import Integral
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -11,40 +15,58 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
+from deimos import plugins
 from deimos.checks import check_at_least
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import uniform
 from deimos.run.loop import GoalLoop, spaces
+from deimos.sim import envs
 from deimos.sim.env import EnvConfig
+
+VERSION = 1  # goes up when an episode under the same seed and actions becomes another one
+ENVIRONMENTS: dict[str, dict[str, Any]] = {
+    **{
+        f"Particle-{variant.title()}": {"environment": "particle", "variant": variant, "time_limit": 1000}
+        for variant in ("absolute", "directional", "relative")
+    },
+    **{
+        f"{name}-{terrain.title()}": {"environment": environment, "terrain": terrain}
+        for name, environment in (("Quad", "quad"), ("QuadArm", "quad_arm")) for terrain in ("flat", "rough")
+    },
+}  # fmt: skip
+"""What gymnasium knows as ``Deimos/NAME-v1``: an environment and its options. Episodes end, as most learners need."""
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """Many worlds, with NumPy arrays in and copies out; goals are issued within ``step``.
 
-    Worlds that are done begin anew in the same step (``AutoresetMode.SAME_STEP``): what comes back is the first
-    observation of the new episode, and ``infos["final_obs"]`` holds the last one of the old. ``loop`` leads to the
-    environment, the selector and the interactions; every ``reset`` with a seed makes another one.
+    ``loop`` leads to the environment, the selector and the interactions; every ``reset`` with a seed makes another one.
 
     Args:
         config: The environment.
         num_envs: Number of worlds, at least 1.
-        seed: Seed of every draw, in [0, 2^32); ``reset`` may set another.
+        seed: Seed of every draw, in [0, 2^32); ``None`` for one that nobody knows. ``reset`` may set another.
         device: Where they are simulated.
         selector: Who chooses their goals; ``None`` for Uniform. Nothing here lets it learn.
         env_offset: Global number of world 0; see ``EnvConfig.build``.
+        autoreset_mode: What becomes of worlds that are done. ``SAME_STEP``: they begin anew at once, the observation is
+            the new episode's first, and ``infos["final_obs"]`` holds the last one of the old. ``NEXT_STEP``: the
+            observation is the last one, and the next step begins anew there, whatever the action, with reward 0.
+            ``DISABLED``: ``reset(options={"reset_mask": ...})`` must come before the next step.
     """
 
-    metadata: ClassVar[dict] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
-
     def __init__(
-        self, config: EnvConfig, num_envs: int, seed: int = 0, device: torch.device | str = "cpu",
+        self, config: EnvConfig, num_envs: int, seed: int | None = None, device: torch.device | str = "cpu",
         selector: SelectorConfig | None = None, env_offset: int = 0,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ) -> None:  # fmt: skip
         check_at_least("num_envs", num_envs, 1)
         self.num_envs = num_envs
+        self._mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
         self._build = partial(config.build, num_envs, torch.device(device), env_offset=env_offset)
         self._selector = selector or uniform.Config()
-        self._begin(seed)
+        self._begin(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
         env = self.loop.env
         self.single_observation_space = Box(-np.inf, np.inf, (env.obs_dim,), np.float32)
         low, high = env.action_range
@@ -53,33 +75,42 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def _begin(self, seed: int) -> None:
-        if not 0 <= seed < 2**32:
-            raise ValueError(f"seed must be in [0, 2^32), got {seed}.")
-        env = self._build(seed=seed)
-        self.loop = GoalLoop(env, self._selector.build(spaces(env), seed))
-        self._untouched = True  # all worlds stand where an episode begins
+        if not isinstance(seed, Integral) or not 0 <= seed < 2**32:
+            raise ValueError(f"seed must be a whole number in [0, 2^32), one for all worlds, got {seed}.")
+        env = self._build(seed=int(seed))
+        self.loop = GoalLoop(env, self._selector.build(spaces(env), int(seed)))
+        everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=env.device)
+        self._fresh = everywhere  # where a world stands as an episode begins
+        self._over = ~everywhere  # where an episode has ended and no new one has begun
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        """Begin an episode in every world.
+        """Begin an episode.
 
         Args:
             seed: In [0, 2^32), to build the worlds and the selector anew, so that equal seeds give equal episodes.
-            options: Must be empty; worlds that are done need no ``reset_mask``.
+            options: Empty, or ``reset_mask``: where to begin, bool, shape (num_envs,), instead of everywhere.
 
         Returns:
             What to act on first, float32, shape (num_envs, obs_dim), and an empty dictionary.
 
         Raises:
-            ValueError: If the seed is out of range or there are options.
+            ValueError: If the seed is out of range, the options are others, or there are a seed and a mask.
         """
+        options = dict(options or {})
+        mask = options.pop("reset_mask", None)
         if options:
-            raise ValueError(f"options must be empty, got {options}.")
-        super().reset(seed=seed)
+            raise ValueError(f"options may hold reset_mask alone, got {options}.")
+        if mask is not None and (np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool):
+            raise ValueError(f"reset_mask must be bool and have shape ({self.num_envs},), got {mask}.")
+        if mask is not None and seed is not None:
+            raise ValueError(f"seed must be None where there is a reset_mask, got {seed}: it is of all worlds.")
         if seed is not None:
             self._begin(seed)
-        elif not self._untouched:
-            self.loop.start()
-            self._untouched = True
+        super().reset(seed=None if seed is None else int(seed))
+        again = ~self._fresh if mask is None else ~self._fresh & torch.as_tensor(mask, device=self._fresh.device)
+        if again.any():
+            self.loop.start(again)
+            self._fresh, self._over = self._fresh | again, self._over & ~again
         return _copy(self.loop.env.obs), {}
 
     def step(self, actions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -90,26 +121,40 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
         Returns:
             What to act on next, float32, shape (num_envs, obs_dim); rewards, float64, terminated and truncated,
-            bool, shape (num_envs,); and where a world is done, ``final_obs`` and ``final_info`` as gymnasium has them.
+            bool, shape (num_envs,); and in ``SAME_STEP``, where a world is done, ``final_obs`` and ``final_info`` as
+            gymnasium has them.
 
         Raises:
             ValueError: If the actions have another shape.
+            ResetNeeded: If nobody has begun an episode where one has ended, and nothing here does.
             SimulationError: If an action is not finite, or more worlds become invalid than may.
         """
         env = self.loop.env
         action = np.array(actions, dtype=np.float32)
         if action.shape != self.action_space.shape:  # a smaller one would be broadcast
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {action.shape}.")
-        self._untouched = False
+        if self._mode is AutoresetMode.DISABLED and self._over.any():
+            text = f"The episode of world {int(self._over.int().argmax())} has ended; call reset() with a reset_mask."
+            raise gymnasium.error.ResetNeeded(text)
         step = env.step(torch.from_numpy(action).to(env.device))
         env.check()
+        ended_before = self._over
+        if self._mode is AutoresetMode.NEXT_STEP:  # the step of such a world did not happen
+            for flag in (step.terminated, step.truncated, step.goal_due):
+                flag &= ~ended_before
+            step.reward.masked_fill_(ended_before, 0.0)
+        changes = self.loop.resolve(step)
+        self.loop.choose(changes.due)
+        done = step.terminated | step.truncated
+        same_step = self._mode is AutoresetMode.SAME_STEP
+        begins = done if same_step else ended_before
         ended = (step.obs, step.reward.double(), step.terminated, step.truncated)
         final_obs, reward, terminated, truncated = map(_copy, ended)
-        self.loop.advance(step)
-        done = terminated | truncated
-        self._untouched = done.all()
+        if begins.any():
+            self.loop.begin(begins)
+        self._fresh, self._over = begins, done & ~begins
         infos: dict = {}
-        for world in np.flatnonzero(done):
+        for world in np.flatnonzero(done.cpu()) if same_step else ():
             infos = self._add_info(infos, {"final_obs": final_obs[world], "final_info": {}}, world)
         return _copy(env.obs), reward, terminated, truncated, infos
 
@@ -120,18 +165,18 @@ class GymnasiumEnv(gymnasium.Env):
     metadata: ClassVar[dict] = {"render_modes": []}
 
     def __init__(
-        self, config: EnvConfig, seed: int = 0, device: torch.device | str = "cpu",
+        self, config: EnvConfig, seed: int | None = None, device: torch.device | str = "cpu",
         selector: SelectorConfig | None = None, env_offset: int = 0,
     ) -> None:  # fmt: skip
-        self.worlds = GymnasiumVectorEnv(config, 1, seed, device, selector, env_offset)
+        self.worlds = GymnasiumVectorEnv(config, 1, seed, device, selector, env_offset, AutoresetMode.DISABLED)
         self.observation_space = self.worlds.single_observation_space
         self.action_space = self.worlds.single_action_space
         self._running = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         """See ``GymnasiumVectorEnv.reset``; observations have the shape (obs_dim,)."""
-        super().reset(seed=seed)
         obs, info = self.worlds.reset(seed=seed, options=options)
+        super().reset(seed=None if seed is None else int(seed))
         self._running = True
         return obs[0], info
 
@@ -139,10 +184,47 @@ class GymnasiumEnv(gymnasium.Env):
         """See ``GymnasiumVectorEnv.step``; the observation that an episode ends in comes back as such."""
         if not self._running:
             raise gymnasium.error.ResetNeeded("The episode has ended or not begun; call reset().")
-        obs, reward, terminated, truncated, infos = self.worlds.step(np.expand_dims(action, 0))
-        self._running = "final_obs" not in infos
-        return (obs if self._running else infos["final_obs"])[0], reward.item(), terminated.item(), truncated.item(), {}
+        obs, reward, terminated, truncated, _ = self.worlds.step(np.expand_dims(action, 0))
+        self._running = not (terminated | truncated).item()
+        return obs[0], reward.item(), terminated.item(), truncated.item(), {}
+
+
+def make(environment: str, render_mode: None = None, **options: Any) -> GymnasiumEnv:
+    """One world, for ``gymnasium.make``.
+
+    Args:
+        environment: Name of the environment.
+        render_mode: Must be ``None``: ``deimos play`` draws runs.
+        options: Fields of its configuration, and arguments of ``GymnasiumEnv``.
+
+    Raises:
+        ValueError: If there is no such environment or a value is not valid.
+        TypeError: If there is no such option.
+    """
+    config = _config(environment, render_mode, options)
+    return GymnasiumEnv(config, **options)
+
+
+def make_vec(environment: str, num_envs: int, render_mode: None = None, **options: Any) -> GymnasiumVectorEnv:
+    """Many worlds, for ``gymnasium.make_vec``; see ``make`` and ``GymnasiumVectorEnv``."""
+    config = _config(environment, render_mode, options)
+    return GymnasiumVectorEnv(config, num_envs, **options)
+
+
+def _config(environment: str, render_mode: None, options: dict[str, Any]) -> EnvConfig:
+    """The environment's configuration, whose fields are taken out of ``options``."""
+    if render_mode is not None:
+        raise ValueError(f"render_mode must be None, got '{render_mode}'; `deimos play` draws runs.")
+    kind = plugins.load(envs, environment).Config
+    return kind(**{name: options.pop(name) for name in kind.__dataclass_fields__ if name in options})
 
 
 def _copy(tensor: torch.Tensor) -> np.ndarray:
     return tensor.cpu().numpy().copy()
+
+
+for _name, _options in ENVIRONMENTS.items():
+    gymnasium.register(
+        f"Deimos/{_name}-v{VERSION}", entry_point=f"{__name__}:make", vector_entry_point=f"{__name__}:make_vec",
+        kwargs=dict(_options),
+    )  # fmt: skip

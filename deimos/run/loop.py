@@ -1,6 +1,7 @@
 """What happens between two steps: interactions resolve, goals are chosen, episodes begin."""
 
 import torch
+from torch import Tensor
 
 from deimos.goals.core import Changes, GoalCore
 from deimos.goals.interactions import Resolved
@@ -32,10 +33,17 @@ class GoalLoop:
         if selector.first_goals_scaled:  # the goals that the environment was built with are not
             env.restart(selector.goal_range())
 
-    def start(self) -> None:
-        """Begin a new episode in every world and drop what is pending; a fresh environment has begun already."""
-        self.interactions.active.fill_(False)
-        self._reset(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
+    def start(self, mask: Tensor | None = None) -> None:
+        """Begin new episodes and drop what is pending there; a fresh environment has begun already.
+
+        Args:
+            mask: Where, bool, shape (num_envs,); ``None`` for every world.
+        """
+        if mask is None:
+            mask = torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device)
+        self.interactions.active &= ~mask
+        self.core.percentile.masked_fill_(mask, 50.0)
+        self.begin(mask)
 
     def advance(self, step: Step) -> None:
         """Do what ``step`` calls for; ``env.obs`` is then what the policy acts on next.
@@ -51,16 +59,20 @@ class GoalLoop:
 
     def renew(self, step: Step, changes: Changes) -> None:
         """The second half of ``advance``: new goals where they are due, new episodes where one has ended."""
-        env, rows = self.env, changes.due
+        self.choose(changes.due)
+        if len(changes.done):
+            self.begin(step.terminated | step.truncated)
+
+    def choose(self, rows: Tensor) -> None:
+        """Give the listed worlds, int64, shape (m,), the selector's next goals."""
         if len(rows):
-            obs = env.obs[rows]
+            env, obs = self.env, self.env.obs[rows]
             candidates = env.sample_goals(rows, self.selector.num_candidates, self.selector.goal_range())
             goal = self.core.choose(rows, env.state(obs), obs[:, env.goal_slice], candidates, env.draw(rows))
             env.set_goals(rows, goal)
-        if len(changes.done):
-            self._reset(step.terminated | step.truncated)
 
-    def _reset(self, mask: torch.Tensor) -> None:
+    def begin(self, mask: Tensor) -> None:
+        """Begin an episode where ``mask``, bool, shape (num_envs,), is true; nothing may be pending there."""
         self.env.reset(mask, self.selector.goal_range() if self.selector.first_goals_scaled else None)
         self.weight.masked_fill_(mask, 1.0)
 
