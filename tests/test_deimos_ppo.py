@@ -108,14 +108,24 @@ def end_in(rollout, final_obs):
     rollout.ends = [(torch.full_like(worlds, t), worlds, final_obs[t, worlds]) for t, worlds in enumerate(rows)]
 
 
+def statistics(normalizer):
+    """What our normaliser has gathered, as the state of rsl_rl's."""
+    mean, variance = normalizer.mean.unsqueeze(0), normalizer.variance.unsqueeze(0)
+    return {"_mean": mean, "_var": variance, "_std": variance.sqrt(), "count": normalizer.count.long()}
+
+
 def rsl_rl_like(ppo, rollout):
     """rsl_rl's learner with the same weights and the same data, after it has computed its returns."""
     config = ppo.config
     obs = TensorDict({"policy": rollout.obs[0]}, batch_size=[NUM_ENVS])
     groups = {"actor": ["policy"], "critic": ["policy"]}
     spread = {"class_name": "GaussianDistribution", "init_std": config.init_std, "std_type": "scalar"}
-    actor = MLPModel(obs, groups, "actor", 3, list(config.hidden), config.activation, distribution_cfg=spread)
-    critic = MLPModel(obs, groups, "critic", 1, list(config.hidden), config.activation)
+    shape = list(config.hidden), config.activation, config.normalize_observations
+    actor = MLPModel(obs, groups, "actor", 3, *shape, distribution_cfg=spread)
+    critic = MLPModel(obs, groups, "critic", 1, *shape)
+    for theirs in (actor.obs_normalizer, critic.obs_normalizer) if ppo.actor.normalizer else ():
+        theirs.load_state_dict(statistics(ppo.actor.normalizer))
+        theirs.until = 0  # ours are renewed after an update, theirs in the middle of a rollout
     for theirs, ours in ((actor.mlp, ppo.actor.mean), (critic.mlp, ppo.critic)):
         theirs.load_state_dict(dict(zip(theirs.state_dict(), ours.state_dict().values(), strict=True)))
     storage = RolloutStorage("rl", NUM_ENVS, NUM_STEPS, obs, [3])
@@ -167,10 +177,14 @@ def test_returns_differ_from_rsl_rls_at_time_limits_only_by_the_value():
     torch.testing.assert_close(ppo.batch(rollout)[0].value[0, 2], storage.returns.flatten(), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("clip_value", [True, False])
-def test_a_full_update_is_rsl_rls(monkeypatch, clip_value):
+def test_a_full_update_is_rsl_rls(monkeypatch, clip_value, normalize):
     """After 5 x 4 minibatches in the same order, losses, learning rate and all weights agree to float32 rounding."""
-    ppo = small_learner(clip_value=clip_value)
+    ppo = small_learner(clip_value=clip_value, normalize_observations=normalize)
+    if normalize:
+        earlier = torch.randn(500, 12, generator=torch.Generator().manual_seed(2))
+        ppo.actor.normalizer.update(3.0 + 2.0 * earlier, torch.ones(500))
     rollout = filled(ppo)
     learner = rsl_rl_like(ppo, rollout)
     order = torch.randperm(NUM_ENVS * NUM_STEPS, generator=torch.Generator().manual_seed(3))

@@ -86,7 +86,10 @@ def runner_config(ppo: PPOConfig) -> dict[str, Any]:
 
     The reward scale is not in it: give it to the environment.
     """
-    network = {"class_name": "MLPModel", "hidden_dims": list(ppo.hidden), "activation": ppo.activation}
+    network = {
+        "class_name": "MLPModel", "hidden_dims": list(ppo.hidden), "activation": ppo.activation,
+        "obs_normalization": ppo.normalize_observations,
+    }  # fmt: skip
     spread = {"class_name": "GaussianDistribution", "init_std": ppo.init_std, "std_type": "scalar"}
     return {
         "num_steps_per_env": ppo.num_steps,

@@ -1,4 +1,4 @@
-"""A trained policy in one file: weights, observation scaling and layout."""
+"""A trained policy in one file: weights, statistics of a normaliser, observation scaling and layout."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -87,7 +87,8 @@ def load_policy(path: Path | str, device: str = "cpu") -> Policy:
         weights = data["actor"]
         sizes = sum(field.size for field in layout), data["hidden"], len(weights["std"])
         seen = seen_by("actor", layout, torch.device(device))
-        actor = Actor(*sizes, data["activation"], init_std=1.0, seen=seen)
+        normalize = any(name.startswith("normalizer.") for name in weights)
+        actor = Actor(*sizes, data["activation"], init_std=1.0, seen=seen, normalize=normalize)
         actor.load_state_dict(weights)
         actor.to(device)
         return Policy(actor, data["hidden"], data["activation"], layout, data["action_bound"], data["dt"])

@@ -67,6 +67,9 @@ class PPOConfig:
     """Between the layers."""
     init_std: float = 1.0
     """Standard deviation that the policy starts with, in units of the action, positive."""
+    normalize_observations: bool = False
+    """Whether actor and critic see observations less their running mean, in units of their running standard deviation.
+    The statistics are part of the policy, which no longer changes them."""
 
     def __post_init__(self) -> None:
         for name in ("num_steps", "epochs", "minibatches"):
@@ -86,8 +89,8 @@ class Batch:
     """Transitions to learn from, one per column: what is one per row elsewhere then lies end to end."""
 
     table: Tensor
-    """Observations, actions, means of the policy that acted, log-probability under it, normalised advantage, weight,
-    value before the update and target, shape (obs_dim + 2 action_dim + 5, n)."""
+    """Observations as the networks are given them, actions, means of the policy that acted, log-probability under it,
+    normalised advantage, weight, value before the update and target, shape (obs_dim + 2 action_dim + 5, n)."""
     obs_dim: int
     """Components of an observation."""
 
@@ -139,8 +142,9 @@ class PPO(Stateful):
         self._size = rows // config.minibatches
         weights = generator(seed, "policy weights")
         self.actor = Actor(
-            obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights, actor_sees
-        ).to(device)
+            obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights, actor_sees,
+            normalize=config.normalize_observations,
+        ).to(device)  # fmt: skip
         self.critic = mlp(count(critic_sees, obs_dim), config.hidden, 1, config.activation, weights).to(device)
         self._critic_sees = critic_sees
         self.generator = generator(seed, "policy minibatches", device)
@@ -157,6 +161,7 @@ class PPO(Stateful):
         self._batch, self._shuffled = (
             Batch(torch.zeros(shape, dtype=torch.float32, device=device), obs_dim) for _ in range(2)
         )
+        self._normalized = torch.zeros(num_envs, obs_dim, dtype=torch.float32, device=device)
         self._sizes = num_envs, obs_dim, action_dim, device
         self._seed, self._worlds = seed, torch.arange(num_envs, device=device)
 
@@ -192,13 +197,17 @@ class PPO(Stateful):
             action: Actions, shape (n, action_dim). Written.
             mean: Means of their distribution, same shape. Written.
         """
-        mean.copy_(self._actor.forward(obs[:, self.actor.seen])[0])
+        mean.copy_(self._actor.forward(self._inputs(obs, self._normalized[: len(obs)])[:, self.actor.seen])[0])
         torch.addcmul(mean, noise, self.actor.std, out=action)
 
     @torch.no_grad()
     def value(self, obs: Tensor) -> Tensor:
         """Values of observations of any leading shape."""
-        return self._critic.forward(obs.flatten(0, -2)[:, self._critic_sees]).view(obs.shape[:-1])
+        return self._critic.forward(self._inputs(obs.flatten(0, -2))[:, self._critic_sees]).view(obs.shape[:-1])
+
+    def _inputs(self, obs: Tensor, out: Tensor | None = None) -> Tensor:
+        """What the networks are given of observations, shape (n, obs_dim); normalised in ``out`` if it is given."""
+        return obs if self.actor.normalizer is None else self.actor.normalizer(obs, out)
 
     @torch.no_grad()
     def update(
@@ -233,6 +242,9 @@ class PPO(Stateful):
                 for minibatch in minibatches:
                     totals += self._learn(minibatch, std, learn_value=critic is None)
             value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
+        if self.actor.normalizer is not None:  # only now: the policy that acted is the one that learning starts from
+            for obs, weight in zip(rollout.obs, rollout.weight, strict=False):
+                self.actor.normalizer.update(obs, (weight > 0).float())
         return {
             "value_loss": value_loss,
             "surrogate_loss": surrogate_loss,
@@ -264,6 +276,7 @@ class PPO(Stateful):
         obs, action, mean, *rows = table.split([start, size, size, 1, 1, 1, 1, 1])
         for part, source in ((obs, rollout.obs[:-1]), (action, rollout.action), (mean, rollout.mean)):
             part.copy_(source.flatten(0, 1).t())
+        self._inputs(obs.t(), out=obs.t())
         density = log_prob((action - mean) / std, std)
         for row, source in zip(rows, (density, advantage, weight, value, returns), strict=True):
             row.copy_(source.flatten())
@@ -320,10 +333,11 @@ class PPO(Stateful):
         self.critic.load_state_dict(state["critic"])
 
     def check(self) -> None:
-        """Raise ``SimulationError`` if a weight is not finite; reads the device once."""
-        if bool(self._parameters.isfinite().all()):
+        """Raise ``SimulationError`` if a weight or a statistic is not finite; reads the device once."""
+        finite = [numbers.isfinite().all() for numbers in (self._parameters, *self.actor.buffers())]
+        if bool(torch.stack(finite).all()):
             return
         for part, module in (("actor", self.actor), ("critic", self.critic)):
-            for name, value in module.named_parameters():
+            for name, value in module.state_dict().items():
                 if not value.isfinite().all():
                     raise SimulationError(f"The weight {part}.{name} is not finite after an update of PPO.")

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from deimos.nn.losses import Loss, Surrogate, ValueLoss, by_outputs
+from deimos.nn.normalizer import Normalizer
 from deimos.nn.threads import torch_on_one
 
 if TYPE_CHECKING:
@@ -26,8 +27,9 @@ class MLPs:
 
     Args:
         modules: Linear layers with one kind of activation between them, as ``networks.mlp`` makes them, on one device;
-            a module may have free parameters besides, which its loss uses (a policy's standard deviation). All
-            parameters and their gradients become views of ``parameters`` and ``grad``.
+            a module may have free parameters besides, which its loss uses (a policy's standard deviation), and a
+            ``Normalizer``, whose outputs are then the inputs here. All parameters and their gradients become views of
+            ``parameters`` and ``grad``.
         memory: Where parameters and gradients shall lie, float32, shape (2, K, numbers); ``None`` allocates it.
         workspace: Memory for activations in torch's products [MiB]; what takes more is computed in parts.
 
@@ -203,7 +205,7 @@ def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
 
 def _layout(module: nn.Module) -> tuple[tuple[int, ...], str, list[int], slice]:
     """A network's units, its activation, where layers' weights start among its parameters, and where free ones lie."""
-    leaves = [part for part in module.modules() if not list(part.children())]
+    leaves = [part for part in module.modules() if not list(part.children()) and not isinstance(part, Normalizer)]
     linears = [layer for layer in leaves[::2] if isinstance(layer, nn.Linear) and layer.bias is not None]
     between = {type(layer) for layer in leaves[1::2]}
     if len(linears) != len(leaves) // 2 + 1 or len(between) > 1 or not between <= ACTIVATIONS.keys():

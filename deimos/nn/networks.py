@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from deimos.nn.layout import ALL, Seen, count
+from deimos.nn.normalizer import Normalizer
 
 Activation = Literal["relu", "elu", "tanh"]
 
@@ -56,18 +57,23 @@ def weights_of(net: nn.Module) -> dict[str, Tensor]:
 
 
 class Actor(nn.Module):
-    """A Gaussian policy: its mean is an MLP of the observation, its deviation one number per action; see ``mlp``."""
+    """A Gaussian policy: its mean is an MLP of the observation, its deviation one number per action; see ``mlp``.
+
+    With ``normalize`` the observation is normalised first, by statistics that are saved with the weights.
+    """
 
     def __init__(
         self, obs_dim: int, hidden: Sequence[int], action_dim: int, activation: Activation, init_std: float,
-        generator: torch.Generator | None = None, seen: Seen = ALL,
+        generator: torch.Generator | None = None, seen: Seen = ALL, *, normalize: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         self.seen = seen
         """What it sees of an observation."""
+        self.normalizer = Normalizer(obs_dim) if normalize else None
         self.mean = mlp(count(seen, obs_dim), hidden, action_dim, activation, generator)
         self.std = nn.Parameter(torch.full((action_dim,), init_std, dtype=torch.float32))
 
     def forward(self, obs: Tensor) -> Tensor:
         """Mean action, shape (n, action_dim)."""
+        obs = obs if self.normalizer is None else self.normalizer(obs)
         return self.mean(obs[..., self.seen])
