@@ -1,5 +1,6 @@
 """Studies run for real, on tiny budgets: stopped, killed, resumed, with workers that die."""
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -56,7 +57,7 @@ def file(tmp_path_factory):
 def whole(file, tmp_path_factory):
     """The study run without interruption."""
     folder = tmp_path_factory.mktemp("studies") / "whole"
-    cli.RunOptions(folder=folder, file=file, workers=2).run()
+    cli.RunOptions(folder=folder, file=file, workers=2, allow_uncommitted=True).run()
     return StudyFolder(folder)
 
 
@@ -134,15 +135,15 @@ def test_finished_study_starts_nothing(whole, file, monkeypatch):
     """Giving the command again adds no row and starts no process."""
     paths = [whole.cell_path(cell) / "result.json" for cell in whole.cells()]
     before = [path.read_bytes() for path in paths]
-    monkeypatch.setattr(subprocess, "Popen", None)
-    cli.RunOptions(folder=whole.path, file=file).run()
+    monkeypatch.setattr(LocalProcesses, "run", lambda self, cell: pytest.fail("something was started"))
+    cli.RunOptions(folder=whole.path, file=file, allow_uncommitted=True).run()
     assert [path.read_bytes() for path in paths] == before
 
 
 def test_stopped_and_killed_study_ends_with_the_same_table(whole, file, tmp_path):
     """A study interrupted, then killed with SIGKILL, ends with the table of one that was not, no cell twice."""
     study = StudyFolder(tmp_path / "broken")
-    options = cli.RunOptions(folder=study.path, file=file, workers=2)
+    options = cli.RunOptions(folder=study.path, file=file, workers=2, allow_uncommitted=True)
     with pytest.raises(SystemExit) as stop:
         options.run(stopped=lambda: min(iterations(study).values(), default=0) >= 2)
     assert stop.value.code == 130
@@ -306,5 +307,6 @@ def test_broken_run_is_one_line_of_a_worker(whole, tmp_path, capsys):
     run = study.cell_path(cell) / "run"
     run.mkdir()
     (run / "checkpoint.pt").write_text("not a checkpoint")
+    (run / "config.json").write_text("{}")
     assert worker.main([str(study.path), cell.name]) == 2
-    assert capsys.readouterr().err == f"{Path(run)} is not a run folder: it holds no config.json.\n"
+    assert capsys.readouterr().err == f"{Path(run) / 'config.json'} is not that of a run of schema 1.\n"
