@@ -1,6 +1,5 @@
 """Studies run for real, on tiny budgets: stopped, killed, resumed, with workers that die."""
 
-import dataclasses
 import os
 import shutil
 import signal
