@@ -44,7 +44,7 @@ def test_estimate_is_of_finished_cells_where_there_are_any(tmp_path, monkeypatch
     hours = 3 * (transitions / 1000.0 + steps / 1e6) / 3600
     said = estimate.estimate(study, cells)
     assert said.startswith(
-        f"3 runs: {3 * transitions / 1e6:.1f} M transitions (FPS measured on a short run of each kind)"
+        f"3 run(s): {3 * transitions / 1e6:.1f} M transitions (FPS measured on a short run of each kind)"
     )
     assert said.endswith(f" = {hours:.2f} core-hours.")
     values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}, list: []}

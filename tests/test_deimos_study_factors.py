@@ -31,7 +31,8 @@ def test_a_sweep_is_a_design_of_one_factor(tmp_path):
     cells = expanded(tmp_path, "[factors]\nenv.max_force = [0.5, inf]\n")
     found = [(cell.environment, cell.config.method, cell.config.env.max_force, cell.levels) for cell in cells[:4]]
     assert found == [
-        ("directional.0", "uniform", 0.5, {"env.max_force": 0.5}), ("directional.0", "p25", 0.5, {"env.max_force": 0.5}),
+        ("directional.0", "uniform", 0.5, {"env.max_force": 0.5}),
+        ("directional.0", "p25", 0.5, {"env.max_force": 0.5}),
         ("directional.1", "uniform", math.inf, {"env.max_force": "inf"}),
         ("directional.1", "p25", math.inf, {"env.max_force": "inf"}),
     ]  # fmt: skip
@@ -89,8 +90,11 @@ def test_aliases_are_those_of_the_columns():
 
 def test_sobol_sample_fills_the_ranges():
     """A sample of 2^m points has as many in each half of a range as in the other, and repeats with its seed."""
-    ranges = {"ppo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}, "env.goal_period": {"low": 50, "high": 200},
-              "env.reward": ["linear", "reciprocal"]}  # fmt: skip
+    ranges = {
+        "ppo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
+        "env.goal_period": {"low": 50, "high": 200},
+        "env.reward": ["linear", "reciprocal"],
+    }
     points = factors.expand(ranges, {"kind": "sobol", "points": 16, "seed": 3})
     assert points == factors.expand(ranges, {"kind": "sobol", "points": 16, "seed": 3})
     assert points != factors.expand(ranges, {"kind": "sobol", "points": 16, "seed": 4})
@@ -111,12 +115,12 @@ MISTAKES = {
     "[factors]\nppo.speed = [1.0]": "PPOConfig has no speed",
     "[factors]\nseed = [1, 2]": "seed cannot stand in 'train' or be a factor",
     "[factors]\nnum_envs = [0]": "num_envs must be at least 1, got 0",
-    "[factors]\nhorizon = [{ env = { goal_period = 5 } }]": "levels must be values, or tables of fields each with a name",
+    "[factors]\nhorizon = [{ env = { goal_period = 5 } }]": "levels must be values, or tables of fields each",
     "[factors]\nppo.epochs = { low = 3, high = 1 }": r"ppo\.epochs must have low < high",
     "[factors]\nppo.epochs = { low = 1, high = 3 }": "must be a list of levels; only a sobol design takes a range",
-    "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'half'": "kind must be one of full, fractional, sobol, got 'half'",
+    "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'half'": "kind must be one of full, .*, got 'half'",
     "[factors]\nppo.epochs = [1, 2]\n[design]\npoints = 4": r"A full \[design\] has no points; it has: kind",
-    "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'sobol'\npoints = 3": "points must be a power of 2 below 10000, got 3",
+    "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'sobol'\npoints = 3": "points must be a power of 2 .*, got 3",
     "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'sobol'": "points must be a whole number, got None",
     "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'fractional'": "generators must be a table, got None",
     "[factors]\nppo.epochs = [1, 2, 3]\n[design]\nkind = 'fractional'\ngenerators = {}": "ppo.epochs has not",

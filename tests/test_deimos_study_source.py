@@ -52,7 +52,7 @@ def test_clean_checkout_is_its_commit(checkout):
 
 
 def test_changed_checkout_is_its_sources(checkout, tmp_path):
-    """A source that differs, or that the commit does not have, makes it a hash of the sources; so does a lack of git."""
+    """A source that differs, or that the commit does not have, makes it a hash of the sources; so does no git."""
     before = ask(checkout)
     (checkout / "deimos" / "goals" / "selectors" / "mine.py").write_text('"""Mine."""\n')
     commit, name, *changed = ask(checkout)

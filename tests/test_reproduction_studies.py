@@ -1,5 +1,7 @@
 """The studies of the thesis, as files: what is in them, and that their cells are still those of the committed rows."""
 
+import os
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -41,7 +43,7 @@ def test_studies_of_particle_gym_expand(name, pools):
 
 
 def test_blocks_make_one_table(pools):
-    """The cells of all blocks can be compared: an environment is one setting in all, and all meet the same attackers."""
+    """The cells of all blocks can be compared: an environment is one setting, and all meet the same attackers."""
     cells = [cell for name in BLOCKS for cell in plan.expand(plan.read(FILES[name]))]
     check_comparable(map(identity, cells))
     assert {cell.config.eval.attackers for cell in cells} == {("argmax", "pooled", "scripted")}
@@ -69,3 +71,39 @@ def test_studies_are_the_thesis(pools):
         assert (description["seeds"], set(description["methods"])) == (30, set(LEGGED_METHODS))
         (environment,) = description["environment"]
         assert (environment["name"], environment["goal_periods"]) == (name, [100, 500])
+
+
+PYTHON = """#!/usr/bin/env bash
+[ "$*" = "-m venv .venv" ] && mkdir -p .venv/bin && printf '#!/bin/sh\\necho pip "$@" > asked\\n' > .venv/bin/pip \\
+    && chmod +x .venv/bin/pip
+"""
+
+
+def test_frozen_commit_has_a_worktree_of_its_own(tmp_path):
+    """The command makes a worktree of a commit, into which it installs that commit's own sources."""
+    home, frozen, tools = (tmp_path / name for name in ("home", "frozen", "tools"))
+    (home / "reproduction").mkdir(parents=True)
+    tools.mkdir()
+    (tools / "python3").write_text(PYTHON)
+    (tools / "python3").chmod(0o755)
+    script = home / "reproduction" / "freeze"
+    script.write_bytes((ROOT / "reproduction" / "freeze").read_bytes())
+    script.chmod(0o755)
+
+    def git(*arguments):
+        command = ["git", "-C", str(home), "-c", "user.name=x", "-c", "user.email=x@example.org", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    git("init", "-q")
+    for text in ("one", "two"):
+        (home / "source").write_text(text)
+        git("add", "-A")
+        git("commit", "-q", "-m", text)
+    env = os.environ | {"PATH": f"{tools}{os.pathsep}{os.environ['PATH']}"}
+    command = [str(script), "HEAD~1", str(frozen)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+    assert (frozen / "source").read_text() == "one"
+    assert (frozen / "asked").read_text() == "pip install --quiet -c constraints.txt -e .[all]\n"
+    assert done.stdout.splitlines()[-1].startswith(f"cd {frozen} && .venv/bin/deimos study run runs/particle_a --file ")
+    wrong = subprocess.run(command[:2], env=env, capture_output=True, text=True, check=False)
+    assert (wrong.returncode, wrong.stderr) == (2, "usage: reproduction/freeze COMMIT FOLDER\n")

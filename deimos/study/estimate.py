@@ -58,7 +58,7 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
             hours += (transitions / (median(known) if known else speed.training) + steps / speed.acting) / 3600
     source = "measured on a short run of each kind" if measured else "of the finished cells"
     return (
-        f"{len(cells)} runs: {trained / 1e6:,.1f} M transitions (FPS {source}) + {acted / 1e6:,.1f} M world-steps of "
+        f"{len(cells)} run(s): {trained / 1e6:,.1f} M transitions (FPS {source}) + {acted / 1e6:,.1f} M world-steps of "
         f"attacks, evaluations and audits = {hours:.2f} core-hours."
     )
 
