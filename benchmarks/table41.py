@@ -21,17 +21,19 @@ from rich.table import Table
 from benchmarks.timing import wide_console
 from deimos.checks import RunError
 from deimos.files import write_whole
+from deimos.goals.fear_selector import fear_selector
 from deimos.run.presets import preset
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.legged.engines import Name as EngineName
 from deimos.sim.legged.engines import resolve
-from reproduction.thesis import LEGGED, PARTICLE, TABLE_4_1
+from reproduction.thesis import LEGGED, PARTICLE, RATIOS_4_1, TABLE_4_1
 
 TITLES = {"p25": "DEIMOS (p25)", "rnd": "RND", "uniform": "Uniform", "vds": "VDS", "cl": "CL"}
 """The table's methods, in the thesis's order."""
 ROBOTS = 256
 PERIOD = 100  # T of the robots: a fifth of the presets', so that selectors choose five times as often
-WARM_UP = 4  # goals of every world before anything is timed: a fear network has met crashes and survivals by then
+WARM_UP = 2  # goals of every world before anything is timed, and as many more as a fear network needs to learn at all
+MOST = 20  # goals of every world that it may take to
 
 Round = dict[str, Any]
 """``seconds`` of every environment and method, the ``load`` of the host before it, and the ``cores`` that it had."""
@@ -102,11 +104,9 @@ def measure(
         name: {each: Trainer(replace(column.config, method=each), device) for each in column.methods}
         for name, column in table.items()
     }
-    for name, column in table.items():
-        turns = math.ceil(WARM_UP * column.config.env.goal_period / (column.iterations * column.config.ppo.num_steps))
-        for trainer in trainers[name].values():
-            for _ in range(turns):
-                _turn(trainer, column, device)
+    for own in trainers.values():
+        for trainer in own.values():
+            _warm_up(trainer)
     first = len(found)
     while len(found) < rounds and (len(found) == first or time.monotonic() - begin < seconds):
         load, started = os.getloadavg()[0], (time.perf_counter(), time.process_time())
@@ -118,6 +118,16 @@ def measure(
         found.append({"seconds": spent, "load": load, "cores": cores})
         keep(found)
     return found
+
+
+def _warm_up(trainer: Trainer) -> None:
+    """Train until goals have fallen due in all worlds and fear, if there is any, has learnt."""
+    goal = trainer.config.env.goal_period / trainer.config.ppo.num_steps  # iterations
+    afraid = fear_selector(trainer.loop.selector)
+    while trainer.iteration < WARM_UP * goal or (afraid and not afraid.fear.fitted):
+        if trainer.iteration > MOST * goal:
+            raise RunError(f"After {MOST} goals the fear network of {trainer.config.label} has learnt nothing.")
+        trainer.iterate()
 
 
 def _turn(trainer: Trainer, column: Column, device: torch.device) -> float:
@@ -212,6 +222,5 @@ def show(table: Mapping[str, Column], rounds: list[Round]) -> None:
 
 
 def _beside_thesis(row: dict[str, Any]) -> str:
-    published = TABLE_4_1[row["environment"]]
     text = f"{row['ratio']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
-    return "1" if row["method"] == "uniform" else f"{text}; {published[row['method']] / published['uniform']:.2f}"
+    return "1" if row["method"] == "uniform" else f"{text}; {RATIOS_4_1[row['environment']][row['method']]:.2f}"

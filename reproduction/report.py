@@ -3,12 +3,13 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from deimos.study import report
 from deimos.study.data import Data
 from deimos.study.document import Block
-from reproduction import claims
+from reproduction import claims, deviations, shifted_goals
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import FACTOR, LEAST, PROBABILITY, REWARD_SHARE, SPREAD
 from reproduction.claims import Outcome
@@ -19,7 +20,8 @@ from reproduction.thesis import LEGGED_METHODS, RATIOS_4_1
 
 def write(folder: Path, out: Path) -> Path:
     """Write the report; see ``deimos.study.report.write``."""
-    return report.write(folder, out, STYLE, page, figures)
+    shifted = shifted_goals.read(folder)
+    return report.write(folder, out, STYLE, page, partial(figures, shifted=shifted))
 
 
 def page(data: Data, pictures: report.Pictures) -> list[Block]:
@@ -27,9 +29,9 @@ def page(data: Data, pictures: report.Pictures) -> list[Block]:
     tested = data.only(LEGGED_METHODS)
     outcomes = [claims.test(claim, tested) for claim in CLAIMS]
     return [
-        "# A study of goal selection", *report.what_was_run(data), *_verdicts(outcomes),
-        *report.environments(data, pictures), *report.over_all(data),
-        *_speed(data), *[block for outcome in outcomes for block in _details(outcome)],
+        "# A study of goal selection", *_verdicts(outcomes), *report.environments(data, pictures),
+        *report.over_all(data), *report.what_was_run(data), *deviations.blocks(),
+        *_speed(data), *report.distributions(data), *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
 
