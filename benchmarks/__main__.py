@@ -1,6 +1,7 @@
 """``python -m benchmarks WHAT``: everything that is compared is measured in the same run."""
 
 import json
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +11,14 @@ import torch
 import tyro
 import warp as wp
 
-from benchmarks import commits, director, engines, learner, particle, quad, terrain, training
+from benchmarks import commits, director, engines, learner, particle, quad, table41, terrain, training
 from benchmarks.timing import wide_console
-from deimos.checks import RunError, check_at_least
+from deimos.checks import RunError, check_at_least, check_positive
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import cores, provenance, resolve_device
 from deimos.sim.envs.particle import Config
+from deimos.sim.legged.engines import Name as EngineName
+from deimos.sim.legged.engines import resolve
 from deimos.sim.shared import one_stream
 from reproduction.thesis import TABLE_4_1
 
@@ -25,7 +28,7 @@ class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
     what: tyro.conf.Positional[
-        Literal["particle", "quad", "quad-arm", "engines", "terrain", "director", "learner", "commits"]
+        Literal["particle", "quad", "quad-arm", "engines", "terrain", "director", "learner", "commits", "table41"]
     ]
     """What to measure."""
     against: str = "HEAD"
@@ -38,8 +41,13 @@ class BenchOptions:
     """CPU threads, at least 0; 0 takes one per core."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to measure; auto takes the GPU where there is one."""
+    engine: EngineName = "auto"
+    """Physics of the robots of ``table41``; auto is warp (mujoco-warp) on a GPU and native on a CPU."""
+    seconds: float = math.inf
+    """``table41`` begins no round after so many [s], positive. With ``json`` the same command continues the table."""
 
     def __post_init__(self) -> None:
+        check_positive("seconds", self.seconds)
         check_at_least("rounds", self.rounds, 1)
         check_at_least("threads", self.threads, 0)
         if self.json is not None and not self.json.parent.is_dir():
@@ -70,6 +78,10 @@ def run(options: BenchOptions) -> dict[str, Any]:
         learner.show(results["learner"])
         return _write(results, options.json)
     with one_stream(device):
+        if options.what == "table41":
+            results["engine"] = resolve(options.engine, device)
+            table41.run(results, options.rounds, device, options.json, options.seconds)
+            return results
         if options.what in measure:
             results |= measure[options.what](options.rounds, device)
         else:

@@ -1,18 +1,25 @@
-"""What the thesis's methods look like, and the figure of claim C25: crashes over the achieved percentile of fear."""
+"""What the thesis's methods look like, and the figure of claim C25: outcomes over the delivered dose of fear."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from deimos.study import outcomes
 from deimos.study.data import Data, Style, Where
-from deimos.study.figures import GOALS, Figures, logarithmic, of_environment, subplots
-from deimos.study.stats import Array
-from reproduction.thesis import ACHIEVED, DIRECTOR_METHODS, ENVIRONMENTS
+from deimos.study.figures import WIDTH, Figures, as_rates, legend, not_recorded, subplots
+from deimos.study.outcomes import DOSE, of_environment
+from deimos.study.results import Row
+from reproduction.thesis import DIRECTOR_METHODS, ENVIRONMENTS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+SHIFTED = (
+    "On the right, Uniform policies under the Director's rules, from Coop to Antagonist, by a fear network trained on "
+    "the finished policy and by exact fear from clones: what the shift of the goals does in itself."
+)
 _BASELINES = ("uniform", "rnd", "vds")
 _DIRECTOR_COLOURS = ("#fde333", "#b6c24a", "#6fa76b", "#3c8a7c", "#2e6b85", "#3a4a80", "#2d1e5f")  # yellow to blue
 STYLE = Style(
@@ -26,51 +33,61 @@ STYLE = Style(
 )  # fmt: skip
 
 
-def figures(data: Data, environment: str) -> Figures:
-    """The figures of every study, and the dose-response of the Directors."""
+def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figures:
+    """The figures of every study; beside the delivered dose, Uniform policies under shifted goals.
+
+    Args:
+        data: The study's.
+        environment: Its name.
+        shifted: Rows of ``reproduction.shifted_goals``.
+    """
     found = of_environment(data, environment)
     for period in data.periods(environment):
-        found[f"dose-{environment}-T{period}"] = (
-            f"{environment}, T = {period}: crashes over the percentile of fear that a method's goals have on average; "
-            "medians with quartiles, and the parabola of claim C25.",
-            dose_response(data, environment, period),
-        )
+        own = [row for row in shifted if (row["environment"], row["goal_period"]) == (environment, period)]
+        text = f"{environment}, T = {period}: {DOSE} {SHIFTED}"
+        found[f"dose-{environment}-T{period}"] = (text, dose_response(data, environment, period, own))
     return found
 
 
-def dose_response(data: Data, environment: str, period: int) -> "Figure | None":
-    """Crashes over the achieved percentile of fear, Naive and Adversary side by side."""
-    names = [name for name in data.methods(environment) if name in ACHIEVED]
-    if len([name for name in names if name in DIRECTOR_METHODS]) < 3:
+def dose_response(data: Data, environment: str, period: int, shifted: Sequence[Row]) -> "Figure | None":
+    """What a shift of goals in training does under uniform goals, and what it does to a Uniform policy in itself."""
+    names = [name for name in data.methods(environment) if data.delivered(environment, name)]
+    if not names and not shifted:
         return None
-    figure, axes = subplots(1, 2, (11, 4.2), sharey=True)
-    for panel, goals in zip(axes[0], GOALS, strict=True):
-        where = Where(environment, goals, period)
-        samples = {name: data.sample(where, name, "crashes") for name in names}
-        for name, values in samples.items():
-            if len(values):
-                low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-                panel.errorbar(
-                    ACHIEVED[name], middle, [[middle - low], [high - middle]], color="black",
-                    marker=data.style.marker(name), markerfacecolor=data.style.colours[name], markersize=8,
-                    capsize=3, linewidth=1,
-                )  # fmt: skip
-        _parabola(panel, {n: x for n, x in samples.items() if n in DIRECTOR_METHODS and len(x)})
-        panel.set_title(f"against the {goals.capitalize()}")
-        panel.set_xlabel("achieved percentile of fear")
-        panel.grid(alpha=0.3)
-        shown = [name for name, values in samples.items() if len(values)]
-        names_above = panel.secondary_xaxis("top")  # beside the markers they would cover each other
-        names_above.set_xticks([ACHIEVED[name] for name in shown], shown, rotation=60, ha="left", fontsize=8)
-    logarithmic(axes[0, 0])
-    axes[0, 0].set_ylabel("crashes")
+    hard = outcomes.attacked(data, environment, period)
+    figure, axes = subplots(2, 2, (WIDTH, 4.8), sharex=True, sharey="row")
+    places = (Where(environment, "naive", period), "score"), (hard.where, hard.metric)
+    for (left, right), (where, metric) in zip(axes, places, strict=True):
+        for name in names:
+            outcomes.over_dose(left, data, where, name, metric)
+        if not names:
+            not_recorded(left, "delivered dose")
+        _over_shift(right, shifted, "score" if metric == "score" else "crash_rate")
+        for panel in (left, right):
+            panel.grid(alpha=0.3)
+    axes[0, 0].set_title("trained on shifted goals,\njudged on uniform goals and attacks")
+    axes[0, 1].set_title("Uniform policies,\njudged on shifted goals")
+    axes[0, 0].set_ylabel("score")
+    as_rates(axes[1, 0], "y", "crashes per interaction [%]")
+    axes[1, 0].set_xlabel("delivered dose in training:\nmean percentile of fear")
+    axes[1, 1].set_xlabel("delivered dose in evaluation:\nmean percentile of fear")
+    if names:
+        legend(figure, data.style, names, "beside")
     return figure
 
 
-def _parabola(axes: "Axes", samples: dict[str, Array]) -> None:
-    if len(samples) < 4:
+def _over_shift(axes: "Axes", rows: Sequence[Row], metric: str) -> None:
+    """A line for each policy, through the rules by rising percentile, by learnt fear and by exact fear."""
+    if not rows:
+        not_recorded(axes, "shifted goals")
         return
-    x = np.concatenate([np.full(len(values), ACHIEVED[name]) for name, values in samples.items()])
-    coefficients = np.polyfit(x, np.log1p(np.concatenate(list(samples.values()))), 2)
-    line = np.linspace(0.5, 99.5, 100)
-    axes.plot(line, np.expm1(np.polyval(coefficients, line)), color="grey", linewidth=1, linestyle="--", zorder=0)
+    unit = 1 if metric == "score" else 100
+    for fear, colour, marker in (("learnt", "#000000", "o"), ("exact", "#D55E00", "^")):
+        own = [row for row in rows if row["fear"] == fear]
+        for i, seed in enumerate(sorted({row["seed"] for row in own})):
+            points = sorted((row["percentile"], unit * row[metric]) for row in own if row["seed"] == seed)
+            axes.plot(
+                *np.array(points).T, color=colour, linewidth=0.8, marker=marker, markersize=3.5, alpha=0.7,
+                label=None if i else f"{fear} fear",
+            )  # fmt: skip
+    axes.legend(frameon=False, loc="lower left" if metric == "score" else "upper left")

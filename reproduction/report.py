@@ -2,12 +2,13 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from deimos.study import report
 from deimos.study.data import Data
 from deimos.study.document import Block
-from reproduction import claims
+from reproduction import claims, deviations, shifted_goals
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import SETTLED_RATIO, SETTLED_SHARE
 from reproduction.claims import LEAST, Outcome
@@ -18,7 +19,8 @@ from reproduction.thesis import RATIOS_4_1
 
 def write(folder: Path, out: Path) -> Path:
     """Write the report; see ``deimos.study.report.write``."""
-    return report.write(folder, out, STYLE, page, figures)
+    shifted = shifted_goals.read(folder)
+    return report.write(folder, out, STYLE, page, partial(figures, shifted=shifted))
 
 
 def page(data: Data, pictures: report.Pictures) -> list[Block]:
@@ -26,9 +28,9 @@ def page(data: Data, pictures: report.Pictures) -> list[Block]:
     evidence = Evidence.of(data)
     outcomes = [claims.test(claim, evidence) for claim in CLAIMS]
     return [
-        "# A study of goal selection", *report.what_was_run(data), *_verdicts(outcomes),
-        *report.environments(data, pictures), *report.over_all(data),
-        *_speed(data), *[block for outcome in outcomes for block in _details(outcome)],
+        "# A study of goal selection", *_verdicts(outcomes), *report.environments(data, pictures),
+        *report.over_all(data), *report.what_was_run(data), *deviations.blocks(),
+        *_speed(data), *report.distributions(data), *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
 

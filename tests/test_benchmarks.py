@@ -9,13 +9,14 @@ from deimos.terrain import presets
 from torch import nn
 
 from benchmarks import __main__ as benchmarks
-from benchmarks import commits, director, engines, flops, learner, particle, quad, terrain, timing, training
+from benchmarks import commits, director, engines, flops, learner, particle, quad, table41, terrain, timing, training
 from deimos.checks import RunError
 from deimos.goals.methods import method
 from deimos.goals.selectors import rnd, vds
 from deimos.learn.ppo import PPOConfig
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs.particle import Config
+from reproduction.thesis import TABLE_4_1
 
 CPU = torch.device("cpu")
 TINY = TrainConfig(env=Config(goal_period=12), num_envs=64, ppo=PPOConfig(hidden=(8,)), evaluation=False)
@@ -215,3 +216,74 @@ def test_the_learner_is_measured(capsys):
         assert 0 < row["share"] < 10
     learner.show(rows)
     assert "tiny, a core busy" in capsys.readouterr().out
+
+
+@pytest.fixture
+def small_table(monkeypatch):
+    """Two columns of Table 4.1, in tiny: one whose goals fall due together, one of robots."""
+    robots = table41.columns("native", CPU)["quad"].config
+    small = replace(robots, num_envs=2, ppo=replace(robots.ppo, hidden=(8,)), env=robots.env.with_goal_period(25))
+    found = {
+        "directional": table41.Column(TINY, ("uniform", "p25")), "quad": table41.Column(small, ("uniform", "cl")),
+    }  # fmt: skip
+    monkeypatch.setattr(table41, "columns", lambda engine, device: found)
+    return found
+
+
+def test_table_41_continues_where_it_stopped(small_table, tmp_path, capsys):
+    """Rounds hold all methods of all environments, stop when time is up, and go on in another call from the file."""
+    path = tmp_path / "table.json"
+    command = ["table41", "--rounds", "3", "--json", str(path), "--device", "cpu", "--threads", "1"]
+    threads = torch.get_num_threads()
+    try:
+        assert benchmarks.main([*command, "--seconds", "1e-3"]) == 0
+        (first,) = json.loads(path.read_text())["table41"]
+        assert "2 rounds are left; the same command continues." in capsys.readouterr().out
+        assert benchmarks.main(command) == 0
+        assert benchmarks.main([*command, "--rounds", "4", "--engine", "warp"]) == 2
+    finally:
+        torch.set_num_threads(threads)
+    found = json.loads(path.read_text())
+    assert (found["engine"], found["device"], len(found["table41"])) == ("native", "cpu", 3)
+    assert found["table41"][0] == first
+    assert {name: list(own) for name, own in first["seconds"].items()} == {
+        "directional": ["uniform", "p25"], "quad": ["uniform", "cl"],
+    }  # fmt: skip
+    said = capsys.readouterr()
+    assert "holds rounds of other engine: one table is one commit on one machine" in said.err
+    assert "3 rounds; " in said.out
+    assert "load of the host" in said.out
+
+
+def test_table_41_compares_within_rounds(small_table, capsys):
+    """A ratio is the median of the rounds', with quartiles, so that a round that is slow for all counts for nothing."""
+    turns = [1.0, 2.0, 10.0]
+    ratios = [0.5, 0.8, 0.9]
+    rounds = [
+        {"seconds": {name: {"uniform": t, "p25": t / r, "cl": t} for name in small_table}, "load": t, "cores": 1.0}
+        for t, r in zip(turns, ratios, strict=True)
+    ]
+    rows = {(row["environment"], row["method"]): row for row in table41.speeds(small_table, rounds)}
+    p25 = rows["directional", "p25"]
+    assert (p25["low"], p25["ratio"], p25["high"]) == pytest.approx((0.65, 0.8, 0.85))
+    assert rows["quad", "cl"]["ratio"] == 1.0
+    # 12 steps of 64 worlds take one iteration of 24; a robot's goals fall due in every iteration.
+    assert rows["directional", "uniform"]["fps"] == 64 * 24 / 2.0
+    table41.show(small_table, rounds)
+    said = capsys.readouterr().out
+    assert "0.80 [0.65, 0.85]; 0.83" in said  # 274 / 329 in the thesis
+    assert "load of the host 2.0 (1.0 to 10.0)" in said
+
+
+def test_table_41_has_the_columns_of_the_thesis():
+    """Every environment of the thesis is there, trained with its methods, robots on the engine that is asked for."""
+    found = table41.columns("warp", CPU)
+    assert list(found) == ["absolute", "relative", "directional", "quad", "quad_arm"]
+    assert {name: set(column.methods) for name, column in found.items()} == {
+        name: set(own) for name, own in TABLE_4_1.items()
+    }  # fmt: skip
+    assert {column.config.env.engine for name, column in found.items() if "quad" in name} == {"warp"}
+    assert found["absolute"].config.env.variant == "absolute"
+    assert {name: column.iterations for name, column in found.items()} == {
+        "absolute": 5, "relative": 5, "directional": 5, "quad": 1, "quad_arm": 1,
+    }  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from deimos.checks import RunError
-from deimos.study import document, figures, report, stats
+from deimos.study import document, figures, outcomes, report, stats
 from deimos.study.data import Data, Style
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results
 from reproduction import report as thesis
@@ -41,6 +41,7 @@ def fill(folder, seeds=4, points=20):
                             "errors": {"end effector [m]": rng.uniform(0.3, 0.4)},
                         }
                     rows.append(row | {"goals": goals, "crashes": crashes, "crashes_per_1000": crashes / 4000,
+                                       "crash_rate": min(1.0, crashes / 1000) if goals == "adversary" else 0.5,
                                        "reward": rng.normal(0.8, 0.01), "fps": rng.normal(1e5, 1e3),
                                        "weak_adversary": weak})  # fmt: skip
                 line = dict.fromkeys(CURVE_COLUMNS, tuple(rng.uniform(0.1, 1, points))) | key
@@ -96,9 +97,9 @@ def test_page_needs_no_other_file(folder):
 
 
 def test_every_figure_is_there_twice(folder):
-    """Each environment has its training curves, boxes, profiles and dose-response, as PNG and as SVG."""
+    """Each environment has its training curves, boxes, profiles and its score against safety, as PNG and as SVG."""
     names = {f"training-{name}" for name in ("directional", "quad")}
-    names |= {f"{kind}-{e}-T100" for kind in ("evaluation", "profile", "dose") for e in ("directional", "quad")}
+    names |= {f"{kind}-{e}-T100" for kind in ("evaluation", "profile", "pareto") for e in ("directional", "quad")}
     for ending in ("png", "svg"):
         assert {path.stem for path in (folder / "figures").glob(f"*.{ending}")} == names
     for path in (folder / "figures").glob("*.png"):
@@ -120,21 +121,19 @@ def test_markdown_says_the_same(folder):
 
 
 def test_report_says_what_limits_it(folder):
-    """Weak adversaries are counted; the caveat of training curves and the detectable effects are printed."""
+    """Attackers that met no crash are counted; the caveat of training curves and the detectable effects are printed."""
     text = (folder / "report.md").read_text()
-    assert (
-        "2 of 48 evaluations by the Adversary are marked weak and left out (directional: coop 1; quad: coop 1)" in text
-    )
+    assert "In 2 of 48 attacks the attacker had met few crashes or none before it attacked" in text
+    assert "(directional: coop 1; quad: coop 1)" in text
     assert figures.CAVEAT in text
     assert "minimum detectable effect" in text
     assert "| quad | vds |" in text
-    assert "0.69 |" in text  # the thesis's VDS over Uniform in Quad, 70 / 101
 
 
 def test_tracking_and_errors_stand_beside_the_crashes(folder):
     """Where goals have several groups, and an environment errors, the tables of its policies have their means."""
     text = (folder / "report.md").read_text()
-    particle, quad = text.split("### directional, Naive")[1].split("### quad, Naive")
+    particle, quad = text.split("## Distributions")[1].split("### directional, Naive")[1].split("### quad, Naive")
     for name in (
         "tracking of velocity: IQM",
         "tracking of yaw rate: IQM",
@@ -154,7 +153,7 @@ def test_report_is_the_same_twice(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(stats, "RESAMPLES", 200)
     monkeypatch.setattr(figures, "write", lambda figures, out: [])
     thesis.write(folder, tmp_path)
-    text = re.sub(r"!\[.*\n\n", "", (folder / "report.md").read_text())
+    text = re.sub(r"(!\[|There are no data for this figure).*\n\n", "", (folder / "report.md").read_text())
     assert (tmp_path / "report.md").read_text() == text
 
 
@@ -177,10 +176,13 @@ def test_empty_folder_has_no_report(tmp_path):
 @pytest.mark.parametrize("count", [1, 2, 6])
 def test_titles_fit_above_their_axes(folder, count):
     """However few methods there are, the titles of the boxes keep apart and inside the figure."""
-    figure = figures.boxes(Data.read(folder).only(METHODS[:count]), "directional", 100)
-    figure.draw_without_rendering()
-    left, right = (axes.title.get_window_extent() for axes in figure.axes[:2])
-    assert figure.bbox.x0 <= left.x0 < left.x1 < right.x0 < right.x1 <= figure.bbox.x1
+    with figures.print_size():
+        figure = outcomes.boxes(Data.read(folder).only(METHODS[:count]), "directional", 100)
+        figure.draw_without_rendering()
+    titles = [axes.title.get_window_extent() for axes in figure.axes]
+    assert len(titles) == 3
+    ends = [figure.bbox.x0, *(end for title in titles for end in (title.x0, title.x1)), figure.bbox.x1]
+    assert ends == sorted(ends)
 
 
 def test_mean_without_an_interval_says_so(tmp_path, monkeypatch):
@@ -191,8 +193,8 @@ def test_mean_without_an_interval_says_so(tmp_path, monkeypatch):
     text = (tmp_path / "report.md").read_text()
     assert "(no interval)" in text
     assert "inf]" not in text
-    assert "| goals that ended in a crash: median |" in text
-    assert "| 50 % |" in text
+    assert "crashes: median" in text
+    assert "| 50 [50, 50] |" in text
     assert "Run on v, v." in text
 
 
@@ -237,15 +239,17 @@ def test_report_without_a_thesis(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(stats, "RESAMPLES", 200)
     report.write(folder, tmp_path, style=Style(reference="vds"))
     text = (tmp_path / "report.md").read_text()
-    assert "P(more crashes than vds)" in text
+    assert "P(safer than vds)" in text
     assert "ratio to vds" in text
     assert not re.search("thesis|claim|published|C1", text)
-    names = {f"{kind}-{e}-T100" for kind in ("evaluation", "profile") for e in ("directional", "quad")}
+    names = {f"{kind}-{e}-T100" for kind in ("evaluation", "profile", "pareto") for e in ("directional", "quad")}
     assert {path.stem for path in (tmp_path / "figures").glob("*.png")} == names | {
         "training-directional", "training-quad",
     }  # fmt: skip
     headings = re.findall("^## (.*)$", text, re.MULTILINE)
-    assert headings == ["What was run", "directional", "quad", "Over all environments", "Speed", "Limits"]
+    assert headings == [
+        "directional", "quad", "Over all environments", "What was run", "Speed", "Distributions", "Limits",
+    ]  # fmt: skip
 
 
 def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
@@ -257,7 +261,7 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
         return ["# Mine", *pictures["directional"], *pictures["quad"]]
 
     def draw(data, environment):
-        return {f"own-{environment}": ("A caption.", figures.boxes(data, environment, 100))}
+        return {f"own-{environment}": ("A caption.", outcomes.boxes(data, environment, 100))}
 
     report.write(folder, tmp_path, page=page, draw=draw)
     assert (tmp_path / "report.md").read_text().startswith("# Mine\n\n![A caption.](figures/own-directional.png)")

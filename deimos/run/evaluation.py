@@ -191,7 +191,7 @@ def evaluate(
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
     target = make_target(policy, env_config, config, device)
-    scale = _scale(target.build, config, progress)
+    scale = return_scale(target.build, config, progress)
     rows = []
     for identity in _identities(env_config, config):
         goals = identity["goals"]
@@ -253,8 +253,10 @@ def _halves(row: dict) -> tuple[float, float, int] | None:
     return crashed / even, (row["interaction_crashes"] - crashed) / odd, odd
 
 
-def _scale(build: Callable[[int, int], Env], config: EvalConfig, progress: Progress) -> tuple[float, float] | None:
-    """Return per step of the zero-action policy and of the reference policy, if there is one."""
+def return_scale(
+    build: Callable[[int, int], Env], config: EvalConfig, progress: Progress = lambda stage, share: None
+) -> tuple[float, float] | None:
+    """Return per step of the zero-action policy and of the reference policy, if there is one: scores of 0 and 1."""
     env = build(config.worlds, config.seed)
     nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
     reference = env.reference_policy()

@@ -63,7 +63,7 @@ class Where:
 
 
 class Data:
-    """The results of a study. Rows of a weak adversary are counted, and left out of every sample.
+    """The results of a study. All policies count, also those whose attacker found nothing to learn from.
 
     ``style`` says how methods are ordered and drawn; those without a colour get one. Raises ``RunError`` if the
     results are no one study; see ``Results.check``.
@@ -76,10 +76,9 @@ class Data:
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = defaultdict(dict)
         for row in self.rows:
-            if not row["weak_adversary"]:
-                goals = "adversary" if row["goals"] == "argmax" else row["goals"]
-                where = Where(row["environment"], goals, row["goal_period"])
-                self._samples[where, row["method"]][row["seed"]] = row
+            goals = "adversary" if row["goals"] == "argmax" else row["goals"]
+            where = Where(row["environment"], goals, row["goal_period"])
+            self._samples[where, row["method"]][row["seed"]] = row
 
     @classmethod
     def read(cls, folder: Path, style: Style | None = None) -> "Data":
@@ -151,9 +150,28 @@ class Data:
         return tracking | {f"errors:{name}": f"{name}, median over goals" for name in errors}
 
     def curves(self, environment: str, method: str, column: str = "crashes_per_1000") -> list[Array]:
-        """A column of the training curves of a method, see ``CURVE_COLUMNS``, seed by seed, each of shape (k,)."""
-        found = [row for row in self._results.curves if (row["environment"], row["method"]) == (environment, method)]
-        return [np.array(row[column]) for row in sorted(found, key=lambda row: row["seed"])]
+        """A column of the training curves of a method, see ``CURVE_COLUMNS``, seed by seed, each of shape (k,).
+
+        Those that do not hold it are left out.
+        """
+        return [*self.curves_by_seed(environment, method, column).values()]
+
+    def curves_by_seed(self, environment: str, method: str, column: str) -> dict[int, Array]:
+        """The same by seed."""
+        own = [row for row in self._results.curves if (row["environment"], row["method"]) == (environment, method)]
+        found = {row["seed"]: np.array(row.get(column, ())) for row in sorted(own, key=lambda row: row["seed"])}
+        return {seed: values for seed, values in found.items() if len(values)}
+
+    def delivered(self, environment: str, method: str) -> dict[int, float]:
+        """Delivered dose of every policy, by seed: the mean percentile of fear of its goals in training.
+
+        First goals and the time before fear had learnt count. Policies of which it is not known are left out.
+        """
+        means = {
+            seed: float(values.mean())
+            for seed, values in self.curves_by_seed(environment, method, "goal_percentile").items()
+        }
+        return {seed: mean for seed, mean in means.items() if not math.isnan(mean)}
 
 
 def _metric(row: Row, name: str) -> float:
@@ -161,7 +179,7 @@ def _metric(row: Row, name: str) -> float:
         return math.log1p(row["crashes"])
     column, _, part = name.partition(":")
     if not part:
-        return row[name]
+        return row.get(name, math.nan)
     if column == "tracking":
         return row[column][int(part)] if int(part) < len(row[column]) else math.nan
     return row[column].get(part, math.nan)

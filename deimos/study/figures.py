@@ -1,18 +1,18 @@
 """The figures of a study, as PNG and SVG, for print and the colour-blind.
 
-Every method has one colour and one marker throughout: those of the data's ``Style``.
+Every method has one colour and one marker throughout: those of the data's ``Style``. What the rows of an older version
+do not say is named in the place of its panel.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.stats import sem
 
-from deimos.study import stats
-from deimos.study.data import Data, Style, Where
-from deimos.study.document import Picture
+from deimos.study.data import Data, Style
+from deimos.study.document import Block, Picture
 from deimos.study.stats import Array
 
 if TYPE_CHECKING:
@@ -20,39 +20,43 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CAVEAT = "Curves of different methods are not comparable: each crashes under its own goals."
-BOXES = "every point is a policy; boxes are quartiles, whiskers 1.5 times their range. Weak adversaries are left out."
-PROFILES = "share of the policies that crash more often than x, with pointwise 95 % bands."
-DPI = 130
+TRAINING = (
+    "medians over seeds with quartiles, of rolling means. Strips: the share of rollouts after which fear did not "
+    "learn, from none (white) to all (dark); methods without a fear network have no strip."
+)
+DPI = 200
+WIDTH = 7.2  # [inch]: the text of an A4 page, at which every figure can be read
 WINDOW = 0.05  # of the training, for the rolling mean
-GOALS = ("naive", "adversary")
+PRINT = {
+    "font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5,
+    "legend.fontsize": 7.5, "figure.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False,
+}  # fmt: skip
 
 Figures = dict[str, tuple[str, "Figure | None"]]
 """Captions and figures by their names; ``None`` for a figure that there are no data for."""
 
 
-def of_environment(data: Data, environment: str) -> Figures:
-    """The figures of one environment."""
-    text = f"Training in {environment}: rolling means, mean over seeds with standard error. {CAVEAT}"
-    figures: Figures = {f"training-{environment}": (text, training(data, environment))}
-    for period in data.periods(environment):
-        place, ending = f"{environment}, T = {period}", f"{environment}-T{period}"
-        figures[f"evaluation-{ending}"] = (f"{place}: {BOXES}", boxes(data, environment, period))
-        figures[f"profile-{ending}"] = (f"{place}: {PROFILES}", profiles(data, environment, period))
-    return figures
-
-
-def write(figures: Figures, folder: Path) -> list[Picture]:
-    """Write figures, each as PNG and SVG, and return those that there are data for as blocks of a page."""
+def print_size() -> AbstractContextManager[None]:
+    """Figures that are made inside have the letters of a printed page."""
     import matplotlib
 
-    pictures = []
+    return matplotlib.rc_context(PRINT)
+
+
+def write(figures: Figures, folder: Path) -> list[Block]:
+    """Write figures, each as PNG and SVG, and return them as blocks of a page; a figure without data says so there."""
+    import matplotlib
+
+    blocks: list[Block] = []
     for name, (caption, figure) in figures.items():
-        if figure is not None:
-            figure.savefig(folder / f"{name}.png", dpi=DPI)
-            with matplotlib.rc_context({"svg.hashsalt": name}):  # the same file from the same data
-                figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-            pictures.append(Picture(name, caption))
-    return pictures
+        if figure is None:
+            blocks.append(f"There are no data for this figure: {caption}")
+            continue
+        figure.savefig(folder / f"{name}.png", dpi=DPI)
+        with matplotlib.rc_context({"svg.hashsalt": name}):  # the same file from the same data
+            figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+        blocks.append(Picture(name, caption))
+    return blocks
 
 
 def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) -> "tuple[Figure, Any]":
@@ -66,132 +70,114 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) ->
     return figure, figure.subplots(rows, columns, squeeze=False, **more)
 
 
-def boxes(data: Data, environment: str, period: int) -> "Figure":
-    """Box-and-whisker plots of crashes and rewards, Naive and Adversary side by side."""
-    methods = data.methods(environment)
-    figure, axes = subplots(2, 2, (2.6 + 0.62 * len(methods), 6.4), sharex=True, sharey="row")
-    for column, goals in enumerate(GOALS):
-        where = Where(environment, goals, period)
-        axes[0, column].set_title(goals.capitalize())
-        for row, metric in enumerate(("crashes", "reward")):
-            _boxes(axes[row, column], data.style, {name: data.sample(where, name, metric) for name in methods})
-        axes[1, column].set_xticks(range(len(methods)), methods, rotation=45, ha="right")
-    axes[0, 0].set_ylabel("crashes")
-    axes[1, 0].set_ylabel("mean reward per transition")
-    logarithmic(axes[0, 0])
-    return figure
+def not_recorded(axes: "Axes", what: str) -> None:
+    """Say in the place of a panel what its rows do not hold."""
+    axes.text(0.5, 0.5, f"{what}:\nnot recorded", ha="center", va="center", transform=axes.transAxes, color="#555555")
+    axes.set_yticks([])
 
 
-def _boxes(axes: "Axes", style: Style, samples: Mapping[str, Array]) -> None:
-    first = next(iter(style.panels))
-    for i, (name, values) in enumerate(samples.items()):
-        if len(values) == 0:
-            continue
-        drawn = axes.boxplot(
-            [values], positions=[i], widths=0.62, patch_artist=True, showfliers=False,
-            medianprops={"color": "white" if _is_dark(style.colours[name]) else "black", "linewidth": 1.8},
-        )  # fmt: skip
-        hatch = None if style.panel(name) == first else "//"
-        drawn["boxes"][0].set(facecolor=style.colours[name], alpha=0.85, hatch=hatch)
-        place = i + 0.4 * (np.arange(len(values)) * 0.618034 % 1.0 - 0.5)  # spread, but not in the order of the seeds
-        axes.plot(
-            place, values, linestyle="", marker="o", markersize=3.2, color="white",
-            markeredgecolor="black", markeredgewidth=0.6, zorder=3,
-        )  # fmt: skip
-    axes.grid(axis="y", alpha=0.3)
-
-
-def logarithmic(axes: "Axes") -> None:
-    """Crashes from 0 to many: linear up to 10, logarithmic above. After all is drawn, which the limits depend on."""
-    axes.set_yscale("symlog", linthresh=10)
-    axes.autoscale_view()
-    axes.set_ylim(bottom=-1)
+def as_rates(axes: "Axes", which: Literal["x", "y"], label: str) -> None:
+    """An axis of shares in percent, from none to all: linear up to 0.01 %, logarithmic above."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    getattr(axes, f"set_{which}scale")("symlog", linthresh=0.01, linscale=0.5)
+    getattr(axes, f"set_{which}lim")(-0.002, 150)
+    axis.set_ticks([0, 0.01, 0.1, 1, 10, 100], ["0", "0.01", "0.1", "1", "10", "100"])
+    axis.set_ticks([], minor=True)
+    axis.set_label_text(label)
 
 
 def training(data: Data, environment: str) -> "Figure | None":
-    """Crashes and rewards during training, a column for each panel of methods."""
+    """Crashes and rewards during training, a column for each panel of methods, and where fear did not learn."""
     found = [name for name in data.methods(environment) if data.curves(environment, name)]
     if not found:
         return None
-    figure, axes = _panels(data.style, sharey="row")
-    for top, bottom, title in zip(*axes, data.style.panels, strict=True):
-        own = [name for name in found if data.style.panel(name) == title]
-        names = [name for name in found if name == data.style.everywhere and name not in own] + own
+    titles = [*data.style.panels]
+    own = {title: [name for name in found if data.style.panel(name) == title] for title in titles}
+    most = max(map(len, own.values()))
+    figure, axes = subplots(
+        3, len(titles), (WIDTH, 4.4 + 0.13 * most), sharex=True, sharey="row", height_ratios=[1, 1, 0.12 + 0.07 * most]
+    )
+    for (top, bottom, strip), title in zip(axes.T, titles, strict=True):
+        more = [name for name in found if name == data.style.everywhere and name not in own[title]]
         for panel, column in ((top, "crashes_per_1000"), (bottom, "reward")):
             panel.grid(alpha=0.3)
-            for name in names:
+            for name in more + own[title]:
                 _curve(panel, data, environment, name, column)
         top.set_title(title)
-        bottom.set_xlabel("parallel steps")
-        if names:
-            top.legend(frameon=False, ncols=2, fontsize=9)
+        strip.set_xlabel("steps of every world")
         top.set_yscale("symlog", linthresh=0.1)
         top.set_ylim(bottom=0)
-    axes[0, 0].set_ylabel("crashes per 1000 transitions")
-    axes[1, 0].set_ylabel("mean reward per transition")
-    figure.suptitle(CAVEAT, fontsize=9)
+        top.yaxis.set_major_formatter("{x:g}")
+        _strips(strip, data, environment, own[title])
+    axes[0, 0].set_ylabel("crashes per 1000\ntransitions")
+    axes[1, 0].set_ylabel("mean reward\nper transition")
+    legend(figure, data.style, found, "below")
     return figure
 
 
-def profiles(data: Data, environment: str, period: int) -> "Figure | None":
-    """Performance profiles: share of the policies whose crashes per 1000 transitions exceed a threshold."""
-    figure, axes = _panels(data.style, sharey="all")
-    thresholds = np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 120)])
-    for row, goals in enumerate(GOALS):
-        for panel, title in zip(axes[row], data.style.panels, strict=True):
-            for name in data.methods(environment):
-                values = data.sample(Where(environment, goals, period), name, "crashes_per_1000")
-                if data.style.panel(name) == title and len(values) >= 2:
-                    share, *band = stats.performance_profile([values], thresholds, resamples=2000)
-                    _line(panel, data.style, name, thresholds, share, band, every=12, alpha=0.1, step="post")
-            panel.set_xscale("symlog", linthresh=1e-3)
-            panel.grid(alpha=0.3)
-            panel.set_title(f"{title}, against the {goals.capitalize()}")
-            if panel.lines:
-                panel.legend(frameon=False, fontsize=8, ncols=2)
-    for panel in axes[1]:
-        panel.set_xlabel("crashes per 1000 transitions")
-    for panel in axes[:, 0]:
-        panel.set_ylabel("share of policies above")
-    return figure if any(panel.lines for panel in axes.flat) else None
+def unfitted(data: Data, environment: str, method: str) -> Array | None:
+    """Share of rollouts after which fear did not learn, over policies, in every stretch of the training, shape (k,).
+
+    ``None`` where that was not recorded, or for a method without a fear network.
+    """
+    curves = data.curves(environment, method, "fear_fitted")
+    length = min(map(len, curves), default=0)
+    return 1.0 - np.mean([curve[:length] for curve in curves], axis=0) if length else None
 
 
-def _panels(style: Style, sharey: str) -> "tuple[Figure, Any]":
-    """Two rows of as many axes as there are panels of methods."""
-    count = len(style.panels)
-    return subplots(2, count, (1.5 + 4.75 * count, 6.6), sharex=True, sharey=sharey)
+def _strips(axes: "Axes", data: Data, environment: str, names: Sequence[str]) -> None:
+    """A strip for each method with a fear network, dark where the networks of its policies did not learn."""
+    found = {name: shares for name in names if (shares := unfitted(data, environment, name)) is not None}
+    if not found:
+        not_recorded(axes, "where fear did not learn")
+        return
+    for row, (name, shares) in enumerate(found.items()):
+        steps = data.curves(environment, name, "env_steps")[0][: len(shares)]
+        edges = np.concatenate([[0.0], steps])
+        axes.pcolormesh(edges, [row - 0.4, row + 0.4], shares[None], cmap="Greys", vmin=0, vmax=1.2, rasterized=True)
+        axes.text(1.01, row, name, transform=axes.get_yaxis_transform(), va="center", fontsize=7)
+    axes.set_ylim(len(found) - 0.4, -0.6)
+    axes.set_yticks([])
+    axes.set_ylabel("fear did\nnot learn")
 
 
 def _curve(axes: "Axes", data: Data, environment: str, name: str, column: str) -> None:
-    """Mean over seeds with its standard error, smoothed by a rolling mean."""
+    """Median over seeds with quartiles, smoothed by a rolling mean."""
     curves, steps = data.curves(environment, name, column), data.curves(environment, name, "env_steps")
     length = min(map(len, curves))
     window = max(1, round(WINDOW * length))
-    smooth = np.stack([_rolling(curve[:length], window) for curve in curves])
-    mean = smooth.mean(axis=0)
-    error = sem(smooth) if len(curves) > 1 else 0.0
-    band = mean - error, mean + error
-    _line(axes, data.style, name, steps[0][:length], mean, band, every=max(1, length // 8), alpha=0.18)
+    low, middle, high = np.quantile([_rolling(curve[:length], window) for curve in curves], [0.25, 0.5, 0.75], axis=0)
+    line(axes, data.style, name, steps[0][:length], middle, (low, high), every=max(1, length // 8), alpha=0.18)
 
 
-def _line(
+def line(
     axes: "Axes", style: Style, name: str, x: Array, y: Array, band: Sequence[Array],
     *, every: int, alpha: float, step: Literal["post"] | None = None,
 ) -> None:  # fmt: skip
     """A method's line with its band of that opacity, and a marker at ``every`` so many points."""
     axes.plot(
-        x, y, drawstyle=step and f"steps-{step}", color=style.colours[name], linewidth=1.6, label=name,
-        marker=style.marker(name), markersize=4.5, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
+        x, y, drawstyle=step and f"steps-{step}", color=style.colours[name], linewidth=1.3, label=name,
+        marker=style.marker(name), markersize=3.6, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
     )  # fmt: skip
     low, high = band
     axes.fill_between(x, low, high, step=step, color=style.colours[name], alpha=alpha, linewidth=0)
 
 
+def legend(
+    figure: "Figure", style: Style, methods: Mapping[str, Any] | Sequence[str], place: Literal["beside", "below"]
+) -> None:
+    """What belongs to whom, outside the axes."""
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], linestyle="", marker=style.marker(name), markersize=5, color=style.colours[name],
+               markeredgecolor="black", markeredgewidth=0.4, label=name)
+        for name in methods
+    ]  # fmt: skip
+    where = {"loc": "outside right center"} if place == "beside" else {"loc": "outside lower center", "ncols": 7}
+    figure.legend(handles=handles, frameon=False, **where)
+
+
 def _rolling(x: Array, window: int) -> Array:
     """Mean of the last ``window`` values; of fewer at the start."""
     return np.convolve(x, np.ones(window))[: len(x)] / np.minimum(np.arange(1, len(x) + 1), window)
-
-
-def _is_dark(code: str) -> bool:
-    red, green, blue = (int(code[i : i + 2], 16) for i in (1, 3, 5))
-    return 0.299 * red + 0.587 * green + 0.114 * blue < 110

@@ -1,4 +1,4 @@
-"""The report of a study as HTML and as Markdown: what was run, tables, figures and limits.
+"""The report of a study as HTML and as Markdown: outcomes, figures, what was run, and limits.
 
 ``write`` puts the sections of ``page`` together; a caller with more to say gives a ``page`` of its own, made of
 these sections and others.
@@ -15,15 +15,17 @@ import numpy as np
 from scipy.stats import sem
 
 from deimos.study import figures, stats
-from deimos.study.data import Data, Where
-from deimos.study.document import Block, Picture, to_html, to_markdown
-from deimos.study.figures import Figures, Style
+from deimos.study.data import Data, Style, Where
+from deimos.study.document import Block, to_html, to_markdown
+from deimos.study.figures import Figures
+from deimos.study.outcomes import SAFE, attacked, base_of, of_environment, of_factors, settings_of
 from deimos.study.stats import Array
 
-Pictures = Mapping[str, Sequence[Picture]]
-"""The figures of every environment."""
+Pictures = Mapping[str, Sequence[Block]]
+"""The figures of every environment and, under ``FACTORS``, those by level."""
 
 FIGURES = "figures"
+FACTORS = ""
 COVERAGE = (  # python -m reproduction coverage, its defaults
     "The intervals of IQMs and medians are percentile bootstraps: they cover 93 to 94 % at n = 10, on normal and on "
     "lognormal data. Means have bootstrap-t intervals (94 % and 91 %); the percentile bootstrap would cover 90 % and "
@@ -32,13 +34,14 @@ COVERAGE = (  # python -m reproduction coverage, its defaults
     "describe, and no difference is called on them."
 )
 _median = partial(np.median, axis=-1)
+_mean = partial(np.mean, axis=-1)
 
 
 def page(data: Data, pictures: Pictures) -> list[Block]:
     """The sections that every study has."""
     return [
-        "# A study of goal selection", *what_was_run(data), *environments(data, pictures),
-        *over_all(data), *speed(data), "## Limits", "\n".join(f"* {text}" for text in limits(data)),
+        "# A study of goal selection", *environments(data, pictures), *over_all(data), *what_was_run(data),
+        *speed(data), *distributions(data), "## Limits", "\n".join(f"* {text}" for text in limits(data)),
     ]  # fmt: skip
 
 
@@ -47,7 +50,7 @@ def write(
     out: Path,
     style: Style | None = None,
     page: Callable[[Data, Pictures], list[Block]] = page,
-    draw: Callable[[Data, str], Figures] = figures.of_environment,
+    draw: Callable[[Data, str], Figures] = of_environment,
 ) -> Path:
     """Write ``report.html``, ``report.md`` and ``figures/``; returns the path of the HTML page.
 
@@ -56,91 +59,137 @@ def write(
         out: Where to write; made if it is not there.
         style: How methods are ordered and drawn.
         page: Makes the page.
-        draw: Draws the figures of an environment.
+        draw: Draws the figures of an environment. Those of a design's settings are not drawn, but figures by level.
 
     Raises:
         RunError: If there are no results, or they cannot be read.
     """
     data = Data.read(folder, style)
     (out / FIGURES).mkdir(parents=True, exist_ok=True)
-    pictures = {name: figures.write(draw(data, name), out / FIGURES) for name in data.environments}
-    blocks = page(data, pictures)
+    single = [name for name, own in settings_of(data).items() if not own]
+    with figures.print_size():
+        drawn = {name: draw(data, name) for name in single} | {FACTORS: of_factors(data)}
+        pictures = {name: figures.write(own, out / FIGURES) for name, own in drawn.items()}
+        blocks = page(data, pictures)
     (out / "report.md").write_text(to_markdown(blocks, FIGURES))
     (out / "report.html").write_text(to_html(blocks, out / FIGURES))
     return out / "report.html"
 
 
 def what_was_run(data: Data) -> list[Block]:
-    """Environments, methods, seeds, sizes, weak adversaries and versions."""
+    """Environments, methods, seeds, sizes, attackers and versions."""
     rows = []
     for environment in data.environments:
         methods, own = data.methods(environment), [row for row in data.rows if row["environment"] == environment]
         counts = Counter(len({row["seed"] for row in own if row["method"] == name}) for name in methods)
+        policies = {(row["method"], row["seed"]): row["env_steps"] * row["num_envs"] for row in own}
         rows.append({
             "environment": environment, "methods": ", ".join(methods),
             "runs": ", ".join(f"{n} seeds x {k} methods" for n, k in sorted(counts.items())),
             "worlds": _values(own, "num_envs"), "parallel steps": _values(own, "env_steps"),
+            "transitions, all": f"{sum(policies.values()) / 1e6:.0f} M",
             "T in training": _values(own, "trained_period"), "T evaluated": _values(own, "goal_period"),
             "evaluation: worlds x steps": f"{_values(own, 'worlds')} x {_values(own, 'steps')}",
-            "setting": _values(own, "setting"),
+            "goals": _values(own, "goals"), "setting": _values(own, "setting"),
         })  # fmt: skip
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
-    weak = [_weak_adversaries(data)] if data.weak else []  # of results of 0.1.0
-    return ["## What was run", rows, *weak, "Run on " + "; ".join(versions) + "."]
+    return ["## What was run", rows, *_uninformed(data), "Run on " + "; ".join(versions) + "."]
 
 
 def _values(rows: Sequence[dict], column: str) -> str:
     return ", ".join(map(str, sorted({row[column] for row in rows})))
 
 
-def _weak_adversaries(data: Data) -> str:
-    made = sum(row["goals"] == "adversary" for row in data.rows)
-    weak = Counter((row["environment"], row["method"]) for row in data.weak)
-    text = f"{len(data.weak)} of {made} evaluations by the Adversary are marked weak and left out"
-    found = {place: [f"{name} {weak[place, name]}" for name in data.methods(place) if weak[place, name]]
-             for place in data.environments}  # fmt: skip
-    parts = "; ".join(f"{place}: {', '.join(names)}" for place, names in found.items() if names)
-    return (
-        f"{text} ({parts}). A policy that hardly ever crashes gives its Adversary nothing to learn from, so what is "
-        "left of a method with many of them are its least safe policies."
-    )
+def _uninformed(data: Data) -> list[Block]:
+    """How many attackers found nothing to learn from; their policies count all the same."""
+    found = [row for row in data.rows if row["weak_adversary"] or row.get("uninformed")]
+    if not found:
+        return []
+    made = sum(row["goals"] != "naive" for row in data.rows)
+    counts = Counter((row["environment"], row["method"]) for row in found)
+    places = {place: [f"{name} {counts[place, name]}" for name in data.methods(place) if counts[place, name]]
+              for place in data.environments}  # fmt: skip
+    parts = "; ".join(f"{place}: {', '.join(names)}" for place, names in places.items() if names)
+    return [
+        f"In {len(found)} of {made} attacks the attacker had met few crashes or none before it attacked ({parts}). A "
+        "policy that hardly ever crashes gives an attacker nothing to learn from; it counts as the safe policy that it "
+        "is."
+    ]
 
 
 def environments(data: Data, pictures: Pictures) -> list[Block]:
-    """Of every environment a table for each evaluation, and its figures."""
+    """Of every environment the outcomes and its figures; of settings of a design the outcomes and figures by level."""
     blocks: list[Block] = []
     for environment in data.environments:
         blocks.append(f"## {environment}")
+        if levels := settings_of(data)[environment]:
+            text = ", ".join(f"{name} {level}" for name, level in levels.items())
+            blocks.append(f"{base_of(data, environment)} with {text}.")
+        for period in data.periods(environment):
+            blocks += outcomes(data, environment, period)
+        blocks += pictures.get(environment, ())
+    by_level = pictures.get(FACTORS, ())
+    return [*blocks, "## By level", *by_level] if by_level else blocks
+
+
+def outcomes(data: Data, environment: str, period: int) -> list[Block]:
+    """The primary outcomes of every method, and its mean rates under each attacker."""
+    hard, easy = attacked(data, environment, period), Where(environment, "naive", period)
+    names = data.methods(environment)
+    under_attack = {name: data.sample(hard.where, name, hard.metric) for name in names}
+    base, rows, by_attacker = under_attack.get(data.style.reference, np.array([])), [], []
+    for name, rate in under_attack.items():
+        score = data.sample(easy, name, "score")
+        doses = [*data.delivered(environment, name).values()]
+        better = "-"
+        if name != data.style.reference and min(len(rate), len(base)) >= 2:
+            better = f"{stats.probability_of_improvement([(base, rate)]):.2f}"
+        rows.append({
+            "method": name, "seeds": str(max(len(rate), len(score))),
+            f"policies below {SAFE:g} % [%]": _boot(100.0 * (100 * rate < SAFE), _mean),
+            "mean rate [%]": _boot(100 * rate, _mean),
+            f"P(safer than {data.style.reference})": better,
+            "score: IQM": _boot(score, stats.iqm, ".3f"),
+            "delivered dose": f"{np.mean(doses):.1f}" if doses else "not recorded",
+        })  # fmt: skip
+        by_attacker.append({"method": name} | {
+            goals: f"{100 * values.mean():.3g}" if len(values) else "-" for goals in data.goals
+            if (values := data.sample(Where(environment, goals, period), name, "crash_rate")) is not None
+        })  # fmt: skip
+    return [
+        f"### {environment}, T = {period}: outcomes",
+        f"Crashes per interaction under {hard.by}, the score under uniform goals; with 95 % intervals over policies.",
+        rows, "Mean crashes per interaction [%] by who chooses the goals:", by_attacker,
+    ]  # fmt: skip
+
+
+def distributions(data: Data) -> list[Block]:
+    """Of every evaluation how its policies are distributed."""
+    blocks: list[Block] = []
+    for environment in data.environments:
         for period in data.periods(environment):
             for goals in data.goals:
                 blocks += _table(data, Where(environment, goals, period))
-        blocks += pictures[environment]
-    return blocks
+    return ["## Distributions", "Crashes are shares of interactions [%].", *blocks] if blocks else []
 
 
 def _table(data: Data, where: Where) -> list[Block]:
-    samples = {name: data.sample(where, name, "crashes") for name in data.methods(where.environment)}
-    base, parts = samples.get(data.style.reference, np.array([])), data.parts(where)
-    rows = []
+    samples = {name: 100 * data.sample(where, name, "crash_rate") for name in data.methods(where.environment)}
+    parts, rows = data.parts(where), []
     for name, crashes in samples.items():
         if len(crashes) < 2:
             continue
-        reward, score, rate = (data.sample(where, name, metric) for metric in ("reward", "score", "crash_rate"))
+        reward, score = (data.sample(where, name, metric) for metric in ("reward", "score"))
         mean = stats.bootstrap_t(crashes)
-        more = "-"
-        if name != data.style.reference and len(base) >= 2:
-            more = f"{stats.probability_of_improvement([(crashes, base)]):.2f}"
         rows.append({
             "method": name, "seeds": str(len(crashes)),
             "crashes: median": _boot(crashes, _median), "IQM": _boot(crashes, stats.iqm),
-            # Where most policies do not crash, the bootstrap-t is wide on both sides; counts are not below 0.
+            # Where most policies do not crash, the bootstrap-t is wide on both sides; shares are not below 0.
             "mean": f"{replace(mean, low=max(mean.low, 0.0)):.3g}" if math.isfinite(mean.high)
             else f"{mean.estimate:.3g} (no interval)",
             "worst 20 % (CVaR)": _boot(crashes, stats.cvar), "IQR": _boot(crashes, stats.iqr),
             "10 % to 90 %": " to ".join(f"{x:.3g}" for x in np.quantile(crashes, [0.1, 0.9])),
-            "goals that ended in a crash: median": f"{100 * np.median(rate):.3g} %" if len(rate) else "-",
             "reward: IQM": _boot(reward, stats.iqm, ".4f"), "score: IQM": _boot(score, stats.iqm, ".3f"),
-            f"P(more crashes than {data.style.reference})": more,
             **{f"{what}: IQM": _boot(data.sample(where, name, part), stats.iqm) for part, what in parts.items()},
         })  # fmt: skip
     return [f"### {where}", rows] if rows else []
@@ -151,24 +200,26 @@ def _boot(x: Array, statistic: stats.Statistic, form: str = ".3g") -> str:
 
 
 def over_all(data: Data) -> list[Block]:
-    """Safety over all environments and T, by the stratified bootstrap, for the methods that were run in all."""
-    blocks: list[Block] = []
-    for goals in ("naive", "adversary"):
-        places = [place for environment in data.environments for place in data.places(environment, goals)]
-        found = {name: [data.sample(place, name, "log_crashes") for place in places]
-                 for name in data.methods(data.environments[0])}  # fmt: skip
-        shared = {name: samples for name, samples in found.items() if min(map(len, samples)) >= 2}
-        if len(places) < 2 or len(shared) < 2:
-            continue
-        worst = [max(1e-9, *(x.max() for x in samples)) for samples in zip(*shared.values(), strict=True)]
-        rows = []
-        for name, samples in shared.items():
-            safety = [1 - x / most for x, most in zip(samples, worst, strict=True)]
-            mean = stats.bootstrap(safety, lambda *x: stats.iqm(np.concatenate(x, axis=-1)))
-            rows.append({"method": name, "safety: IQM [95 %]": f"{mean:.3f}"})
-        blocks += [f"### Against the {goals.capitalize()}, {len(places)} evaluations together", rows]
-    text = "Safety is 1 - log(1 + crashes) / log(1 + most crashes of any policy of that evaluation)."
-    return ["## Over all environments", text, *blocks] if blocks else []
+    """The primary outcomes over all environments and T, for the methods that were run in all of them."""
+    places = [attacked(data, name, period) for name in data.environments for period in data.periods(name)]
+    found = {name: [100 * data.sample(each.where, name, each.metric) for each in places]
+             for name in data.methods(data.environments[0])}  # fmt: skip
+    shared = {name: samples for name, samples in found.items() if min(map(len, samples)) >= 2}
+    if len(places) < 2 or len(shared) < 2:
+        return []
+    rows = []
+    for name, samples in shared.items():
+        safe = [100.0 * (rate < SAFE) for rate in samples]
+        both = (stats.bootstrap(values, _over_places) for values in (safe, samples))
+        rows.append({"method": name} | dict(zip(
+            (f"policies below {SAFE:g} % [%]", "mean rate [%]"), (f"{each:.3g}" for each in both), strict=True
+        )))  # fmt: skip
+    text = f"Means over {len(places)} evaluations of crashes per interaction under attack, each of which counts alike."
+    return ["## Over all environments", text, rows]
+
+
+def _over_places(*samples: Array) -> Array:
+    return np.mean([x.mean(axis=-1) for x in samples], axis=0)
 
 
 def speed(data: Data) -> list[Block]:
@@ -186,8 +237,8 @@ def speed(data: Data) -> list[Block]:
                     f"ratio to {data.style.reference}": f"{values.mean() / base.mean():.2f}" if len(base) else "-",
                 })  # fmt: skip
     text = (
-        "Frames per second over all worlds during training, learning included: mean over seeds ± standard error. Only "
-        "ratios are comparable, and only among runs of one kind of machine."
+        "Frames per second over all worlds during training, learning included: mean over seeds ± standard error. They "
+        "say what a study costs; runs shared the machine, so methods are compared by `python -m benchmarks table41`."
     )
     return ["## Speed", text, rows] if rows else []
 
