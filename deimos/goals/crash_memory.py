@@ -16,9 +16,9 @@ from deimos.nn.stateful import Stateful
 
 PARTNERS = 16  # survivals that are kept with every crash,
 DRAWN = 4  # and those of them that take part in a fit: another draw each time, since the few would be learnt by heart
-HALF_LIFE = 3  # periods of T steps after which a crash and its partners weigh half
-PRESENT = 0.15  # share of the survivals' weight that the youngest have: alone they raise the AUROC of age by half of it
-YOUNGEST = 512  # of them, drawn from the window
+HALF_LIFE = 1.5  # periods of T steps after which a crash and its partners weigh half
+PRESENT = 0.1  # share of a class that present rows weigh at most: the AUROC of age stays within PRESENT of 0.5
+YOUNGEST = 1024  # survivals of the window that are drawn for a fit
 
 
 class CrashMemory(Stateful):
@@ -73,10 +73,15 @@ class CrashMemory(Stateful):
         self.stored += len(crashed)
 
     def _beside(self, issued: Tensor, crashed: Tensor, survived: Tensor) -> Tensor:
-        """The survivals next to each crash in time, at random among those of a step, int64, shape (n, PARTNERS)."""
-        moment = issued + torch.rand(len(issued), dtype=torch.float64, generator=self.generator, device=issued.device)
-        ranked, order = moment[survived].sort()
-        first = torch.searchsorted(ranked, moment[crashed]) - PARTNERS // 2
+        """The survivals next to each crash in time, at random among those of its step, int64, shape (n, PARTNERS)."""
+        shuffle, draw = (
+            torch.rand(len(rows), dtype=torch.float64, generator=self.generator, device=issued.device)
+            for rows in (survived, crashed)
+        )
+        moment, order = (issued[survived] + shuffle).sort()
+        begin, end = (torch.searchsorted(moment, (issued[crashed] + later).double()) for later in (0, 1))
+        spare = end - begin - PARTNERS  # of its step; where there are too few, as many from before as from after it
+        first = begin + (spare.clamp(min=0) * draw + spare.clamp(max=0) * 0.5).floor().long()
         first = first.clamp(0, max(0, len(survived) - PARTNERS))
         place = first.unsqueeze(1) + torch.arange(PARTNERS, device=issued.device)
         return survived[order[place % len(survived)]]  # of few, some several times
@@ -85,7 +90,8 @@ class CrashMemory(Stateful):
         """What to learn from.
 
         Args:
-            rows: Rows of the window, shape (n, width); some of its survivals join the memory's.
+            rows: Rows of the window, shape (n, width): the present. The crashes among them that are not stored yet, and
+                some of the survivals, join what is remembered.
             window: The recently resolved interactions.
 
         Returns:
@@ -93,15 +99,27 @@ class CrashMemory(Stateful):
             (m,) each.
         """
         count, device = min(self.stored, len(self._issued)), rows.device
+        if not count:
+            return rows[:0], window.crashed[:0], rows[:0, 0]
+        waiting = (window.crashed & (window.issued > self._upto)).nonzero().squeeze(1)
         youngest = (~window.crashed).nonzero().squeeze(1)
         youngest = youngest[torch.randperm(len(youngest), generator=self.generator, device=device)[:YOUNGEST]]
         drawn = torch.randint(PARTNERS, (count, DRAWN), generator=self.generator, device=device)
-        partners = self._partners[torch.arange(count, device=device).unsqueeze(1), drawn]
-        age = self._issued.amax() - self._issued[:count]  # only how they compare matters, and the newest weighs 1
+        partners = self._partners[torch.arange(count, device=device).unsqueeze(1), drawn].flatten(0, 1)
+        age = self._issued[:count].amax() - self._issued[:count]  # only how they compare matters: the newest weighs 1
         weight = torch.exp2(age.float() / (-HALF_LIFE * self._period))
-        present = PRESENT if len(youngest) else 0.0
-        beside = weight.repeat_interleave(DRAWN) * ((1.0 - present) / DRAWN)
-        fresh = (weight.sum() * present / max(1, len(youngest))).expand(len(youngest))
-        inputs = torch.cat([self._crash[:count], partners.flatten(0, 1), rows[youngest]])
-        crashed = torch.arange(len(inputs), device=device) < count
-        return inputs, crashed, torch.cat([weight, beside, fresh])
+        crashes = _with_present(weight, len(waiting))
+        survivals = _with_present(weight.repeat_interleave(DRAWN) / DRAWN, len(youngest))
+        inputs = torch.cat([self._crash[:count], rows[waiting], partners, rows[youngest]])
+        crashed = torch.arange(len(inputs), device=device) < len(crashes)
+        return inputs, crashed, torch.cat([crashes, survivals])
+
+
+def _with_present(remembered: Tensor, present: int) -> Tensor:
+    """Weights of a class, as much as the remembered ones together: those, and then its ``present`` rows.
+
+    A present row weighs as much as the newest remembered one, but all of them at most ``PRESENT`` of the whole.
+    """
+    total = remembered.sum()
+    share = (present / (present + total)).clamp(max=PRESENT)
+    return torch.cat([remembered * (1.0 - share), (total * share / max(1, present)).expand(present)])
