@@ -1,7 +1,7 @@
 """How well does fear rank goals within a context, late in training, by what it learns from? Prints a table.
 
     python -m reproduction.fear_table runs/fear_table.csv                                 # 60 trainings
-    python -m reproduction.fear_table runs/try.csv --seeds 1 --methods p75 p75-literal --variants directional
+    python -m reproduction.fear_table runs/try.csv --seeds 1000 --methods p75 p75-literal --variants directional
 
 Every method is trained in every variant with every seed. At five points of the last quarter a copy of the run is
 audited: the exact outcomes of 50 candidates in each of at most 200 contexts with both outcomes, from clones. A run that
@@ -37,9 +37,9 @@ def measure(name: str, variant: str, seed: int) -> dict[str, object]:
     """Train once, and audit the fear network on the way.
 
     Returns:
-        ``auroc`` and ``contexts`` at every point, the first NaN where no context had both outcomes; ``fitted``, the
-        share of the rollouts since the first crash of an interaction that fear was fitted in; and ``percentile``, the
-        mean dose that was delivered.
+        ``auroc`` and ``contexts`` at every point, the first NaN where no context had both outcomes; ``waited``, the
+        rollouts from the first crash of an interaction to the first fit; ``fitted``, the share of the rollouts since
+        then that fear was fitted in; and ``percentile``, the mean dose that was delivered.
     """
     config = TrainConfig(
         env=particle.Config(variant=variant), selector=method(name), seed=seed, env_steps=VARIANTS[variant],
@@ -61,11 +61,12 @@ def measure(name: str, variant: str, seed: int) -> dict[str, object]:
             auroc.append(round(found["auroc"], 4))
             contexts.append(min(found["contexts"], CONTEXTS))
     crashed = [row["fear/crash_rate"] > 0 for row in rows]
-    since = rows[crashed.index(True) :] if any(crashed) else []
+    fitted = [math.isfinite(row["fear/loss"]) for row in rows]
+    first, crash = (column.index(True) if True in column else count for column in (fitted, crashed))
     return {
         "method": name, "variant": variant, "seed": seed,
         "auroc": " ".join(map(str, auroc)), "contexts": " ".join(map(str, contexts)),
-        "fitted": round(sum(math.isfinite(row["fear/loss"]) for row in since) / max(1, len(since)), 4),
+        "waited": first - crash, "fitted": round(sum(fitted) / max(1, count - first), 4),
         "percentile": round(sum(row["goal_percentile"] for row in rows) / len(rows), 2),
     }  # fmt: skip
 
@@ -76,11 +77,12 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="where the rows are kept")
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, nargs="+", default=range(5))
+    parser.add_argument("--threads", type=int, default=cores())
     args = parser.parse_args()
-    torch.set_num_threads(cores())
+    torch.set_num_threads(args.threads)
     known = read(args.file)
-    for seed in range(args.seeds):
+    for seed in args.seeds:
         for variant in args.variants:
             for name in args.methods:
                 if (name, variant, str(seed)) not in {(row["method"], row["variant"], row["seed"]) for row in known}:
@@ -119,6 +121,7 @@ def show(rows: list[dict[str, str]]) -> None:
         "lowest",
         f"below {FLOOR}",
         "contexts",
+        "waited",
         "fitted",
         "dose",
     ):
@@ -135,10 +138,12 @@ def show(rows: list[dict[str, str]]) -> None:
             half = stats.t.ppf(0.975, len(means) - 1) * stats.sem(means)
         contexts = sum(int(x) for row in own for x in row["contexts"].split())
         dose, fitted = (sum(float(row[column]) for row in own) / len(own) for column in ("percentile", "fitted"))
+        waited = max(int(row["waited"]) for row in own)
         table.add_row(
             variant, name, str(len(own)), f"{center:.3f}" + (" *" if center < BAR else ""),
             f"{center - half:.3f}-{center + half:.3f}", f"{min(every):.3f}",
-            f"{sum(value < FLOOR for value in every)} of {len(every)}", str(contexts), f"{fitted:.0%}", f"{dose:.1f}",
+            f"{sum(value < FLOOR for value in every)} of {len(every)}", str(contexts), str(waited), f"{fitted:.1%}",
+            f"{dose:.1f}",
         )  # fmt: skip
     Console(width=120).print(table)
 

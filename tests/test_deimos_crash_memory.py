@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 import logging
 import math
 
@@ -10,7 +11,7 @@ import torch
 
 from deimos import GoalDirector
 from deimos.goals import crash_memory
-from deimos.goals.crash_memory import HALF_LIFE, PARTNERS, CrashMemory
+from deimos.goals.crash_memory import DRAWN, HALF_LIFE, PARTNERS, PRESENT, YOUNGEST, CrashMemory
 from deimos.goals.fear import FearConfig
 from deimos.goals.fear_selector import LEAST, FearEstimate
 from deimos.goals.interactions import Interactions, Resolved
@@ -30,7 +31,7 @@ class History:
 
     def __init__(self, synchronous, steps=900, seed=0):
         generator = torch.Generator().manual_seed(seed)
-        worlds = 60
+        worlds = 400  # 20 goals are due in a step, as in Particle Gym
         begin = torch.zeros(worlds) if synchronous else torch.randint(PERIOD, (worlds,), generator=generator)
         issued = (begin.unsqueeze(1) + torch.arange(0, steps, PERIOD)).long().flatten()
         risk = 0.4 * torch.exp(-issued / 80)
@@ -80,8 +81,8 @@ def test_age_does_not_give_the_class_away(synchronous):
     history = History(synchronous)
     samples = lived(memory(), history, 900)
     found = [
-        weighted_auroc(-issued.float(), crashed, weight.double())
-        for _, crashed, weight, issued in samples.values() if crashed.any()
+        weighted_auroc(rows[:, 0], crashed, weight.double())  # the step of issue: the younger, the higher
+        for rows, crashed, weight in samples.values() if crashed.any()
     ]  # fmt: skip
     assert len(found) > 100
     assert min(found) >= 0.4
@@ -99,7 +100,7 @@ def test_from_the_first_crash_on_there_is_something_to_learn():
     samples = lived(memory(), history, 1800)
     first = int(history.issued[history.crashed].min()) + PERIOD
     assert not history.crashed[history.issued > 700].any()
-    for now, (_, crashed, weight, _) in samples.items():
+    for now, (_, crashed, weight) in samples.items():
         if now >= first:
             assert crashed.any()
             assert (~crashed).any()
@@ -107,24 +108,95 @@ def test_from_the_first_crash_on_there_is_something_to_learn():
             torch.testing.assert_close(weight[crashed].sum(), weight[~crashed].sum())
 
 
+def parts_of(own, sample):
+    """Its remembered crashes, the present ones, the partners that were drawn and the present survivals, as slices."""
+    count, crashes = min(own.stored, len(own._issued)), int(sample[1].sum())
+    edges = [0, count, crashes, crashes + count * DRAWN, len(sample[1])]
+    return [slice(begin, end) for begin, end in itertools.pairwise(edges)]
+
+
 def test_what_is_kept_is_what_happened():
     """Rows keep their class; partners were issued within a rollout of their crash or while it waited for survivals."""
-    own, history = memory(), History(synchronous=False)
-    for rows, crashed, _, issued in lived(own, history, 600).values():
+    own, history = memory(capacity=1000), History(synchronous=False)
+    for now in range(ROLLOUT, 601, ROLLOUT):
+        rows, window = history.window(now)
+        own.store(rows, window, now)
+        sample = own.sample(rows, window)
+        rows, crashed, _ = sample
         assert torch.equal(rows[:, 1] == 1, crashed)
-        count = int(crashed.sum())
-        assert torch.equal(rows[:count, 0].long(), issued[:count])
-        partners = rows[count : count * (1 + PARTNERS), 0].view(count, PARTNERS)
-        assert ((partners - rows[:count, :1]).abs() < ROLLOUT).all()
+        crashes, _, partners, _ = (rows[part, 0] for part in parts_of(own, sample))
+        assert ((partners.view(-1, DRAWN) - crashes.unsqueeze(1)).abs() < ROLLOUT).all()
+
+
+def test_partners_are_the_survivals_next_in_time():
+    """Partners are of the crash's step where that has enough, and else a run of survivals around it, without gaps."""
+    own, history = memory(capacity=1000), History(synchronous=False)
+    rows, window = history.window(2 * PERIOD)
+    own.store(rows, window, 2 * PERIOD)
+    survived = window.issued[~window.crashed & (window.issued <= PERIOD)]
+    assert own.stored > 10
+    assert len(survived) > 2 * PARTNERS
+    enough = 0
+    for crash, partners in zip(own._issued[: own.stored], own._partners[: own.stored, :, 0].long(), strict=True):
+        first, last = partners.min(), partners.max()
+        if (survived == crash).sum() >= PARTNERS:
+            enough += 1
+            assert first == last == crash
+        else:
+            assert first <= crash <= last
+            assert int(((survived > first) & (survived < last)).sum()) <= PARTNERS - 2
+    assert 0 < enough < own.stored
+
+
+def test_every_fit_draws_other_partners():
+    """Partners of a fit are some of those that are kept with each crash, and in the long run all of them."""
+    own, history = memory(capacity=1000), History(synchronous=False)
+    rows, window = history.window(2 * PERIOD)
+    rows = torch.cat([rows, torch.arange(len(rows)).float().unsqueeze(1)], dim=1)
+    own = CrashMemory(1000, PERIOD, 3, CPU, 0)
+    own.store(rows, window, 2 * PERIOD)
+    seen = [set() for _ in range(own.stored)]
+    for _ in range(100):
+        sample = own.sample(rows, window)
+        drawn = sample[0][parts_of(own, sample)[2], 2].view(own.stored, DRAWN)
+        for known, partners in zip(seen, drawn.tolist(), strict=True):
+            known.update(partners)
+    kept = own._partners[: own.stored, :, 2].tolist()
+    assert all(known == set(partners) for known, partners in zip(seen, kept, strict=True))
+    assert all(len(set(partners)) == PARTNERS for partners in kept)  # nobody twice
+
+
+def test_the_present_takes_part():
+    """Crashes that are not stored yet and survivals of the window are learnt from, with a bounded share of a class."""
+    own, history, shares = memory(capacity=1000), History(synchronous=False), []
+    for now in range(ROLLOUT, 301, ROLLOUT):
+        rows, window = history.window(now)
+        own.store(rows, window, now)
+        sample = own.sample(rows, window)
+        if not len(sample[0]):
+            continue
+        issued, weight = sample[0][:, 0], sample[2]
+        crashes, waiting, partners, youngest = parts_of(own, sample)
+        known = window.issued[window.crashed].float()
+        assert torch.equal(issued[waiting].sort().values, known[known > now - PERIOD].sort().values)
+        assert len(issued[youngest]) == min(YOUNGEST, int((~window.crashed).sum()))
+        for remembered, present in ((crashes, waiting), (partners, youngest)):
+            total = weight[remembered].sum() + weight[present].sum()
+            torch.testing.assert_close(total, weight[crashes].sum() + weight[waiting].sum())
+            shares.append((weight[present].sum() / total).item())
+    assert len(shares) > 60
+    assert min(shares[1::2]) > 0
+    assert max(shares) == pytest.approx(PRESENT)
 
 
 def test_it_is_bounded_and_keeps_the_newest():
     """It never holds more than its capacity, and holds the crashes that were issued last."""
     own, history = memory(capacity=10), History(synchronous=False)
-    rows, crashed, *_ = list(lived(own, history, 600).values())[-1]
-    assert int(crashed.sum()) == 10 < own.stored
+    sample = list(lived(own, history, 600).values())[-1]
+    crashes = sample[0][parts_of(own, sample)[0], 0]
+    assert len(crashes) == 10 < own.stored
     known = history.issued[history.crashed & (history.issued <= 600 - PERIOD)].sort().values
-    assert rows[crashed][:, 0].sort().values.tolist() == known[-10:].tolist()
+    assert crashes.sort().values.tolist() == known[-10:].tolist()
     rows, window = history.window(300)
     own = memory(capacity=3)
     own.store(rows, dataclasses.replace(window, crashed=torch.arange(len(rows)) % 2 == 0), 300)  # more at once
@@ -133,17 +205,20 @@ def test_it_is_bounded_and_keeps_the_newest():
 
 def test_weights_fade():
     """A crash that is ``HALF_LIFE`` periods older than another weighs half, and so do its partners."""
-    _, crashed, weight, issued = list(lived(memory(), History(synchronous=False), 600).values())[-1]
-    count = int(crashed.sum())
-    age = (issued[:count].max() - issued[:count]) / (HALF_LIFE * PERIOD)
-    torch.testing.assert_close(weight[:count], 0.5**age)
-    partners = weight[count : count * (1 + PARTNERS)].view(count, PARTNERS)
-    torch.testing.assert_close(partners, weight[:count, None].expand(-1, PARTNERS) * 0.85 / PARTNERS)
+    own = memory(capacity=1000)
+    sample = list(lived(own, History(synchronous=False), 300).values())[-1]
+    weight, issued = sample[2], sample[0][:, 0]
+    crashes, _, partners, _ = parts_of(own, sample)
+    fade = 0.5 ** ((issued[crashes].max() - issued[crashes]) / (HALF_LIFE * PERIOD))
+    assert fade.min() < 0.2
+    torch.testing.assert_close(weight[crashes] / weight[crashes].max(), fade)
+    of_one = weight[partners].view(-1, DRAWN)
+    torch.testing.assert_close(of_one / of_one.max(), fade.unsqueeze(1).expand(-1, DRAWN))
 
 
 def test_crashes_wait_for_survivals():
     """Crashes of a time without survivals are stored with the first ones that come."""
-    own = memory()
+    own = memory(capacity=1000)
     rows, window = History(synchronous=True).window(2 * PERIOD)
     alone = dataclasses.replace(window, crashed=torch.ones_like(window.crashed))
     own.store(rows, alone, 2 * PERIOD)
@@ -168,9 +243,9 @@ def test_it_resumes_bit_for_bit():
         assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
-def training(name, num_envs=128, **changes):
+def training(name, num_envs=128, variant="directional", **changes):
     """A run whose policy crashes often."""
-    env = particle.Config(goal_period=8, max_speed=200.0, max_force=100.0)
+    env = particle.Config(variant=variant, goal_period=8, max_speed=200.0, max_force=100.0)
     selector = dataclasses.replace(method(name), candidates=20, **changes)
     ppo = PPOConfig(hidden=(16,), epochs=1, init_std=100.0)
     return Trainer(TrainConfig(env=env, selector=selector, ppo=ppo, num_envs=num_envs, evaluation=False), CPU)
@@ -195,6 +270,20 @@ def test_fear_never_freezes():
     ages = [row["fear/age"] for row in last["p75-literal"]]
     assert ages[-1] >= 4
     assert math.isnan(last["p75-literal"][-1]["fear/loss"])
+
+
+@pytest.mark.parametrize("name", ["coop", "p0", "p10", "p25", "p50", "p75", "p90", "antagonist"])
+@pytest.mark.parametrize("variant", ["directional", "absolute", "relative"])
+def test_fear_is_fitted_in_every_rollout(variant, name):
+    """From T steps after the first crash on, when survivals of its time are known, no rollout goes without a fit."""
+    run = training(name, num_envs=64, variant=variant)
+    rows = [run.iterate() for _ in range(6)]
+    crashed = [row["fear/crash_rate"] > 0 for row in rows]
+    begin = crashed.index(True) + 1  # a rollout is longer than T
+    assert begin < 4
+    assert all(math.isfinite(row["fear/loss"]) for row in rows[begin:])
+    assert all(row["fear/age"] == 0 for row in rows[begin:])
+    assert all(row["fear/chosen"] == 1 for row in rows[begin + 1 :])
 
 
 def test_the_prior_is_that_of_the_last_two_periods():
@@ -301,5 +390,7 @@ def test_few_crashes_fit_no_temperature():
 
 
 def test_constants_keep_the_promise_on_age():
-    """The youngest survivals alone, if all were younger than every crash, raise the AUROC of age to at most 0.6."""
-    assert 0.5 + crash_memory.PRESENT / 2 <= 0.6
+    """Present rows, were they all younger than what is remembered or older, leave the AUROC of age in 0.4 to 0.6."""
+    past = 1 - crash_memory.PRESENT
+    assert 1 - past * past / 2 <= 0.6  # both classes have a present, where crashes are the younger
+    assert past / 2 >= 0.4

@@ -1,6 +1,7 @@
 """Where commands run: other people's environments, streams and folders."""
 
 import dataclasses
+import logging
 import os
 import re
 import subprocess
@@ -219,8 +220,18 @@ def test_progress_without_a_terminal_is_a_plain_line(monkeypatch, capfd):
 
 def test_progress_of_a_short_run_is_silent(tmp_path, capfd):
     """A run of a second says nothing on stderr where there is no terminal."""
-    assert cli.main([*TINY, "--out", str(tmp_path / "run")]) == 0
+    assert cli.main([*TINY, "--method", "uniform", "--out", str(tmp_path / "run")]) == 0
     assert capfd.readouterr().err == ""
+
+
+def test_a_director_without_fear_yet_says_so(tmp_path, capfd):
+    """Why its goals are uniform at first is a line on stderr; afterwards Deimos logs as little as before."""
+    for number in range(2):
+        assert cli.main([*TINY, "--method", "p75", "--out", str(tmp_path / f"run{number}")]) == 0
+        (line,) = capfd.readouterr().err.splitlines()
+        assert line.startswith("Goals are uniform until the fear network has seen 1 crash(es) and as many survivals;")
+    assert not logging.getLogger("deimos").handlers
+    assert not logging.getLogger("deimos").isEnabledFor(logging.INFO)
 
 
 @pytest.mark.parametrize("columns", [20, 60, 80, 100, 200])
@@ -259,7 +270,7 @@ def test_a_broken_plugin_is_named_and_breaks_nothing(tmp_path):
     (information / "entry_points.txt").write_text(entries)
     for arguments, known in (
         (["train", "--help"], "selector:director"),
-        ([*TINY, "--out", "run"], "run"),
+        ([*TINY, "--method", "uniform", "--out", "run"], "run"),
         (["terrain", "list"], "stairs-up: "),
     ):
         done = run(*arguments, cwd=tmp_path, PYTHONPATH=f"{tmp_path}:{HOME}")

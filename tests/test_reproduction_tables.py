@@ -157,14 +157,16 @@ def test_table_of_fear_trains_and_audits(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fear_table, "VARIANTS", {"directional": 480})
     monkeypatch.setattr(fear_table, "audit_fear", audit)
     file = tmp_path / "new" / "rows.csv"
-    command = [str(file), "--seeds", "1", "--methods", "p75", "--variants", "directional"]
+    command = [str(file), "--seeds", "1000", "--methods", "p75", "--variants", "directional"]
     for _ in range(2):  # the second time all is there
         monkeypatch.setattr("sys.argv", ["fear_table", *command])
         fear_table.main()
     (row,) = fear_table.read(file)
     assert row["auroc"] == "nan 0.6 0.8 0.9 0.9"
     assert row["contexts"] == "0 200 200 200 200"
-    assert 0.0 < float(row["fitted"]) <= 1.0
+    assert float(row["fitted"]) == 1.0  # with memory, from the first fit on
+    assert 0 <= int(row["waited"]) <= 6  # T steps and two rollouts
+    assert row["seed"] == "1000"
     assert 50.0 <= float(row["percentile"]) < 87.5
     printed = capsys.readouterr().out
     assert "0.800" in printed

@@ -10,6 +10,7 @@ import functools
 import inspect
 import io
 import itertools
+import logging
 import os
 import shutil
 import signal
@@ -203,6 +204,20 @@ def progress(title: str) -> Iterator[Callable[[str, float], None]]:
     ) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
+
+
+@contextlib.contextmanager
+def log_shown() -> Iterator[None]:
+    """Show what Deimos logs, such as why goals are uniform yet: a line each on stderr, above a progress bar."""
+    logger, handler = logging.getLogger("deimos"), logging.StreamHandler()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
 
 
 def _plain_progress(title: str) -> Callable[[str, float], None]:

@@ -105,7 +105,7 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
 def _training_progress(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
     """Frames per second, reward and crashes per 1000 transitions, short enough for 80 columns."""
     total = trainer.config.iterations
-    with console.progress("training") as report:
+    with console.progress("training") as report, console.log_shown():
         yield lambda row, fps: report(
             f"{fps:,.0f} FPS, reward {console.number(row['reward'])}, "
             f"crashes/1000 {console.number(row['crashes_per_1000'])}",

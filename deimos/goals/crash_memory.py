@@ -2,7 +2,7 @@
 
 A policy that becomes safe stops crashing, and a network that learns from the last 2 T steps alone stops learning with
 it. Old crashes beside young survivals would teach something else: to tell *when* a state was met. So every crash is
-kept together with survivals that were issued in the same rollout, and both fade alike.
+kept together with survivals of the same time, and both fade alike.
 """
 
 from typing import ClassVar
@@ -14,10 +14,11 @@ from deimos.goals.interactions import Resolved
 from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
-PARTNERS = 3  # survivals that are kept with every crash
-HALF_LIFE = 10  # periods of T steps after which a crash and its partners weigh half
-PRESENT = 0.15  # share of the survivals' weight that the youngest have: alone they raise the AUROC of age by half of it
-YOUNGEST = 512  # of them, drawn from the window
+PARTNERS = 16  # survivals that are kept with every crash,
+DRAWN = 4  # and those of them that take part in a fit: another draw each time, since the few would be learnt by heart
+HALF_LIFE = 1.5  # periods of T steps after which a crash and its partners weigh half
+PRESENT = 0.1  # share of a class that present rows weigh at most: the AUROC of age stays within PRESENT of 0.5
+YOUNGEST = 1024  # survivals of the window that are drawn for a fit
 
 
 class CrashMemory(Stateful):
@@ -48,6 +49,7 @@ class CrashMemory(Stateful):
         """Take over the new crashes among what was issued at least T steps ago, each with survivals of that time.
 
         Of what was issued later only the crashes are known yet. Crashes of a time without survivals wait for some.
+        Partners are the survivals that were issued next to a crash, before or after it.
 
         Args:
             rows: What to keep of every interaction of the window, shape (n, width).
@@ -64,37 +66,60 @@ class CrashMemory(Stateful):
             return
         capacity = len(self._issued)
         crashed = crashed[window.issued[crashed].argsort(stable=True)][-capacity:]  # the newest, in their order
-        count = len(crashed)
-        order = torch.randperm(len(survived), generator=self.generator, device=rows.device)
-        every = torch.arange(count * PARTNERS, device=rows.device)
-        place = (self.stored + every[:count]) % capacity
+        place = (self.stored + torch.arange(len(crashed), device=rows.device)) % capacity
         self._crash[place] = rows[crashed]
-        self._partners[place] = rows[survived[order[every % len(survived)]]].view(count, PARTNERS, -1)
+        self._partners[place] = rows[self._beside(window.issued, crashed, survived)]
         self._issued[place] = window.issued[crashed]
-        self.stored += count
+        self.stored += len(crashed)
 
-    def sample(self, rows: Tensor, window: Resolved) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _beside(self, issued: Tensor, crashed: Tensor, survived: Tensor) -> Tensor:
+        """The survivals next to each crash in time, at random among those of its step, int64, shape (n, PARTNERS)."""
+        shuffle, draw = (
+            torch.rand(len(rows), dtype=torch.float64, generator=self.generator, device=issued.device)
+            for rows in (survived, crashed)
+        )
+        moment, order = (issued[survived] + shuffle).sort()
+        begin, end = (torch.searchsorted(moment, (issued[crashed] + later).double()) for later in (0, 1))
+        spare = end - begin - PARTNERS  # of its step; where there are too few, as many from before as from after it
+        first = begin + (spare.clamp(min=0) * draw + spare.clamp(max=0) * 0.5).floor().long()
+        first = first.clamp(0, max(0, len(survived) - PARTNERS))
+        place = first.unsqueeze(1) + torch.arange(PARTNERS, device=issued.device)
+        return survived[order[place % len(survived)]]  # of few, some several times
+
+    def sample(self, rows: Tensor, window: Resolved) -> tuple[Tensor, Tensor, Tensor]:
         """What to learn from.
 
         Args:
-            rows: Rows of the window, shape (n, width); some of its survivals join the memory's.
+            rows: Rows of the window, shape (n, width): the present. The crashes among them that are not stored yet, and
+                some of the survivals, join what is remembered.
             window: The recently resolved interactions.
 
         Returns:
-            Rows, shape (m, width); whether each is a crash, bool; its weight within its class, at least 0; and the
-            step that it was issued after, int64, shape (m,) each.
+            Rows, shape (m, width); whether each is a crash, bool; and its weight within its class, at least 0, shape
+            (m,) each.
         """
-        count = min(self.stored, len(self._issued))
-        issued = self._issued[:count]
+        count, device = min(self.stored, len(self._issued)), rows.device
+        if not count:
+            return rows[:0], window.crashed[:0], rows[:0, 0]
+        waiting = (window.crashed & (window.issued > self._upto)).nonzero().squeeze(1)
         youngest = (~window.crashed).nonzero().squeeze(1)
-        order = torch.randperm(len(youngest), generator=self.generator, device=rows.device)
-        youngest = youngest[order[:YOUNGEST]]
-        age = self._issued.amax() - issued  # only how they compare matters, and the newest weighs 1
+        youngest = youngest[torch.randperm(len(youngest), generator=self.generator, device=device)[:YOUNGEST]]
+        drawn = torch.randint(PARTNERS, (count, DRAWN), generator=self.generator, device=device)
+        partners = self._partners[torch.arange(count, device=device).unsqueeze(1), drawn].flatten(0, 1)
+        age = self._issued[:count].amax() - self._issued[:count]  # only how they compare matters: the newest weighs 1
         weight = torch.exp2(age.float() / (-HALF_LIFE * self._period))
-        present = PRESENT if len(youngest) else 0.0
-        partners = weight.repeat_interleave(PARTNERS) * ((1.0 - present) / PARTNERS)
-        fresh = (weight.sum() * present / max(1, len(youngest))).expand(len(youngest))
-        inputs = torch.cat([self._crash[:count], self._partners[:count].flatten(0, 1), rows[youngest]])
-        crashed = torch.arange(len(inputs), device=rows.device) < count
-        steps = torch.cat([issued, issued.repeat_interleave(PARTNERS), window.issued[youngest]])
-        return inputs, crashed, torch.cat([weight, partners, fresh]), steps
+        crashes = _with_present(weight, len(waiting))
+        survivals = _with_present(weight.repeat_interleave(DRAWN) / DRAWN, len(youngest))
+        inputs = torch.cat([self._crash[:count], rows[waiting], partners, rows[youngest]])
+        crashed = torch.arange(len(inputs), device=device) < len(crashes)
+        return inputs, crashed, torch.cat([crashes, survivals])
+
+
+def _with_present(remembered: Tensor, present: int) -> Tensor:
+    """Weights of a class, as much as the remembered ones together: those, and then its ``present`` rows.
+
+    A present row weighs as much as the newest remembered one, but all of them at most ``PRESENT`` of the whole.
+    """
+    total = remembered.sum()
+    share = (present / (present + total)).clamp(max=PRESENT)
+    return torch.cat([remembered * (1.0 - share), (total * share / max(1, present)).expand(present)])

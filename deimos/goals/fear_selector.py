@@ -184,7 +184,7 @@ class FearSelector(GoalSelector):
         if self.memory is None:
             return self.fit(rows, window.crashed, torch.ones_like(rows[:, 0]))
         self.memory.store(rows, window, interactions.now)
-        rows, crashed, weight, _ = self.memory.sample(rows, window)
+        rows, crashed, weight = self.memory.sample(rows, window)
         return self.fit(rows, crashed, weight)
 
     def rows(self, window: Resolved, interactions: Interactions) -> Tensor:

@@ -30,6 +30,7 @@ CANDIDATES = 50  # goals tried in every context
 BATCH = 256  # contexts cloned at a time
 PATIENCE = 50  # contexts tried per context wanted, before giving up
 RESAMPLES = 10_000
+AHEAD = 10  # steps whose noise is drawn at once: for few worlds every operation costs what its call costs
 
 
 class _Explorer:
@@ -41,13 +42,17 @@ class _Explorer:
     def __init__(self, trainer: Trainer, first_world: int = 0) -> None:
         self._actor, self._seed, self._first = trainer.ppo.actor, trainer.config.seed, first_world
         self.steps = 0
+        self._noise: list[Tensor] = []  # of the coming steps, the next one last
 
     def __call__(self, obs: Tensor) -> Tensor:
         mean = self._actor(obs)
-        world = torch.arange(len(obs), device=obs.device)
-        noise = normals(self._seed, Purpose.AUDIT, world + self._first, world.new_tensor(self.steps), mean.shape[1])
+        if not self._noise or len(self._noise[-1]) != len(obs):
+            world = torch.arange(len(obs), device=obs.device)
+            steps = torch.arange(self.steps, self.steps + AHEAD, device=obs.device).unsqueeze(1)
+            noise = normals(self._seed, Purpose.AUDIT, world + self._first, steps, mean.shape[1])
+            self._noise = list(noise.unbind())[::-1]
         self.steps += 1
-        return mean + self._actor.std * noise
+        return mean + self._actor.std * self._noise.pop()
 
 
 def audit_fear(trainer: Trainer, contexts: int) -> dict:
