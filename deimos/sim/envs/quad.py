@@ -27,6 +27,26 @@ PRESETS = {
         "ppo": {"hidden": (256, 128, 64), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0},
         "eval": {"worlds": 256, "steps": 1000},
     },
+    # From nothing to walking on flat ground in a few minutes of one core: small networks and rollouts, a short horizon,
+    # goals of two seconds, and penalties so light that a robot which has yet to learn to step is not told to stand.
+    "quad-walk": {
+        "env": {
+            "goal_period": 100,
+            "noise": False,
+            "rewards": {
+                "vertical_speed": -1.0, "roll_pitch_rate": -0.02, "torque": -1e-4, "joint_acceleration": -1e-7,
+                "action_rate": -0.005, "collision": -0.25, "air_time": 0.0,
+            },
+        },
+        "method": "uniform",
+        "num_envs": 512,
+        "env_steps": 8000,
+        "ppo": {
+            "hidden": (128, 64, 32), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0,
+            "desired_kl": 0.02, "discount": 0.97, "entropy_coef": 0.002,
+        },
+        "eval": {"worlds": 256, "steps": 1000},
+    },
     # Legged Gym's sizes on rough terrain: 3000 iterations of 24 steps.
     "quad-large": {
         "env": {"terrain": "rough"},
@@ -35,4 +55,4 @@ PRESETS = {
         "ppo": {"hidden": (512, 256, 128), "activation": "elu", "reward_scale": 1.0},
         "eval": {"worlds": 4096, "steps": 2000},
     },
-}
+}  # fmt: skip
