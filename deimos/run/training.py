@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -84,7 +85,8 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
     try:
         folder.write_json("config.json", {
             "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
-            "init_from": str(init_from) if init_from else None, "files": folder.keep(config.env.files),
+            "init_from": str(init_from) if init_from else None,
+            "files": {name: folder.keep(name, partial(config.env.read_file, name)) for name in config.env.files},
         })  # fmt: skip
         save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
     except RunError:
