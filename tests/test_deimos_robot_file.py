@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from deimos.terrain import Grid, Share
+from deimos.terrain.shapes.flat import Shape as Flat
 
+from deimos import terrain
 from deimos.app import cli
 from deimos.run.folder import RunFolder
 from deimos.sim.envs import quad
@@ -395,6 +398,37 @@ def test_a_run_keeps_its_robot(tmp_path, capsys):
     capsys.readouterr()
     assert cli.main(["train", "--resume", str(tmp_path / "run"), "--env-steps", "144"]) == 2
     assert "is not a robot that a run has kept" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--env.robot", "none.toml"], "robot must be a name or a robot file, but there is no none.toml."),
+        (["--env.robot", "scout.toml", "--threads", "-1"], "threads must be in [0, 4096], got -1."),
+        (
+            ["--env.robot", "scout.toml", "--env.terrain", "fine.npz"],
+            "terrain must have cells of at least 0.05 m under",
+        ),
+        (["--env.robot", "scout.toml", "--num-envs", "2000000000"], "2000000000 worlds need more than "),
+        (["--env.robot", "bad.toml"], "joint 'abduct_rr' of body 'shoulder_rr' must have a range of angles; give it"),
+        (
+            ["--env.robot", "scout.xml"],
+            "robot must be a name or the path of a robot file, got 'scout.xml'; make a robot ",
+        ),
+    ],
+)
+def test_bad_input_of_a_training_ends_in_one_line(scout, monkeypatch, capsys, arguments, line):
+    """A robot, a terrain, a number of worlds or of threads that cannot be are refused in a line, and no run is left."""
+    monkeypatch.chdir(scout.parent)
+    shape = Share(shape=Flat(tile=2.0, platform=1.0))
+    terrain.build(Grid(shapes=(shape,), levels=1, columns=1, tile=2.0, border=1.0, cell=0.025)).save("fine.npz")
+    Path("bad.toml").write_text(scout.read_text().replace("scout.xml", "bad.xml"))
+    Path("bad.xml").write_text(Path("scout.xml").read_text().replace('range="-0.7 0.7"', ""))
+    assert cli.main(["train", "env:quad", *SMALL, *arguments, "--out", "run"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"deimos: {line}")
+    assert said.count("\n") == 1
+    assert not Path("run").exists()
 
 
 def test_the_task_has_the_robots_numbers(scout, torch_device):

@@ -45,7 +45,7 @@ TRAINING = {
 BUDGETS = {
     "train": TRAINING,
     "resume": {"--env-steps": "192"},
-    "evaluate": {"--oracle-worlds": "4", "--calibration": "100", "--contexts": "2"},
+    "evaluate": {"--worlds": "8", "--oracle-worlds": "4", "--calibration": "100", "--contexts": "2"},
     "study run": {"--methods": "uniform p25", "--num-envs": "16", "--env-steps": "48", "--threads": "1"},
     "play": {"--seconds": "0.2", "--fps": "10", "--width": "64", "--height": "48"},
 }

@@ -120,11 +120,12 @@ def _say(robot: Robot, report: Report, notes: list[str]) -> None:
         f"{base.subtreemass[0]:.3g} kg, of which base '{base.name}' {base.mass[0]:.3g} kg; it stands "
         f"{robot.standing_height:.3f} m high and starts at {robot.spawn_height:.3f} m"
     )
-    names = [f"{leg} {part}" for leg, part in itertools.product(LEGS, PARTS)]
+    legs = [f"{leg} {part}" for leg, part in itertools.product(LEGS, PARTS)]
+    labels = [*legs, *["arm"] * (len(robot.joints) - len(legs))]
     rows = [
         [label, joint.name, number(joint.pose), f"{joint.range[0]:.3g} to {joint.range[1]:.3g}",
          f"{joint.stiffness:g}, {joint.damping:g}", f"{standing.torque[i]:.1f} of {joint.max_torque:g}"]
-        for i, (label, joint) in enumerate(itertools.zip_longest(names, robot.joints, fillvalue="arm"))
+        for i, (label, joint) in enumerate(zip(labels, robot.joints, strict=True))
     ]  # fmt: skip
     header = ("", "joint", "pose [rad]", "range [rad]", "gains [N m/rad, N m s/rad]", "torque [N m]")
     feet = ", ".join(f"{leg} {' '.join(part)}" for leg, part in zip(LEGS, robot.parts[1:5], strict=True))

@@ -132,12 +132,13 @@ def _check_memory(config: TrainConfig) -> None:
     """
     if not hasattr(os, "sysconf"):
         return
-    need = config.num_envs * (config.ppo.num_steps * LEAST_BYTES + LEAST_BYTES)
+    each = config.ppo.num_steps * LEAST_BYTES + LEAST_BYTES
+    need = config.num_envs * each
     has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if need > has:
         raise RunError(
-            f"{config.num_envs} worlds need more than {need / 2**30:.0f} GiB of memory, this machine has "
-            f"{has / 2**30:.0f} GiB; use fewer (num_envs)."
+            f"{config.num_envs} worlds need more than {need / 2**30:.0f} GiB of memory, each at least "
+            f"{each / 2**10:.0f} KiB, and this machine has {has / 2**30:.0f} GiB; use fewer (num_envs)."
         )
 
 

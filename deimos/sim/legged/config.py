@@ -72,6 +72,9 @@ class LocomotionConfig(EnvConfig):
             raise ValueError(
                 f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
             )
+        if Path(self.robot).suffix.lower() == ".xml":
+            advice = f"make a robot file of it by: deimos robot new {self.robot}"
+            raise ValueError(f"robot must be a name or the path of a robot file, got '{self.robot}'; {advice}")
         if self.robot and not self._has_robot_file:  # a checkpoint leaves out where files lie
             check_choice("robot", self.robot, [*plugins.names(robots), "or the path of a robot file (.toml)"])
         check_choice("engine", self.engine, ["auto", *engines.MODULES])
