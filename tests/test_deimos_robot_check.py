@@ -161,11 +161,13 @@ def test_a_check_ends_with_a_picture(page):
 
 
 def test_a_check_ends_with_1_where_there_is_a_fault(page):
-    """The picture of a robot that falls is drawn too, where it is asked for."""
+    """What is odd about the MJCF is said too, and the picture of a robot that falls is drawn where it is asked for."""
     change(page / "scout.toml", "stiffness = 25 ", "stiffness = 1 ")
+    change(page / "scout.xml", "<freejoint/>", '<freejoint/><geom name="lid" size=".05" contype="0" conaffinity="0"/>')
     done = run(page, "check", "scout.toml", "--picture", "fallen.png")
     assert done.returncode == 1
     assert "\nfault: it falls from its pose" in done.stdout
+    assert "\nnote: geom 'lid' touches nothing and adds to the weight" in done.stdout
     assert "It cannot be trained like this." in done.stdout
     assert (page / "fallen.png").is_file()
 

@@ -320,6 +320,7 @@ CHANGES = [
     ("</worldbody>", "</worldbody><tendon><spatial><site site='s'/></spatial></tendon>", "that MuJoCo loads, but of"),
     ('pos="0.14 0.06', 'pos="-0.2 0.06', "base's frame must have x to the front and y to the left"),
     ('class="pad"><geom', 'class="pad"><geom contype="0" conaffinity="0"', None),
+    ('0 0" mass="0.35"', '0 0" mass="0"', "mass and inertia of moving bodies must be larger .*'shoulder_rr'"),
     ("<worldbody>", "<worldbodies>", "must be a file that MuJoCo loads, but of .* it says: XML"),
 ]  # fmt: skip
 

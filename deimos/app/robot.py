@@ -15,7 +15,7 @@ from deimos.app.drawing import with_caption
 from deimos.app.playback import choose_renderer, rendering
 from deimos.checks import RunError
 from deimos.files import write_whole
-from deimos.sim.legged import robot_draft, robot_file, robots
+from deimos.sim.legged import mjcf, robot_draft, robot_file, robots
 from deimos.sim.legged.robot_check import LEGS, PARTS, SECONDS, Report, check_robot
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, Robot
 
@@ -105,7 +105,7 @@ def _load(options: CheckOptions) -> tuple[Robot, list[str]]:
         raise RunError("held is for an MJCF; a robot file names the joints that it holds.")
     if path.suffix.lower() in robot_file.ENDINGS:
         with robot_file.opened(path) as (described, folder):
-            return described.build(folder), []
+            return described.build(folder), list(mjcf.read(folder / described.mjcf, described.held).notes)
     if path.suffix.lower() == ".xml":
         drafted, notes = robot_draft.draft(path, options.held)
         return drafted.build(path.parent), [*notes, f"deimos robot new {path} writes these values to a file"]
