@@ -193,12 +193,15 @@ def require_memory(num_samples: tuple[int, int], need: int, name: str, cell: flo
         )
 
 
-def _free_memory() -> int:
-    """Memory that a program can still get [B]."""
+def _free_memory() -> float:
+    """Memory that a program can still get [B]; infinite where the system does not say."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             return next(1024 * int(line.split()[1]) for line in file if line.startswith("MemAvailable"))
     except (OSError, StopIteration):  # not Linux
+        sizes = getattr(os, "sysconf_names", {})  # Windows has none
+        if not {"SC_PAGE_SIZE", "SC_PHYS_PAGES"} <= set(sizes):
+            return np.inf
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 

@@ -388,10 +388,11 @@ def test_true_process_says_one_line(copied, arguments):
         (["terrain", "shape", "flat"], "trimesh"),
         (["play", str(HOME / "docs" / "results" / "quad_flat"), "--video", "x.mp4"], "mujoco"),
         (["train", "env:quad", "--num-envs", "1"], "mujoco"),
+        (["train", "env:quad", "--num-envs", "1", "--device", "cpu", "--env.engine", "warp"], "mujoco_warp"),
     ],
 )
 def test_legged_robots_name_their_extra(here, capfd, monkeypatch, arguments, package):
-    """Where MuJoCo or trimesh is not installed, the one line names the extra of the legged robots."""
+    """Where an engine or trimesh is not installed, the one line names the extra of the legged robots."""
     monkeypatch.setitem(sys.modules, package, None)
     line = f"deimos: This needs {package}, which is not installed: pip install 'deimos-rl[legged]'\n"
     assert refused(arguments, capfd) == line

@@ -716,7 +716,7 @@ def test_the_data_hold_what_a_deployment_reads(torch_device):
         ({"friction": (1.0, 0.5)}, "friction must be a range"),
         ({"payload": -1.0}, r"payload must be in \[0, 1e\+06\], got -1.0"),
         ({"stiffness": 0.0}, "stiffness must be finite and positive, got 0.0"),
-        ({"robot": "spot"}, "robot must be one of go1, go1_rx150, got 'spot'"),
+        ({"robot": "spot"}, "robot must be one of go1, go1_rx150, or the path of a .*, got 'spot'"),
         ({"rewards": RewardWeights(tilt=math.nan)}, "rewards.tilt must be finite, got nan"),
     ],
 )

@@ -262,7 +262,7 @@ def test_the_environments_share_their_code_not_their_lines():
         ({"speed": 1.5}, r"speed must be in \[0.*1.*\], got 1.5"),
         ({"speed": math.nan}, r"speed must be in \[0.*1.*\], got nan"),
         ({"arm_rewards": ArmWeights(reach=math.inf)}, "arm_rewards.reach must be finite, got inf"),
-        ({"robot": "nobody"}, "robot must be one of go1, go1_rx150, got 'nobody'"),
+        ({"robot": "nobody"}, "robot must be one of go1, go1_rx150, or the path of a .*, got 'nobody'"),
         ({"goal_period": 1001}, "goal_period must be at most an episode of 1000 steps, got 1001"),
     ],
 )

@@ -77,6 +77,15 @@ def test_everything_is_described_in_words():
     assert "tracking" not in text  # of a goal in one part it is the reward
 
 
+def test_an_unknown_auroc_is_said():
+    """The row stays where no attacker could be tested; who learns nothing has a dash in it."""
+    naive, attack = few_crashes(0.0, 0.2)
+    naive.pop("adversary_auroc")
+    text = describe([naive, attack])
+    rows = {line[:46].strip(): line[46:].split() for line in text.splitlines()}
+    assert rows["attacker's AUROC (0.5: chance, 1: perfect)"] == ["-", "unknown"]
+
+
 def test_parts_of_a_goal_have_names():
     """Where a goal has several parts, what is said of each is said by its name; errors have their units."""
     parts = {"tracking": [0.9, 0.8, 0.0001], "goal_groups": ["velocity", "yaw rate", "end effector"]}

@@ -674,7 +674,9 @@ def test_what_led_to_an_invalid_state_is_left_out():
 
 def test_too_many_worlds_are_refused_before_memory_is_taken():
     """The message says how much would be needed; nothing is allocated first, or the system would kill the process."""
-    with pytest.raises(RunError, match=r"2000000000 worlds need more than \d+ GiB.*use fewer"):
+    with pytest.raises(
+        RunError, match=r"2000000000 worlds need more than \d+ GiB.*, each at least \d+ KiB,.*use fewer"
+    ):
         training.build(TrainConfig(num_envs=2_000_000_000), torch.device("cpu"))
 
 

@@ -31,7 +31,7 @@ PAGES = [HOME / "README.md", HOME / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"
 PAGES = [page for page in PAGES if "```" in page.read_text(encoding="utf-8") and "results" not in page.parts]
 LAB = [page for page in PAGES if page.parent.name == "lab" and "```sh" in page.read_text(encoding="utf-8")]
 PAGES = [page for page in PAGES if page not in LAB]
-LANGUAGES = {"python", "sh", "toml", "text", "{toctree}", "{eval-rst}"}
+LANGUAGES = {"python", "sh", "toml", "xml", "text", "{toctree}", "{eval-rst}"}
 
 CRASHING = {
     "--num-envs": "256", "--env-steps": "96", "--env.max-speed": "200", "--env.max-force": "100",
@@ -45,7 +45,7 @@ TRAINING = {
 BUDGETS = {
     "train": TRAINING,
     "resume": {"--env-steps": "192"},
-    "evaluate": {"--oracle-worlds": "4", "--calibration": "100", "--contexts": "2"},
+    "evaluate": {"--worlds": "8", "--oracle-worlds": "4", "--calibration": "100", "--contexts": "2"},
     "study run": {"--methods": "uniform p25", "--num-envs": "16", "--env-steps": "48", "--threads": "1"},
     "play": {"--seconds": "0.2", "--fps": "10", "--width": "64", "--height": "48"},
 }
@@ -79,7 +79,7 @@ class Block:
     @property
     def path(self) -> str | None:
         """Where the block belongs, if it is a file."""
-        first = re.match(r"# ([\w/]+\.(?:py|toml))\n", self.text)
+        first = re.match(r"(?:#|<!--) ([\w/]+\.(?:py|toml|xml))(?: -->)?\n", self.text)
         return first and first[1]
 
 
@@ -185,8 +185,8 @@ class Session:
                 arguments = shortened(arguments, {"--seeds": "{0}-{0}".format(*re.findall(r"\d+", seeds))})
         if arguments[:2] == ["study", "attack"]:
             arguments = [*arguments, "--allow-uncommitted"]
-        if name == "play":  # MuJoCo decides once in a process how it renders
-            self.process(sys.executable, "-m", "deimos", *shortened(arguments, BUDGETS[name]))
+        if name in ("play", "robot"):  # MuJoCo decides once in a process how it renders
+            self.process(sys.executable, "-m", "deimos", *shortened(arguments, BUDGETS.get(name, {})))
             return
         budget = BUDGETS.get(name, {})
         if name == "train" and "--preset" not in arguments and "env:" not in " ".join(arguments):

@@ -178,6 +178,27 @@ def test_grid_that_does_not_fit_is_refused(monkeypatch):
         terrain.build(grid)
 
 
+@pytest.mark.parametrize("names", [{}, {"SC_PAGE_SIZE": 30, "SC_PHYS_PAGES": 85}])
+def test_memory_is_known_where_the_system_says_it(monkeypatch, names):
+    """Without ``/proc`` the whole memory counts; where nobody tells that either, no grid is refused for it."""
+
+    def refuse(*args, **kwargs):
+        raise FileNotFoundError("no /proc")
+
+    monkeypatch.setattr("builtins.open", refuse)
+    monkeypatch.setattr(os, "sysconf_names", names)
+    monkeypatch.setattr(os, "sysconf", lambda name: 2**14)
+    free = world._free_memory()
+    monkeypatch.undo()
+    assert free == (2**28 if names else np.inf)
+    monkeypatch.setattr(world, "_free_memory", lambda: free)
+    if names:
+        with pytest.raises(ValueError, match=r"and 0\.2 GiB are free"):
+            world.require_memory((10, 10), 2**29, "cell", 0.1)
+    else:
+        world.require_memory((10, 10), 2**60, "cell", 0.1)
+
+
 def test_grid_with_too_many_cells_is_refused():
     """More cells along an axis than the exact ray test allows are refused with the least cell that works."""
     with pytest.raises(ValueError, match=r"cell must be at least 0.0128 m for 16384 cells along an axis at most"):

@@ -25,6 +25,7 @@ COMMANDS = {
     "pool": ("deimos.app.pool", "train the network of the attacker pooled on other runs"),
     "study": ("deimos.app.study", "train and compare populations of policies"),
     "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
+    "robot": ("deimos.app.robot", "check a robot of your own, and draft its file from an MJCF"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }
 """By name: the module whose ``main`` is the command, imported when it is asked for, and a line about it."""

@@ -33,11 +33,17 @@ def describe(rows: list[dict], elsewhere: Sequence[dict] = ()) -> str:
     columns = [*rows, *elsewhere]
     lines = [("simulated by", [known(row.get("engine"), str) for row in columns])]
     lines += [("goals that ended in a crash", [percent(row["crash_rate"]) for row in columns])]
-    lines += [(label, [known(row.get(key)) for row in columns]) for label, key in _LINES]
+    lines += [(label, [_cell(row, key) for row in columns]) for label, key in _LINES]
     lines += _per_part(columns)
     header, names = zip(("", ""), *[heading(row["goals"]) for row in columns], strict=True)
     shown = [[label, *values] for label, values in lines if any(value != "-" for value in values)]
     return f"Evaluation: {conditions(rows[0])}\n\n{table(header, [names, *shown])}\n\n{conclude(rows)}"
+
+
+def _cell(row: dict, key: str) -> str:
+    """A value of a row; an attacker that has learnt, but from too few crashes to be tested, has an unknown AUROC."""
+    is_unknown = key == "adversary_auroc" and _is_missing(row.get(key, 0.0))
+    return "unknown" if is_unknown else known(row.get(key))
 
 
 def heading(goals: str) -> tuple[str, str]:

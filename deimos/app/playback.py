@@ -84,12 +84,11 @@ def main(arguments: list[str], program: str) -> None:
     """Run ``deimos play``."""
     options: PlayOptions = console.parse(PlayOptions, arguments, program)
     console.quiet_warp()
-    if sys.platform.startswith("linux"):
-        os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
+    choose_renderer()
     folder = RunFolder.open(options.run)
     config = read_config(folder)
     if isinstance(config.env, LocomotionConfig):
-        with _rendering():
+        with rendering():
             import mujoco  # noqa: F401 (it decides now how it will render)
     policy = load_policy(folder.path)
     try:
@@ -119,8 +118,14 @@ def _render(env: Env, policy: Policy, afraid: FearSelector | None, options: Play
     env.check()
 
 
+def choose_renderer() -> None:
+    """Have MuJoCo render without a display, as the user says or by EGL; call it before MuJoCo is imported."""
+    if sys.platform.startswith("linux"):
+        os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
+
+
 @contextmanager
-def _rendering() -> Iterator[None]:
+def rendering() -> Iterator[None]:
     """Turn whatever goes wrong into a ``RunError`` that says how to render, but for a missing MuJoCo."""
     try:
         yield
@@ -170,7 +175,7 @@ def _view(env: Env, width: int, height: int) -> Iterator[Callable[[], np.ndarray
 
     model = shown[0]
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    with _rendering():
+    with rendering():
         renderer = mujoco.Renderer(model, height, width)
     camera = mujoco.MjvCamera()
     camera.distance, camera.azimuth, camera.elevation = 1.8, 130.0, -18.0

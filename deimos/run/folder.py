@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,19 +52,19 @@ class RunFolder:
         except (OSError, ValueError) as error:
             raise RunError(f"{self.path / name} cannot be read ({first_line(error)}).") from error
 
-    def keep(self, files: Mapping[str, Path]) -> dict[str, str]:
-        """Copy the files that a run is built from; gives what each copy is called, by the name that it was given by."""
-        copies = {name: name + path.suffix for name, path in files.items()}
-        for name, copy in copies.items():
-            self._copy(files[name], copy)
-        return copies
+    def keep(self, name: str, read: Callable[[], tuple[bytes, str]]) -> str:
+        """Copy a file that a run is built from; gives what the copy is called.
 
-    def _copy(self, source: Path, name: str) -> None:
+        Args:
+            name: What the copy is called, without its ending.
+            read: Gives its contents and its ending.
+        """
         try:
-            data = source.read_bytes()
+            data, ending = read()
         except OSError as error:
-            raise RunError(f"{source} cannot be read ({error.strerror}).") from error
-        write_whole(self.path / name, lambda file: file.write(data))
+            raise RunError(f"{error.filename or name} cannot be read ({error.strerror}).") from error
+        write_whole(self.path / (name + ending), lambda file: file.write(data))
+        return name + ending
 
     def read_csv(self, name: str) -> list[dict[str, str]]:
         """All whole rows of a CSV file; none if there is no file."""

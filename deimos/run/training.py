@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -84,7 +85,8 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
     try:
         folder.write_json("config.json", {
             "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
-            "init_from": str(init_from) if init_from else None, "files": folder.keep(config.env.files),
+            "init_from": str(init_from) if init_from else None,
+            "files": {name: folder.keep(name, partial(config.env.read_file, name)) for name in config.env.files},
         })  # fmt: skip
         save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
     except RunError:
@@ -130,12 +132,13 @@ def _check_memory(config: TrainConfig) -> None:
     """
     if not hasattr(os, "sysconf"):
         return
-    need = config.num_envs * (config.ppo.num_steps * LEAST_BYTES + LEAST_BYTES)
+    each = config.ppo.num_steps * LEAST_BYTES + LEAST_BYTES
+    need = config.num_envs * each
     has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if need > has:
         raise RunError(
-            f"{config.num_envs} worlds need more than {need / 2**30:.0f} GiB of memory, this machine has "
-            f"{has / 2**30:.0f} GiB; use fewer (num_envs)."
+            f"{config.num_envs} worlds need more than {need / 2**30:.0f} GiB of memory, each at least "
+            f"{each / 2**10:.0f} KiB, and this machine has {has / 2**30:.0f} GiB; use fewer (num_envs)."
         )
 
 

@@ -91,6 +91,10 @@ class EnvConfig(abc.ABC):
         """Files that the worlds are built from, by the field that holds the path; a run works with its own copies."""
         return {}
 
+    def read_file(self, name: str) -> tuple[bytes, str]:
+        """What a run keeps of one of ``files``, whole in itself, and the ending of its copy."""
+        return self.files[name].read_bytes(), self.files[name].suffix
+
     @property
     def largest_reward(self) -> float:
         """Largest reward of one step for matching the goal: the unit of ``crash_penalty``."""

@@ -12,7 +12,7 @@ from deimos.checks import check_at_least, check_choice, check_positive, check_ra
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import LevelRule
 from deimos.sim.env import EnvConfig
-from deimos.sim.legged import engines, robots
+from deimos.sim.legged import engines, robot_file, robots
 from deimos.sim.legged.engines import PhysicsConfig
 from deimos.sim.legged.robots import Robot
 from deimos.terrain import Terrain, importing
@@ -23,7 +23,7 @@ class LocomotionConfig(EnvConfig):
     """A legged robot on a terrain. Defaults are Legged Gym's but for those that say otherwise."""
 
     robot: str = "go1"
-    """Who walks, a name of ``deimos.sim.legged.robots``."""
+    """Who walks, a name of ``deimos.sim.legged.robots`` or the path of a robot file (.toml)."""
     terrain: str = "flat"
     """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a terrain file (.npz)."""
     engine: engines.Name = field(default="auto", metadata={"before": "warp"})
@@ -72,7 +72,11 @@ class LocomotionConfig(EnvConfig):
             raise ValueError(
                 f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
             )
-        check_choice("robot", self.robot, plugins.names(robots))
+        if Path(self.robot).suffix.lower() == ".xml":
+            advice = f"make a robot file of it by: deimos robot new {self.robot}"
+            raise ValueError(f"robot must be a name or the path of a robot file, got '{self.robot}'; {advice}")
+        if self.robot and not self._has_robot_file:  # a checkpoint leaves out where files lie
+            check_choice("robot", self.robot, [*plugins.names(robots), "or the path of a robot file (.toml)"])
         check_choice("engine", self.engine, ["auto", *engines.MODULES])
         check_choice("levels", self.levels, [rule.name.lower() for rule in LevelRule])
         for name, gain in self._gains().items():
@@ -86,8 +90,13 @@ class LocomotionConfig(EnvConfig):
 
     @property
     def files(self) -> dict[str, Path]:
-        """See ``EnvConfig.files``: the terrain, unless it has a name."""
-        return {} if self.terrain in ("flat", "rough") else {"terrain": Path(self.terrain).expanduser()}
+        """See ``EnvConfig.files``: terrain and robot, unless they have names."""
+        terrain_file = {} if self.terrain in ("flat", "rough") else {"terrain": Path(self.terrain).expanduser()}
+        return terrain_file | ({"robot": Path(self.robot).expanduser()} if self._has_robot_file else {})
+
+    def read_file(self, name: str) -> tuple[bytes, str]:
+        """See ``EnvConfig.read_file``: a robot file takes its MJCF along."""
+        return (robot_file.pack(self.files[name]), ".zip") if name == "robot" else super().read_file(name)
 
     @property
     def largest_reward(self) -> float:
@@ -106,8 +115,19 @@ class LocomotionConfig(EnvConfig):
         )
 
     def make_robot(self) -> Robot:
-        """The robot, in free space."""
-        return plugins.load(robots, self.robot).build(**self._gains())
+        """The robot, in free space.
+
+        Raises:
+            ValueError: If its file is not one, or its MJCF is not that of a robot.
+        """
+        if not self._has_robot_file:
+            return plugins.load(robots, self.robot).build(**self._gains())
+        with robot_file.opened(self.files["robot"]) as (robot, folder):
+            return robot.build(folder, **self._gains())
+
+    @property
+    def _has_robot_file(self) -> bool:
+        return Path(self.robot).suffix.lower() in robot_file.ENDINGS
 
     def _gains(self) -> dict[str, float]:
         """The gains that are not the robot's own."""

@@ -1,6 +1,7 @@
 """Legged robots, built in code from published numbers: one file, one robot, which ``--env.robot`` finds by its name.
 
-A robot's file holds ``build(*, stiffness, damping, action_scale) -> Robot``, three numbers that all have defaults.
+A robot's file holds ``build(*, stiffness, damping, action_scale) -> Robot``, three numbers that all have defaults. What
+has an MJCF needs no code: see ``deimos.sim.legged.robot_file``.
 """
 
 from dataclasses import dataclass

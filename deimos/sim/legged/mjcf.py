@@ -1,0 +1,355 @@
+"""Reads a robot from an MJCF, whatever its names and its order, and copies it as the simulation needs it.
+
+MuJoCo compiles the file, with its classes, includes, meshes and keyframes; what the simulation needs is then built anew
+from the compiled numbers: the base, its legs in the order of ``Robot``, and spheres and capsules for whatever collides.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from deimos.checks import one_line
+from deimos.sim.legged.capsules import Piece, fill
+from deimos.sim.legged.robots import ROBOT_BIT, TERRAIN_BIT, VISUAL_GROUP
+from deimos.sim.legged.robots._primitives import add_collision
+
+if TYPE_CHECKING:
+    import mujoco
+
+STANDING = ("home", "stand", "standing")  # what keyframes of a standing robot are called
+DARK = (0.25, 0.27, 0.3, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Servo:
+    """What an MJCF says about the actuators of a joint; 0 for what it does not say."""
+
+    stiffness: float = 0.0
+    """[N m/rad]."""
+    damping: float = 0.0
+    """[N m s/rad]."""
+    max_torque: float = 0.0
+    """[N m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """An MJCF as it was read: everything has a name, held joints are gone, bodies that do not move are one."""
+
+    model: "mujoco.MjModel"
+    base: int
+    """Body of the free joint."""
+    servos: dict[str, Servo]
+    """By joint."""
+    pose: dict[str, float]
+    """Angle of every joint in a keyframe of the standing robot, or as the file shows it [rad]."""
+    has_keyframe: bool
+    """Whether the pose is that of a keyframe."""
+    notes: tuple[str, ...]
+    """What is odd about the file, each with a way out."""
+
+    def name(self, joint: int) -> str:
+        """Name of a joint."""
+        return self.model.joint(joint).name
+
+    def body_of(self, joint: int) -> str:
+        """Name of the body that a joint moves."""
+        return self.model.body(self.model.jnt_bodyid[joint]).name
+
+
+def read(path: Path, held: Sequence[str] = ()) -> Source:
+    """Read an MJCF.
+
+    Args:
+        path: The file.
+        held: Joints to hold at zero, as if the file did not have them.
+
+    Raises:
+        ValueError: If MuJoCo does not read it, or it is no robot with a floating base.
+    """
+    import mujoco
+
+    if not path.is_file():
+        raise ValueError(f"mjcf must be an MJCF file, but there is no {path}.")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        _name_all(spec)
+        whole = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"mjcf must be a file that MuJoCo loads, but of {path} it says: {one_line(error)}") from error
+    base = _find_base(path, whole)
+    _refuse_couplings(path, whole)
+    visual = _weighing_visuals(spec, whole)
+    for name in held:
+        if spec.joint(name) is None:
+            raise ValueError(f"held must name joints of {path}, which has no '{name}'.")
+        spec.delete(spec.joint(name))
+    for things in (spec.keys, spec.sensors, spec.actuators, spec.excludes, spec.pairs):
+        for thing in list(things):
+            spec.delete(thing)
+    spec.fuse_static()
+    model = spec.compile()
+    key = _standing_keyframe(whole)
+    angles = whole.qpos0 if key is None else whole.key_qpos[key]
+    return Source(
+        model=model, base=model.body(base).id, servos=_servos(whole),
+        pose={whole.joint(j).name: float(angles[whole.jnt_qposadr[j]]) for j in range(whole.njnt)},
+        has_keyframe=key is not None, notes=tuple(visual),
+    )  # fmt: skip
+
+
+def find_legs(source: Source) -> list[list[int]]:
+    """The joints of four legs from hip to foot, front left, front right, rear left, rear right.
+
+    Which leg is which is seen from where the hips are: x is to the front, y to the left.
+
+    Raises:
+        ValueError: If these are not four legs of three hinges each, and nothing else that moves.
+    """
+    model, base = source.model, source.base
+    chains = [_chain(source, leaf) for leaf in _leaves(model, base)]
+    if len(chains) != 4 or any(len(chain) != 3 for chain in chains):
+        found = "; ".join(" ".join(map(source.name, chain)) or "none" for chain in chains)
+        raise ValueError(
+            f"a robot must have four legs of three hinges each, and no other joints; found {len(chains)} chains of "
+            f"joints: {found}. Name the joints of a head, tail or arm in held; robots with more or fewer legs are not "
+            "supported."
+        )
+    _require_hinges(source, chains)
+    places = np.array([_place(model, base, chain[0]) for chain in chains])
+    by_x = np.argsort(-places[:, 0], kind="stable")
+    order = [leg for pair in (by_x[:2], by_x[2:]) for leg in sorted(pair, key=lambda leg: -places[leg, 1])]
+    x, y = places[order].T[:2]
+    if not (min(x[:2]) > max(x[2:]) and y[0] > y[1] and y[2] > y[3]):
+        raise ValueError(
+            f"the base's frame must have x to the front and y to the left, but the hips of body "
+            f"'{model.body(base).name}' do not lie so: {np.round(places[:, :2], 3).tolist()} m; turn the bodies in it."
+        )
+    return [chains[leg] for leg in order]
+
+
+def copy(source: Source, legs: Sequence[Sequence[int]]) -> "tuple[mujoco.MjSpec, dict[str, list[tuple[str, str]]]]":
+    """The robot built anew, its legs in this order.
+
+    Returns:
+        The model, without actuators; and for every body its geoms that collide, each as its name in the file and the
+        name of a piece of it.
+    """
+    import mujoco
+
+    model, spec = source.model, mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.modelname = model.body(source.base).name
+    trunk = _add_body(spec.worldbody, model, source.base)
+    trunk.add_freejoint(name="base")
+    pieces = {trunk.name: _add_geoms(spec, trunk, model, source.base)}
+    for leg in legs:
+        parent = trunk
+        for index in dict.fromkeys(model.jnt_bodyid[list(leg)].tolist()):
+            parent = _add_body(parent, model, index)
+            for joint in range(model.body_jntadr[index], model.body_jntadr[index] + model.body_jntnum[index]):
+                _add_joint(parent, model, joint)
+            pieces[parent.name] = _add_geoms(spec, parent, model, index)
+    return spec, pieces
+
+
+def _name_all(spec: "mujoco.MjSpec") -> None:
+    """Name what has no name after the body that it is on."""
+    for number, body in enumerate(spec.bodies):
+        body.name = body.name or f"body{number}"
+        for things, kind in ((body.joints, "joint"), (body.geoms, "geom")):
+            for i, thing in enumerate(things):
+                thing.name = thing.name or f"{body.name}_{kind}{i}"
+
+
+def _refuse_couplings(path: Path, model: "mujoco.MjModel") -> None:
+    """Raise ``ValueError`` if joints are coupled by what a copy would lose."""
+    for count, what in ((model.neq, "an equality constraint"), (model.ntendon, "a tendon"), (model.nflex, "a flex")):
+        if count:
+            raise ValueError(
+                f"mjcf must be a tree of bodies with joints of their own, but {path} has {what}; take it out, and hold "
+                "the joints that it moves."
+            )
+
+
+def _weighing_visuals(spec: "mujoco.MjSpec", model: "mujoco.MjModel") -> list[str]:
+    """What to say of bodies whose looks are a part of their weight: a frequent slip."""
+    explicit = {body.name for body in spec.bodies if body.explicitinertial}
+    weighing = [
+        geom.name for geom in spec.geoms
+        if not (geom.contype or geom.conaffinity) and geom.parent.name not in explicit
+        and geom.parent.name != "world" and model.body(geom.parent.name).mass[0] > 0 and geom.density > 0
+        and not geom.mass == 0
+    ]  # fmt: skip
+    return [
+        f"geom '{name}' touches nothing and adds to the weight of its body, which has no <inertial>; give it mass=\"0\""
+        for name in weighing
+    ]
+
+
+def _standing_keyframe(model: "mujoco.MjModel") -> int | None:
+    names = [model.key(i).name.lower() for i in range(model.nkey)]
+    found = [names.index(name) for name in STANDING if name in names]
+    return found[0] if found else None
+
+
+def _servos(model: "mujoco.MjModel") -> dict[str, Servo]:
+    """What the actuators and the joints of a model say about gains and limits."""
+    import mujoco
+
+    servos = {}
+    for joint in range(model.njnt):
+        limits = [model.jnt_actfrcrange[joint].max()] if model.jnt_actfrclimited[joint] else []
+        stiffness = damping = 0.0
+        for i in range(model.nu):
+            if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[i, 0] != joint:
+                continue
+            gain, bias, gear = model.actuator_gainprm[i, 0], model.actuator_biasprm[i], abs(model.actuator_gear[i, 0])
+            if model.actuator_forcelimited[i]:
+                limits.append(gear * model.actuator_forcerange[i].max())
+            if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and bias[1] == -gain:
+                stiffness, damping = gear**2 * gain, -(gear**2) * bias[2]
+            elif bias[1] == 0 and model.actuator_ctrllimited[i]:  # a motor
+                limits.append(gear * gain * model.actuator_ctrlrange[i].max())
+        servos[model.joint(joint).name] = Servo(
+            stiffness=float(stiffness), damping=float(damping), max_torque=float(min(limits, default=0.0))
+        )
+    return servos
+
+
+def _find_base(path: Path, model: "mujoco.MjModel") -> str:
+    """Name of the body of the free joint."""
+    import mujoco
+
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    if len(free) == 1:
+        return model.body(model.jnt_bodyid[free[0]]).name
+    roots = ", ".join(f"'{model.body(i).name}'" for i in range(1, model.nbody) if model.body_parentid[i] == 0)
+    raise ValueError(
+        f"mjcf must hold one body that floats, but {path} has {len(free)} free joints; put <freejoint/> into the "
+        f"robot's base alone ({roots or 'no body moves'})."
+    )
+
+
+def _leaves(model: "mujoco.MjModel", base: int) -> list[int]:
+    """The bodies of a base's tree that have no children, without the base."""
+    parents = set(model.body_parentid[1:].tolist())
+    return [i for i in range(base + 1, model.nbody) if model.body_rootid[i] == base and i not in parents]
+
+
+def _chain(source: Source, leaf: int) -> list[int]:
+    """The joints from the base to a body."""
+    model, body = source.model, leaf
+    joints: list[int] = []
+    while body != source.base:
+        first = model.body_jntadr[body]
+        joints = [*range(first, first + model.body_jntnum[body]), *joints]
+        body = model.body_parentid[body]
+    return joints
+
+
+def _require_hinges(source: Source, chains: list[list[int]]) -> None:
+    import mujoco
+
+    model, seen = source.model, set()
+    for joint in (joint for chain in chains for joint in chain):
+        what = f"joint '{source.name(joint)}' of body '{source.body_of(joint)}'"
+        if joint in seen:
+            raise ValueError(f"legs must be chains, but {what} moves two of them; every leg needs three of its own.")
+        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise ValueError(f"{what} must be a hinge; name it in held, or model the leg by hinges.")
+        if not model.jnt_limited[joint]:
+            raise ValueError(f'{what} must have a range of angles; give it range="LOW HIGH" in the MJCF.')
+        seen.add(joint)
+
+
+def _place(model: "mujoco.MjModel", base: int, joint: int) -> np.ndarray:
+    """Where a joint is, in the base's frame, in the pose that the file shows [m], shape (3,)."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return (data.xanchor[joint] - data.xpos[base]) @ data.xmat[base].reshape(3, 3)
+
+
+def _add_body(parent: "mujoco.MjsBody", model: "mujoco.MjModel", index: int) -> "mujoco.MjsBody":
+    body = parent.add_body(name=model.body(index).name, pos=model.body_pos[index], quat=model.body_quat[index])
+    body.mass, body.ipos, body.iquat = model.body_mass[index], model.body_ipos[index], model.body_iquat[index]
+    body.inertia, body.explicitinertial = model.body_inertia[index], True
+    return body
+
+
+def _add_joint(body: "mujoco.MjsBody", model: "mujoco.MjModel", joint: int) -> None:
+    dof, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
+    body.add_joint(
+        name=model.joint(joint).name, axis=model.jnt_axis[joint], pos=model.jnt_pos[joint],
+        range=model.jnt_range[joint], limited=True, ref=model.qpos0[place], armature=model.dof_armature[dof],
+        damping=(model.dof_damping[dof], 0.0, 0.0), frictionloss=model.dof_frictionloss[dof],
+        stiffness=(model.jnt_stiffness[joint], 0.0, 0.0), springref=model.qpos_spring[place],
+    )  # fmt: skip
+
+
+def _add_geoms(
+    spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjModel", index: int
+) -> list[tuple[str, str]]:
+    """Add what a body looks like and what of it collides; a body that has no looks looks like what collides."""
+    geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == index]
+    hard = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
+    for geom in [i for i in geoms if i not in hard] or hard:
+        _add_look(spec, body, model, geom)
+    added = []
+    for geom in hard:
+        pieces = [_moved(piece, model, geom) for piece in fill(model.geom_aabb[geom, 3:])]
+        for i, (start, end, radius) in enumerate(pieces):
+            name = model.geom(geom).name
+            piece = name if len(pieces) == 1 else f"{name}_{i}"
+            add_collision(body, piece, radius, start, end, contype=ROBOT_BIT, conaffinity=TERRAIN_BIT)
+            added.append((name, piece))
+    return added
+
+
+def _moved(piece: Piece, model: "mujoco.MjModel", geom: int) -> tuple[tuple, tuple | None, float]:
+    """A piece of a geom's box in the frame of its body."""
+    import mujoco
+
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+    start, end = (
+        model.geom_pos[geom] + turn.reshape(3, 3) @ (model.geom_aabb[geom, :3] + np.array(point))
+        for point in (piece.start, piece.end)
+    )
+    return tuple(start), None if piece.start == piece.end else tuple(end), piece.radius
+
+
+def _add_look(spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjModel", index: int) -> None:
+    """Add a copy of a geom that touches nothing and weighs nothing."""
+    import mujoco
+
+    material, mesh = model.geom_matid[index], model.geom_dataid[index]
+    is_mesh = model.geom_type[index] == mujoco.mjtGeom.mjGEOM_MESH
+    geom = body.add_geom(
+        type=mujoco.mjtGeom(int(model.geom_type[index])), size=np.maximum(model.geom_size[index], 0.0),
+        pos=model.geom_pos[index], quat=model.geom_quat[index], group=VISUAL_GROUP, contype=0, conaffinity=0, mass=0.0,
+        rgba=model.mat_rgba[material] if material >= 0 else model.geom_rgba[index],
+    )  # fmt: skip
+    if is_mesh:
+        geom.meshname = _add_mesh(spec, model, int(mesh))
+
+
+def _add_mesh(spec: "mujoco.MjSpec", model: "mujoco.MjModel", index: int) -> str:
+    """Add a copy of a mesh, once; gives its name."""
+    import mujoco
+
+    name = f"mesh{index}"
+    if spec.mesh(name) is None:
+        first, count = model.mesh_vertadr[index], model.mesh_vertnum[index]
+        face, faces = model.mesh_faceadr[index], model.mesh_facenum[index]
+        spec.add_mesh(
+            name=name, uservert=model.mesh_vert[first : first + count].ravel(),
+            userface=model.mesh_face[face : face + faces].ravel(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # looks need not be closed
+        )  # fmt: skip
+    return name
