@@ -29,6 +29,7 @@ SETTINGS = {
 INSTEAD = particle.Config(variant="absolute", max_force=2.0, max_speed=7.0, goal_period=140, goal_range=1600.0)
 HEADROOM = 0.01  # crashes per interaction of Uniform under the worst attacker
 SEEDS = (9101, 9102)
+WORLDS = 1000  # of a training
 EVALUATION = EvalConfig(worlds=500, attackers=("argmax", "argmax-long", "scripted"))
 UNIFORM = "uniform"
 SELECTORS: dict[str, dict[str, SelectorConfig]] = {
@@ -77,7 +78,9 @@ def run(root: Path, setting: str, env: particle.Config, seeds: tuple[int, ...], 
     """Train and evaluate some configurations in a setting."""
     for seed in seeds:
         for selector, configuration, config in chosen:
-            train = TrainConfig(env=env, selector=config, seed=seed, eval=EVALUATION, device="cpu", threads=1)
+            train = TrainConfig(
+                env=env, selector=config, seed=seed, num_envs=WORLDS, eval=EVALUATION, device="cpu", threads=1
+            )  # fmt: skip
             finished(train, _path(root, setting, selector, configuration, seed))
 
 

@@ -51,6 +51,8 @@ class Target:
     """The file of ``pooled``."""
     progress: Callable[[float], None] = lambda share: None
     """Called now and then with the share of the preparation that is done."""
+    learnt: dict[tuple[int, bool], tuple[Fear, dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
+    """What ``learn_fear`` has given so far, by its arguments: several attackers ask for the same network."""
 
 
 @dataclass(frozen=True)
@@ -111,20 +113,22 @@ def argmax_director(env: Env, fear: Fear) -> director.Director:
 
 
 def learn_fear(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, dict[str, Any]]:
-    """Train a fear network on a finished policy; for the arguments see ``collect``.
+    """Train a fear network on a finished policy, once for all attackers; for the arguments see ``collect``.
 
     Returns:
         The network, and ``adversary_steps``, ``adversary_interactions``, ``adversary_crashes``, ``adversary_auroc`` (on
         every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``uninformed``: whether
         it has learnt nothing, for want of a crash or of a survival, so that goals are uniform.
     """
-    fear, data = collect(target, steps, own_goals=own_goals)
-    fear.fit(learnt_from(data))
-    fear.check()
-    return fear, {
-        "adversary_steps": steps, "adversary_interactions": len(data), "adversary_crashes": int(data.crashed.sum()),
-        "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)), "uninformed": not fear.fitted,
-    }  # fmt: skip
+    if (steps, own_goals) not in target.learnt:
+        fear, data = collect(target, steps, own_goals=own_goals)
+        fear.fit(learnt_from(data))
+        fear.check()
+        target.learnt[steps, own_goals] = fear, {
+            "adversary_steps": steps, "adversary_interactions": len(data), "adversary_crashes": int(data.crashed.sum()),
+            "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)), "uninformed": not fear.fitted,
+        }  # fmt: skip
+    return target.learnt[steps, own_goals]
 
 
 def collect(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, Resolved]:
