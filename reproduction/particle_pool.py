@@ -47,10 +47,11 @@ def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", type=Path, help="where the runs are kept")
-    root = parser.parse_args().root
-    for variant in VARIANTS:
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
+    options = parser.parse_args()
+    for variant in options.variants:
         if not (POOL / f"{variant}.pt").exists():
-            pool(variant, root)
+            pool(variant, options.root)
     sums = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(POOL.glob("*.pt"))}
     (POOL / "SHA256SUMS").write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()))
 

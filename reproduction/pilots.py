@@ -168,7 +168,9 @@ def show(pilots: list[Pilot], file: Path | None) -> None:
         cells = [", ".join(f"{100 * p.rates[goals]:.2f}" for p in own) for goals in columns]
         cells += [", ".join(f"{100 * p.worst:.2f}" for p in own), ", ".join(f"{p.score:.3f}" for p in own)]
         print(f"| {' | '.join([*name, *cells])} |")
-    print("\n| selector | configuration | mean worst rate [%], " + ", ".join(settings) + " | both | score / Uniform's |")
+    print(
+        "\n| selector | configuration | mean worst rate [%], " + ", ".join(settings) + " | both | score / Uniform's |"
+    )
     print("|---|---|---|---|---|")
     for (selector, configuration), (rates, score) in table.items():
         each = ", ".join(f"{100 * rate:.2f}" for rate in rates)
