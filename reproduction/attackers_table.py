@@ -18,7 +18,6 @@ from scipy import stats
 from deimos.run.attack import Policy, names
 from deimos.run.evaluation import EvalConfig, evaluate, worst
 from deimos.run.folder import RunFolder
-from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import particle
 from reproduction.particle_pool import POOL, VARIANTS
 from reproduction.runs import finished
@@ -35,25 +34,22 @@ def attacks(variant: str) -> EvalConfig:
 
 def planted(variant: str) -> dict[str, Policy]:
     """A policy that never moves and one that follows its goals and never brakes."""
-    blind = particle.Config(variant=variant).build(1, CPU, 0).reference_policy(brake=False)
+    env = VARIANTS[variant].env
+    assert isinstance(env, particle.Config)
+    blind = env.build(1, CPU, 0).reference_policy(brake=False)
     return {"stays at the origin": lambda obs: torch.zeros(len(obs), 3), "never brakes": blind}
 
 
 def measure(root: Path, variant: str) -> None:
     """Train and evaluate the policies of a variant, as far as they are missing."""
-    env = particle.Config(variant=variant)
     for seed in SEEDS:
-        config = TrainConfig(
-            env=env, method="uniform", seed=seed, env_steps=VARIANTS[variant], eval=attacks(variant), device="cpu",
-            threads=1,
-        )  # fmt: skip
+        config = replace(VARIANTS[variant], method="uniform", seed=seed, eval=attacks(variant))
         finished(config, root / f"{variant}-s{seed}")
-    home = RunFolder(root)
+    sizes = replace(attacks(variant), worlds=PLANTED_WORLDS)
     for name, policy in planted(variant).items():
         if not (root / _file(variant, name)).exists():
-            home.write_json(
-                _file(variant, name), evaluate(policy, env, replace(attacks(variant), worlds=PLANTED_WORLDS), CPU)
-            )
+            rows = evaluate(policy, VARIANTS[variant].env, sizes, CPU)
+            RunFolder(root).write_json(_file(variant, name), rows)
 
 
 def _file(variant: str, name: str) -> str:
@@ -85,7 +81,7 @@ def show(variant: str, policies: list[list[dict]], known: dict[str, list[dict]])
         columns = [
             goals, "; ".join(interval(row) for row in own), percent(mean), f"{ratio:.1f}",
             f"{chosen[goals]} of {len(own)}" if goals != "naive" else "",
-            ", ".join(f"{row['adversary_auroc']:.3f}" for row in own if "adversary_auroc" in row),
+            ", ".join(known_or_dash(row["adversary_auroc"]) for row in own if "adversary_auroc" in row),
             ", ".join(str(row["adversary_crashes"]) for row in own if "adversary_crashes" in row),
             *[percent(rate) for rate in others],
         ]  # fmt: skip
@@ -96,6 +92,11 @@ def interval(row: dict) -> str:
     """Rate of a row with Wilson's interval, as if interactions of the same world were independent."""
     found = stats.binomtest(row["interaction_crashes"], row["interactions"]).proportion_ci(method="wilson")
     return f"{percent(row['crash_rate'])} ({percent(found.low)}-{percent(found.high)})"
+
+
+def known_or_dash(value: float | None) -> str:
+    """Three digits, or a dash for what nobody knows; files have no NaN."""
+    return "-" if value is None or math.isnan(value) else f"{value:.3f}"
 
 
 def percent(rate: float) -> str:

@@ -9,6 +9,7 @@ that exists is not written again.
 
 import argparse
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -22,7 +23,10 @@ from deimos.sim.envs import particle
 from reproduction.runs import finished
 
 POOL = Path(__file__).parent / "pool"
-VARIANTS = {"directional": 2000, "absolute": 5000, "relative": 2000}  # and the steps of a training, as in the thesis
+VARIANTS = {
+    variant: TrainConfig(env=particle.Config(variant=variant), env_steps=steps, device="cpu", threads=1)
+    for variant, steps in (("directional", 2000), ("absolute", 5000), ("relative", 2000))  # as in the thesis
+}
 METHODS = ("uniform", "coop", "p25", "antagonist", "rnd")
 SEEDS = (9001, 9002)
 
@@ -32,10 +36,7 @@ def pool(variant: str, root: Path) -> None:
     targets = []
     for seed in SEEDS:
         for method in METHODS:
-            config = TrainConfig(
-                env=particle.Config(variant=variant), method=method, seed=seed, env_steps=VARIANTS[variant],
-                evaluation=False, device="cpu", threads=1,
-            )  # fmt: skip
+            config = replace(VARIANTS[variant], method=method, seed=seed, evaluation=False)
             folder, _ = finished(config, root / f"{variant}-{method}-s{seed}")
             policy = load_policy(folder.path, "cpu").scaled
             targets.append(make_target(policy, config.env, EvalConfig(), torch.device("cpu")))

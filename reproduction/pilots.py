@@ -23,7 +23,7 @@ from deimos.sim.envs import particle
 from reproduction.runs import finished
 
 SETTINGS = {
-    "A": particle.Config(variant="directional", max_force=0.5, max_speed=8.0, goal_period=125, goal_range=10.0),
+    "A": particle.Config(variant="directional", max_force=0.5, max_speed=8.0, goal_period=125, goal_range=11.0),
     "B": particle.Config(variant="relative", max_force=2.0, max_speed=7.0, goal_period=140, goal_range=1600.0),
 }
 INSTEAD = particle.Config(variant="absolute", max_force=2.0, max_speed=7.0, goal_period=140, goal_range=1600.0)
