@@ -28,7 +28,8 @@ def finished(config: TrainConfig, path: Path) -> tuple[RunFolder, list[dict]]:
         else:
             shutil.rmtree(path, ignore_errors=True)  # it was killed before its first checkpoint
             trainer, folder = training.start(config, path, None)
-        training.train(trainer, folder)
+        if trainer.iteration < trainer.config.iterations:
+            training.train(trainer, folder)
         if not config.evaluation:
             return folder, []
         return folder, evaluate_run(folder, config.env, config.eval, torch.device("cpu"), again=False)
