@@ -16,7 +16,7 @@ from deimos.app import cli
 from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.interactions import Resolved
-from deimos.run import attackers
+from deimos.run import attack, attackers
 from deimos.run.attack import Explorer, argmax_director, attacker, learn_fear, names, quality, uniform_goals
 from deimos.run.attackers import q_fear, search
 from deimos.run.attackers.pooled import make_pool
@@ -192,9 +192,8 @@ def test_a_pool_attacks_policies_that_it_has_not_seen(tmp_path):
     """A network that has seen some policies crash crashes another; all meet the same network, which the file fixes."""
     config, pool = particle.Config(), tmp_path / "pool.pt"
     facts = make_pool([make_target(policy, config, SMALL, CPU) for policy in (stay, blind())], pool)
-    alone = [learn_fear(make_target(policy, config, SMALL, CPU), 300, own_goals=True)[1] for policy in (stay, blind())]
-    assert facts["adversary_interactions"] == sum(each["adversary_interactions"] for each in alone)
-    assert facts["adversary_crashes"] == alone[1]["adversary_crashes"] > 0
+    assert facts["adversary_steps"] == 2 * SMALL.adversary_steps
+    assert facts["adversary_crashes"] > 0
     assert facts["adversary_auroc"] > 0.7
 
     def slower(obs):
@@ -209,6 +208,41 @@ def test_a_pool_attacks_policies_that_it_has_not_seen(tmp_path):
     after = _identities(config, sizes)
     assert before[0] == after[0]
     assert before[1] != after[1]
+
+
+@pytest.mark.parametrize("own_goals", [True, False])
+def test_policies_of_a_pool_have_one_network(monkeypatch, own_goals):
+    """Each acts in the same worlds as alone; under uniform goals it meets the same, else the one network's choices."""
+    asked = []
+    monkeypatch.setattr(attack, "Explorer", lambda env, fear: asked.append(fear) or Explorer(env, fear))
+    config = particle.Config(goal_period=50)
+    targets = [make_target(policy, config, SMALL, CPU) for policy in (blind(), stay)]
+    fear, together = attack.collect(targets, 300, own_goals=own_goals)
+    alone = [attack.collect([target], 300, own_goals=own_goals)[1] for target in targets]
+    assert [each is fear for each in asked] == [True, True, False, False] * own_goals
+    assert len(together) == pytest.approx(sum(map(len, alone)), rel=0.2)
+    assert fear.fitted == own_goals
+    if not own_goals:
+        for name in ("env", "state", "goal", "next_goal", "crashed"):
+            assert torch.equal(getattr(together, name), torch.cat([getattr(part, name) for part in alone]))
+
+
+def test_attackers_of_one_evaluation_share_what_they_learn(monkeypatch):
+    """Those that want the same network have it trained once, and do to a policy what they do alone."""
+    trained = []
+    original = attack.fear_of
+
+    def count(targets, steps, *, own_goals):
+        trained.append((steps, own_goals))
+        return original(targets, steps, own_goals=own_goals)
+
+    monkeypatch.setattr(attack, "fear_of", count)
+    config, sizes = particle.Config(goal_period=50), replace(SMALL, attackers=("argmax", "argmax-long", "search"))
+    together = evaluate(blind(), config, sizes, CPU)
+    assert trained == [(300, False), (1200, True)]
+    alone = evaluate(blind(), config, replace(sizes, attackers=("search",)), CPU)[1]
+    assert repr(together[3]) == repr(alone)
+    assert len(trained) == 3
 
 
 def test_a_pool_is_made_and_used_by_commands(tmp_path, capsys):

@@ -116,6 +116,35 @@ def test_state_blind_goals_ignore_the_state():
     assert method("state-blind").memory > 0
 
 
+def test_state_blind_fear_learns_what_goals_alone_tell():
+    """What it learns from has no states in it, and yet it asks for large goals, which crash more often."""
+    rows, state, goal, options, draws = decisions(count=2000)
+    selector = history(method("state-blind").build(SPACES, 0), across)
+    assert (selector.memory._crash[: selector.memory.stored, :STATE] == 0).all()
+    assert (selector.memory._partners[: selector.memory.stored, :, :STATE] == 0).all()
+    assert (selector.memory._crash[: selector.memory.stored, STATE:] != 0).any(1).all()
+    chosen = selector.propose(rows, state, goal, options, draws)
+    assert chosen.goal[:, 0].abs().mean() > options[:, :, 0].abs().mean() + 0.15
+    assert chosen.percentile.mean() == pytest.approx(87.5, abs=1.5)
+
+
+def test_swapped_states_are_those_of_the_last_decisions():
+    """Every state that it may borrow was met with the goal beside it, by any world, in the decisions just before."""
+    selector, met = swapped.Config(candidates=20).build(SPACES, 0), []
+    original = selector.propose
+
+    def watch(rows, state, goal, candidates, draws):
+        met.append(torch.cat([state, goal], dim=1))
+        return original(rows, state, goal, candidates, draws)
+
+    selector.propose = watch
+    history(selector, across, rollouts=6)
+    borrowed = torch.cat([selector._state, selector._goal], dim=1)
+    assert len(met) == 6
+    # A call of learn sees the decisions up to it: the last one's are all that there is room for.
+    torch.testing.assert_close(borrowed.sort(dim=0).values, met[-1].sort(dim=0).values)
+
+
 def test_all_controls_of_a_director_have_memory():
     """Controls differ from the Director in one thing only, and crash memory is not it."""
     for name in (

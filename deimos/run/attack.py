@@ -7,8 +7,8 @@ go on until it has seen enough crashes would be stronger against unsafe policies
 
 import abc
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -51,6 +51,8 @@ class Target:
     """The file of ``pooled``."""
     progress: Callable[[float], None] = lambda share: None
     """Called now and then with the share of the preparation that is done."""
+    learnt: dict[tuple[int, bool], tuple[Fear, dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
+    """What ``learn_fear`` has given so far, by its arguments: several attackers ask for the same network."""
 
 
 @dataclass(frozen=True)
@@ -115,48 +117,65 @@ def argmax_director(env: Env, fear: Fear) -> director.Director:
 
 
 def learn_fear(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, dict[str, Any]]:
-    """Train a fear network on a finished policy; for the arguments see ``collect``.
+    """Train a fear network on a finished policy, once for all attackers; for the arguments see ``collect``.
 
     Returns:
         The network, and ``adversary_steps``, ``adversary_interactions``, ``adversary_crashes``, ``adversary_auroc`` (on
         every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``uninformed``: whether
         it has learnt nothing, for want of a crash or of a survival, so that goals are uniform.
     """
-    fear, data = collect(target, steps, own_goals=own_goals)
+    if (steps, own_goals) not in target.learnt:
+        target.learnt[steps, own_goals] = fear_of([target], steps, own_goals=own_goals)
+    return target.learnt[steps, own_goals]
+
+
+def fear_of(targets: Sequence[Target], steps: int, *, own_goals: bool) -> tuple[Fear, dict[str, Any]]:
+    """Train one fear network on policies of one environment; see ``learn_fear``, and ``collect`` for the arguments."""
+    fear, data = collect(targets, steps, own_goals=own_goals)
     fear.fit(learnt_from(data))
     fear.check()
     return fear, {
-        "adversary_steps": steps, "adversary_interactions": len(data), "adversary_crashes": int(data.crashed.sum()),
+        "adversary_steps": steps * len(targets), "adversary_interactions": len(data),
+        "adversary_crashes": int(data.crashed.sum()),
         "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)), "uninformed": not fear.fitted,
     }  # fmt: skip
 
 
-def collect(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, Resolved]:
-    """Let a policy act, to learn from what happens.
+def collect(targets: Sequence[Target], steps: int, *, own_goals: bool) -> tuple[Fear, Resolved]:
+    """Let policies act, each in worlds of its own, to learn from what happens.
 
     Args:
-        target: The policy.
+        targets: The policies, at least 1, of one environment.
         steps: Steps of every world, at least 1.
-        own_goals: Whether every other goal is a network's own argmax, as far as it has learnt by then. Uniform goals
+        own_goals: Whether every other goal is the network's own argmax, as far as it has learnt by then. Uniform goals
             show few crashes of a safe policy, its own choices alone no survivals. False for uniform goals alone.
 
     Returns:
         The network, which has learnt nothing yet without goals of its own, and all interactions.
     """
-    env = target.build(target.worlds, target.seed + 1)
-    fear = Fear(target.fear, env.state_dim, env.goal_dim, env.device, target.seed)
-    loop = GoalLoop(env, Explorer(env, fear) if own_goals else uniform_goals(env), window=steps)
-    pause = max(env.goal_period, steps // FITS)
+    first = targets[0]
+    envs = [target.build(target.worlds, target.seed + 1) for target in targets]
+    fear = Fear(first.fear, envs[0].state_dim, envs[0].goal_dim, envs[0].device, first.seed)
+    loops = [GoalLoop(env, Explorer(env, fear) if own_goals else uniform_goals(env), window=steps) for env in envs]
+    pause = max(envs[0].goal_period, steps // FITS)
     for t in range(1, steps + 1):
-        with torch.no_grad():
-            step = env.step(target.policy(env.obs))
-        loop.advance(step)
+        for target, env, loop in zip(targets, envs, loops, strict=True):
+            with torch.no_grad():
+                step = env.step(target.policy(env.obs))
+            loop.advance(step)
         if t % pause == 0:
-            target.progress(t / steps)
+            first.progress(t / steps)
             if own_goals:
-                fear.fit(learnt_from(loop.outcomes()), epochs=1)
-    env.check()
-    return fear, loop.outcomes()
+                fear.fit(learnt_from(_outcomes(loops)), epochs=1)
+    for env in envs:
+        env.check()
+    return fear, _outcomes(loops)
+
+
+def _outcomes(loops: Sequence[GoalLoop]) -> Resolved:
+    """All interactions of some loops, one loop after the other."""
+    found = [loop.outcomes() for loop in loops]
+    return Resolved(**{each.name: torch.cat([getattr(part, each.name) for part in found]) for each in fields(Resolved)})
 
 
 def learnt_from(data: Resolved) -> Resolved:

@@ -5,17 +5,14 @@ the very same attacker (after Uesato et al. 2019, who train an adversary on weak
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.goals.fear import Fear, FearConfig
-from deimos.goals.interactions import Resolved
-from deimos.run.attack import HELD_OUT, Attack, AttackerConfig, Target, argmax_director, collect, learnt_from, quality
+from deimos.run.attack import Attack, AttackerConfig, Target, argmax_director, fear_of
 from deimos.run.config import from_dict, to_dict
 from deimos.sim.env import Env
 
@@ -51,6 +48,9 @@ class Config(AttackerConfig):
 def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
     """Train a fear network on the interactions of many policies, each with the same number of steps.
 
+    Half of the goals are the network's own, one network's for all policies: so it learns what crashes most of them,
+    and where it fears wrongly.
+
     Args:
         targets: The policies, at least 1, of one environment.
         path: The file to write.
@@ -64,22 +64,10 @@ def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
     envs = [target.build(1, target.seed) for target in targets]
     if len({str(env.layout) for env in envs}) > 1:
         raise RunError("The policies observe different things, so they have no fear in common.")
-    found = [collect(target, target.steps, own_goals=True)[1] for target in targets]
-    data = Resolved(
-        **{field.name: torch.cat([getattr(part, field.name) for part in found]) for field in fields(Resolved)}
-    )
-    first, env = targets[0], envs[0]
-    fear = Fear(first.fear, env.state_dim, env.goal_dim, env.device, first.seed)
-    fear.fit(learnt_from(data))
-    fear.check()
-    if not fear.fitted:
+    fear, facts = fear_of(targets, targets[0].steps, own_goals=True)
+    if facts["uninformed"]:
         raise RunError("These policies never crashed, or always, so there is nothing to learn; pool others.")
-    facts = {
-        "adversary_steps": sum(target.steps for target in targets), "adversary_interactions": len(data),
-        "adversary_crashes": int(data.crashed.sum()),
-        "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)),
-    }  # fmt: skip
-    save_fear(path, fear, env, facts)
+    save_fear(path, fear, envs[0], facts)
     return facts
 
 
