@@ -36,7 +36,7 @@ def names(package: ModuleType) -> list[str]:
 
 
 def has(package: ModuleType, name: str) -> bool:
-    """Whether ``package`` has a plug-in of this name. Its own come first: reading all entry points takes milliseconds."""
+    """Whether ``package`` has a plug-in of this name; its own come first, for entry points take long to read."""
     return name in _own(package) or name in _here(package) or name in names(package)
 
 
