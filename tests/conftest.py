@@ -1,12 +1,15 @@
 """Fixtures of all tests: the devices that they run on, and the reference of every random draw."""
 
 import contextlib
+import sys
 from collections import namedtuple
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import torch
+
+from deimos import plugins
 
 torch.set_num_threads(1)
 
@@ -20,6 +23,20 @@ if find_spec("warp"):  # a base install, which .ci/nightly tests, has none
     wp.config.log_level = wp.LOG_WARNING
     if wp.get_cuda_device_count() > 0 and torch.cuda.is_available():  # a torch without CUDA cannot share its memory
         DEVICES.append("cuda:0")
+
+
+@pytest.fixture
+def new_plugins(monkeypatch):
+    """Forgets afterwards what was registered and imported meanwhile, so that no other test finds it."""
+    monkeypatch.setattr(plugins, "_registered", {})
+    before = dict(sys.modules)
+    for name in [name for name in before if name.startswith("reproduction.")]:
+        del sys.modules[name]  # whoever imports it registers it
+    yield
+    for name in set(sys.modules) - set(before):
+        if not name.startswith(("deimos", "torch", "scipy", "numpy", "warp")):
+            del sys.modules[name]
+    sys.modules.update({name: module for name, module in before.items() if name.startswith("reproduction.")})
 
 
 @pytest.fixture(params=DEVICES)

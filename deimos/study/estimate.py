@@ -92,14 +92,15 @@ def _measure(cell: Cell) -> Speed:
     with on_threads(config.threads or 1), one_stream(device):
         trainer = training.build(config, device)
         trainer.iterate()  # compiles
-        begin, done = time.monotonic(), 0
-        while not done or (done * config.ppo.num_steps < config.env.goal_period and time.monotonic() - begin < SECONDS):
+        clock = time.monotonic if device.type == "cuda" else time.process_time  # others may use the cores too
+        begin, done = clock(), 0
+        while not done or (done * config.ppo.num_steps < config.env.goal_period and clock() - begin < SECONDS):
             trainer.iterate()
             done += 1
-        rate = done * config.ppo.num_steps * config.num_envs / (time.monotonic() - begin)
+        rate = done * config.ppo.num_steps * config.num_envs / (clock() - begin)
         env = config.env.for_evaluation().resolved(device).build(config.eval.worlds, device, 0)
-        begin = time.monotonic()
+        begin = clock()
         play(env, trainer.ppo.actor, uniform_goals(env), PLAYED)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        return Speed(rate, PLAYED * config.eval.worlds / (time.monotonic() - begin))
+        return Speed(rate, PLAYED * config.eval.worlds / (clock() - begin))
