@@ -175,12 +175,11 @@ class Mostly:
         n = len(x)
         if n < LEAST:
             return None
-        share = float((np.sign(x) + 1).mean() / 2)
-        interval = scipy_stats.binomtest(round(share * n), n).proportion_ci(stats.LEVEL)
+        positive = round(n * (np.sign(x) + 1).mean() / 2)
         p_for, p_against = (min(1.0, 2 * float(p)) for p in self.p_values(x))
         return Finding(
-            effect="share of policies", interval=Interval(share, float(interval.low), float(interval.high)),
-            no_difference=0.5, p_for=p_for, p_against=p_against, detectable=detectable_share(n),
+            effect="share of policies", interval=stats.share(np.arange(n) < positive), no_difference=0.5,
+            p_for=p_for, p_against=p_against, detectable=detectable_share(n),
             n={name: len(own) for name, own in numbers.items()},
         )  # fmt: skip
 

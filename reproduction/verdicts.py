@@ -142,7 +142,7 @@ def _ordered(pairs: Sequence[tuple[int, int]]) -> list[Scene]:
     mixed = [LARGE ** (1 - 2 * (half.index(i) % 2)) if i in half else 1.0 for i in range(len(places))]
     for one in POPULATIONS if len(pairs) == 1 else ("normal", "rows"):
         found.append(Scene(f"all alike, {one}", None, [Policies(one)] * len(places)))
-        if half and set(places) == {0.0, 1.0}:  # of the larger side one half is better and one as much worse
+        if one == "normal" and half and set(places) == {0.0, 1.0}:  # of the larger side one half is better, one worse
             found.append(Scene(f"better and worse ones, {one}", None, [Policies(one, odds) for odds in mixed]))
         for holds, odds in ((True, LARGE), (False, 1 / LARGE)):
             found.append(Scene(f"P = 0.75, {one}", holds, [Policies(one, odds**x) for x in places]))

@@ -15,12 +15,11 @@ from reproduction import claim_tests, claims, lines, measures
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import Matters, Ordered
 from reproduction.claims import Claim, Clause, Finding, holm
-from reproduction.measures import ATTACKED, GAIN, NAIVE, Evidence, Place
+from reproduction.measures import ATTACKED, GAIN, NAIVE, PENALTIES, Evidence, Place
 from reproduction.thesis import ENVIRONMENTS, LEGGED_METHODS, PARTICLE_METHODS
 
 POINTS = 40
 BY_ID = {claim.id: claim for claim in CLAIMS}
-PENALTIES = ("penalty-10", "penalty-100")
 HERE = Place("directional", 100)
 
 
