@@ -279,7 +279,7 @@ def _key(name: str, n: int, scene: Scene, studies: int) -> str:
 
 
 def table(known: dict[str, list], studies: int) -> list[str]:
-    """Lines of Markdown: a row for every kind of test and number of policies that is complete, of its scenes the worst."""
+    """Lines of Markdown: a row for every kind of test and number of policies that is complete, its worst scenes."""
     lines = [
         "| test | in | n | holds, wrongly | does not hold, wrongly | worst case | holds, rightly | does not, rightly |",
         "|---|---|---|---|---|---|---|---|",
