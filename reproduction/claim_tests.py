@@ -41,8 +41,9 @@ class Ordered:
         return tuple(dict.fromkeys(name for pair in self.pairs for name in pair))
 
     def __str__(self) -> str:
-        first, second = (", ".join(dict.fromkeys(names)) for names in zip(*self.pairs, strict=True))
-        return f"{'spread of ' if self.spread else ''}{self.measure.name}: {first} > {second}"
+        first, second = (dict.fromkeys(names) for names in zip(*self.pairs, strict=True))
+        order = self.methods if first.keys() & second.keys() else (", ".join(first), ", ".join(second))
+        return f"{'spread of ' if self.spread else ''}{self.measure.name}: {' > '.join(order)}"
 
     def find(self, evidence: Evidence, place: Place) -> Finding | None:
         """See ``Test``."""

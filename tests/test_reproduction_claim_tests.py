@@ -45,6 +45,7 @@ def test_ordered_averages_over_pairs():
 def test_order_is_jonckheeres():
     """All pairs of an order are compared, the earlier with the later."""
     assert falling(["a", "b", "c"]) == (("a", "b"), ("a", "c"), ("b", "c"))
+    assert str(Ordered(SCORE, falling(["a", "b", "c"]))) == "score (Naive): a > b > c"
 
 
 def test_alike_names_the_smallest_ratio():
