@@ -24,13 +24,14 @@ from reproduction.measures import (
     LOSS,
     MOTION,
     NAIVE,
+    PENALTIES,
     RISK,
     SAFE_GAIN,
     SCORE,
     STANDING,
     UNSAFE_RELIEF,
     Measure,
-)  # fmt: skip
+)
 from reproduction.thesis import DIRECTORS, ENVIRONMENTS, LEGGED, LEGGED_METHODS, PARTICLE, PARTICLE_METHODS
 
 BASELINES = ("uniform", "rnd", "vds", "cl")
@@ -339,7 +340,7 @@ DISCUSSION = (
         *_say(395, "in a stairway than if the robot is on flat terrain", LEGGED, _mostly(RISK, DIRECTORS)),
     )),
     Claim("C36", "Penalties for crashing are detrimental.", (
-        *_say(284, "often detrimental to the policy", ENVIRONMENTS, _each(SCORE, "uniform", "penalty-10 penalty-100")),
+        *_say(284, "often detrimental to the policy", ENVIRONMENTS, _each(SCORE, "uniform", " ".join(PENALTIES))),
     )),
     Claim("C37", "The signs of the workshop paper's tables: on the bare robot Uniform and RND beat DEIMOS, which beats "
           "CL; with the arm DEIMOS beats Uniform, CL and RND in this order; argmax is the worst.", (

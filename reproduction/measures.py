@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats as scipy_stats
 
+from deimos.goals.methods import METHODS
 from deimos.study.data import Data
 from deimos.study.results import Row
 from deimos.study.stats import Array
 from reproduction.thesis import PARTICLE
 
 LITERAL = "-literal"  # the ending of methods that learn fear as the thesis does, without a crash memory
+PENALTIES = tuple(name for name in METHODS if name.startswith("penalty-"))
+"""Uniform goals with a crash penalty, by its sizes."""
 NEARLY_NONE = 1e-6  # crashes per step
 SAFE = 0.01  # crashes per interaction, below which a policy counts as safe
 

@@ -15,12 +15,11 @@ from reproduction import claim_tests, claims, lines, measures
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import Matters, Ordered
 from reproduction.claims import Claim, Clause, Finding, holm
-from reproduction.measures import ATTACKED, GAIN, NAIVE, Evidence, Place
+from reproduction.measures import ATTACKED, GAIN, NAIVE, PENALTIES, Evidence, Place
 from reproduction.thesis import ENVIRONMENTS, LEGGED_METHODS, PARTICLE_METHODS
 
 POINTS = 40
 BY_ID = {claim.id: claim for claim in CLAIMS}
-PENALTIES = ("penalty-10", "penalty-100")
 HERE = Place("directional", 100)
 
 
@@ -161,7 +160,7 @@ def test_verdict_goes_either_way(p_for, p_against, verdict):
 def test_line_of_a_claim_counts_clauses(alike):
     """It says how many of them hold, how many do not and how many are undecided; those without data do not count."""
     outcome = claims.test(claim_of((0.01, 1), (0.01, 1), (1, 0.01), (0.5, 1), None), alike)
-    assert outcome.line == "2 of 4 clauses hold; 1 does not hold, 1 undecided"
+    assert outcome.line == "2 of 4 clauses hold; 1 does not, 1 undecided"
     assert outcome.results[0].missing == ("p25",)
     assert len(outcome.without_data) == 1
     assert outcome.within("absolute").line == "no data"
@@ -172,9 +171,9 @@ def test_line_of_a_claim_counts_clauses(alike):
 def test_what_one_clause_decides_is_corrected(alike):
     """Where one clause is enough, p-values for it are those of Holm's rule; those against it stay as they are."""
     pair = [(0.03, 1), (1, 0.03)]
-    assert claims.test(claim_of(*pair), alike).line == "1 of 2 clauses holds; 1 does not hold"
+    assert claims.test(claim_of(*pair), alike).line == "1 of 2 clauses holds; 1 does not"
     outcome = claims.test(claim_of(*pair, one_is_enough=True), alike)
-    assert outcome.line == "0 of 2 clauses hold (one is enough); 1 does not hold, 1 undecided"
+    assert outcome.line == "0 of 2 clauses hold (one is enough); 1 does not, 1 undecided"
     assert [each.finding.p_for for each in outcome.results] == [0.06, 1.0]
 
 
