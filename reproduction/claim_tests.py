@@ -1,229 +1,414 @@
-"""The predeclared tests that claims are made of. Each gives a finding, or nothing where its data are missing."""
+"""The kinds of tests that clauses are made of. The unit is one trained policy; every test is one of permutation.
+
+``Ordered`` compares methods by P(X > Y), or by their spread; ``Alike`` asks within which ratio two are equivalent;
+``Mostly`` looks at each policy by itself; ``Highest`` at the best policies alone; ``Matters`` at how much hangs on the
+method; ``Best`` chooses the methods on half of the seeds and has another test on the others.
+"""
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy import optimize
 from scipy import stats as scipy_stats
 
-from deimos.study import stats
-from deimos.study.data import Data, Where
-from deimos.study.stats import Array, Interval
-from reproduction import significance
-from reproduction.claims import Finding
+from deimos.study import permutation, stats
+from deimos.study.permutation import Pairs
+from deimos.study.stats import POWER, Array, Interval
+from reproduction.claims import ALPHA, LEAST, Finding, Test
+from reproduction.measures import NAIVE, Evidence, Measure, Place
 
-LEAST = 3  # policies in a sample, below which nothing is tested
-PROBABILITY = 0.75  # smallest P(X > Y) of interest
-SPREAD = 2.0  # smallest ratio of spreads of interest
-FACTOR = 2.0  # crashes within this factor are equivalent
-REWARD_SHARE = 0.05  # rewards within this share of Uniform's median are equivalent
-STEPS = {"log_crashes": math.log(FACTOR)}
+SETTLED_RATIO = 1.5  # an equivalence is settled within this ratio,
+SETTLED_SHARE = 0.05  # or, of what has no ratios, within this share of the score's range from 0 to 1
+RESAMPLES = 2000
 
 
-def more(data: Data, where: Where, metric: str, a: str, b: str) -> list[Finding]:
-    """Policies of ``a`` have more of ``metric`` than those of ``b``: rank-sum test, P(a > b)."""
-    return compare(f"{_name(metric)}: {a} > {b}", where, data.sample(where, a, metric), data.sample(where, b, metric))
+@dataclass(frozen=True)
+class Ordered:
+    """The first method of each pair has more than the second: P(X > Y), averaged over the pairs."""
+
+    measure: Measure
+    pairs: tuple[tuple[str, str], ...]
+    """Names of methods; a pair counts where both have enough policies."""
+    spread: bool = False
+    """Whether the first varies more, instead of having more."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """See ``Test``."""
+        return tuple(dict.fromkeys(name for pair in self.pairs for name in pair))
+
+    def __str__(self) -> str:
+        first, second = (", ".join(dict.fromkeys(names)) for names in zip(*self.pairs, strict=True))
+        return f"{'spread of ' if self.spread else ''}{self.measure.name}: {first} > {second}"
+
+    def find(self, evidence: Evidence, place: Place) -> Finding | None:
+        """See ``Test``."""
+        samples = samples_of(self.measure, evidence, place, self.methods)
+        pairs = [pair for pair in self.pairs if set(pair) <= samples.keys()]
+        if not pairs:
+            return None
+        names = [name for name in samples if any(name in pair for pair in pairs)]
+        numbers = [(names.index(a), names.index(b)) for a, b in pairs]
+        values = [samples[name] for name in names]
+        more, less = (2 * float(p[0]) for p in self.p_values([x[None] for x in values], numbers))
+        if self.spread:
+            statistic, effect, at = permutation.log_spread_ratio(numbers), "ratio of spreads", 1.0
+        else:
+            statistic, effect, at = permutation.superiority(numbers), "P(X > Y)", 0.5
+        found = stats.bootstrap(values, statistic, resamples=RESAMPLES)
+        interval = _exp(found) if self.spread else found
+        sizes = [sum(len(samples[name]) for name in dict.fromkeys(side)) for side in zip(*pairs, strict=True)]
+        return Finding(
+            effect=effect, interval=interval, no_difference=at, p_for=min(1.0, more), p_against=min(1.0, less),
+            detectable=detectable_spread(*sizes) if self.spread else stats.detectable_probability(*sizes),
+            n={name: len(samples[name]) for name in names},
+        )  # fmt: skip
+
+    def p_values(self, samples: Sequence[Array], pairs: Pairs, permutations: int | None = None) -> tuple[Array, Array]:
+        """One-sided p-values for and against, of samples of shape (studies, n)."""
+        kind: permutation.Kind = "spread" if self.spread else "superiority"
+        return permutation.p_values(samples, pairs, kind, permutations=permutations)
 
 
-def compare(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
-    """Values of one sample are larger than those of another: rank-sum test, P(x > y)."""
-    if min(len(x), len(y)) < LEAST:
-        return []
-    interval = stats.probability_of_improvement([(x, y)])
-    p = significance.mann_whitney(x, y)
-    return [Finding(
-        what=what, where=where, effect="P(x > y)", interval=interval,
-        p_for=p if interval.estimate > 0.5 else 1.0, p_against=p if interval.estimate < 0.5 else 1.0,
-        detectable=lambda alpha: stats.detectable_probability(len(x), len(y), alpha), wanted=PROBABILITY,
-        n=(len(x), len(y)),
-    )]  # fmt: skip
+@dataclass(frozen=True)
+class Alike:
+    """Policies of two methods are alike: within which ratio, or difference, neither has more than the other.
 
+    The ratio r is the smallest for which both P(X > r Y) and P(Y > r X) are significantly below 1/2: two one-sided
+    tests [1]_ of level 5 %. It is what separates a policy of the one from one of the other, as often as not.
 
-def same(data: Data, where: Where, metric: str, a: str, b: str) -> list[Finding]:
-    """Policies of ``a`` and ``b`` are equivalent in ``metric``: two one-sided tests."""
-    x, y = data.sample(where, a, metric), data.sample(where, b, metric)
-    margin = STEPS.get(metric) or REWARD_SHARE * abs(_median(data.sample(where, "uniform", metric)))
-    return alike(f"{_name(metric)}: {a} = {b}", where, x, y, margin)
-
-
-def alike(what: str, where: Where | str, x: Array, y: Array, margin: float) -> list[Finding]:
-    """The means of two samples differ by less than a margin: two one-sided tests."""
-    if min(len(x), len(y)) < LEAST or not margin > 0:
-        return []
-    found = significance.equivalence(x, y, margin)
-    return [Finding(
-        what=what, where=where, effect=f"difference, 90 %, within {margin:.2g}",
-        interval=Interval(found.difference, found.low, found.high), p_for=found.p_same, p_against=found.p_other,
-        detectable=lambda alpha: significance.detectable_margin(x, y, alpha), wanted=margin, n=(len(x), len(y)),
-    )]  # fmt: skip
-
-
-def wider(data: Data, where: Where, metric: str, a: str, b: str) -> list[Finding]:
-    """Policies of ``a`` vary more in ``metric`` than those of ``b``: Brown and Forsythe's test."""
-    x, y = data.sample(where, a, metric), data.sample(where, b, metric)
-    return spread(f"spread of {_name(metric)}: {a} > {b}", where, x, y)
-
-
-def spread(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
-    """One sample varies more than another: Brown and Forsythe's test; the interval of the ratio only describes."""
-    if min(len(x), len(y)) < LEAST:
-        return []
-    log_ratio = stats.bootstrap([x, y], significance.log_iqr_ratio)
-    with np.errstate(over="ignore"):
-        interval = Interval(*np.exp([log_ratio.estimate, log_ratio.low, log_ratio.high]).tolist())
-    distance = [np.abs(z - np.median(z)).mean() for z in (x, y)]
-    p = significance.brown_forsythe(x, y)
-    return [Finding(
-        what=what, where=where, effect="ratio of IQRs", interval=interval,
-        p_for=p if distance[0] > distance[1] else 1.0, p_against=p if distance[0] < distance[1] else 1.0,
-        detectable=lambda alpha: significance.detectable_spread(len(x), len(y), round(alpha, 6)), wanted=SPREAD,
-        n=(len(x), len(y)),
-    )]  # fmt: skip
-
-
-def positive(what: str, where: Where | str, effect: str, x: Array, wanted: float, at: float = 0.0) -> list[Finding]:
-    """The mean of a sample is above ``at``: one-sample t test, with the interval by the bootstrap-t."""
-    if len(x) < LEAST:
-        return []
-    interval = stats.bootstrap_t(x)
-    if np.ptp(x) == 0.0:
-        p_for, p_against = float(x.mean() <= at), float(x.mean() >= at)
-    else:
-        p_for, p_against = (
-            float(min(1.0, 2 * scipy_stats.ttest_1samp(x, at, alternative=way).pvalue)) for way in ("greater", "less")
-        )
-    return [Finding(
-        what=what, where=where, effect=effect, interval=interval, p_for=p_for, p_against=p_against,
-        detectable=lambda alpha: significance.detectable_mean(x, alpha), wanted=wanted, n=(len(x),),
-    )]  # fmt: skip
-
-
-def paired_more(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
-    """Each policy has more in the first sample than in the second: Wilcoxon's signed ranks on the pairs."""
-    if len(x) < LEAST or len(x) != len(y):
-        return []
-    difference = x - y
-    moved = difference[difference != 0]
-    p = 1.0 if len(moved) == 0 else float(scipy_stats.wilcoxon(moved).pvalue)
-    middle = stats.bootstrap([difference], lambda z: np.median(z, axis=-1))
-    sign = np.sign(scipy_stats.rankdata(np.abs(moved)) @ np.sign(moved)) if len(moved) else 0.0
-    return [Finding(
-        what=what, where=where, effect="median log ratio", interval=middle,
-        p_for=p if sign > 0 else 1.0, p_against=p if sign < 0 else 1.0,
-        detectable=lambda alpha: _detectable_shift(difference, alpha), wanted=math.log(FACTOR), n=(len(x),),
-    )]  # fmt: skip
-
-
-def higher(what: str, where: Where | str, x: Array, y: Array) -> list[Finding]:
-    """The highest value of both samples is one of ``x``'s: how many of one lie above all of the other (Rosenbaum)."""
-    if min(len(x), len(y)) < LEAST:
-        return []
-    above = float((x > y.max()).sum() - (y > x.max()).sum())
-    return [Finding(
-        what=what, where=where, effect="policies above all of the other's (negative: the other's)",
-        interval=Interval(above, math.nan, math.nan), p_for=significance.rosenbaum(x, y),
-        p_against=significance.rosenbaum(y, x), wanted=PROBABILITY, n=(len(x), len(y)),
-        detectable=lambda alpha: significance.detectable_reach(len(x), len(y), alpha),
-    )]  # fmt: skip
-
-
-def mostly(what: str, where: Where | str, holds: NDArray[np.bool_]) -> list[Finding]:
-    """Something holds for most policies: exact sign test, with Clopper and Pearson's interval of the share."""
-    if len(holds) < LEAST:
-        return []
-    n, count = len(holds), int(holds.sum())
-    interval = scipy_stats.binomtest(count, n).proportion_ci(stats.LEVEL)
-    return [Finding(
-        what=what, where=where, effect="share of policies", interval=Interval(count / n, interval.low, interval.high),
-        p_for=float(scipy_stats.binom.sf(count - 1, n, 0.5)), p_against=float(scipy_stats.binom.cdf(count, n, 0.5)),
-        detectable=lambda alpha: 0.5 + significance.detectable_sign(n, alpha), wanted=PROBABILITY, n=(n,),
-    )]  # fmt: skip
-
-
-def resampled(
-    what: str, where: Where | str, effect: str, samples: list[Array], statistic: stats.Statistic, wanted: float
-) -> list[Finding]:
-    """A statistic of several samples is positive: its bootstrap distribution."""
-    if min((len(x) for x in samples), default=0) < LEAST:
-        return []
-    values = stats.distribution(samples, statistic)
-    low, high = np.quantile(values, [0.025, 0.975])
-    p_for, p_against = above_zero(values)
-    return [Finding(
-        what=what, where=where, effect=effect, interval=Interval(float(statistic(*samples)), float(low), float(high)),
-        p_for=p_for, p_against=p_against, detectable=by_error(float(values.std())), wanted=wanted,
-        n=tuple(len(x) for x in samples),
-    )]  # fmt: skip
-
-
-def above_zero(values: Array) -> tuple[float, float]:
-    """Two-sided p-values for and against a statistic above 0, from its bootstrap distribution."""
-    below, above = (((side * values <= 0).sum() + 1) / (len(values) + 1) for side in (1, -1))
-    return float(min(1.0, 2 * below)), float(min(1.0, 2 * above))
-
-
-def by_error(error: float) -> Callable[[float], float]:
-    """Smallest effect that is found with a power of 80 %, from its standard error, as if it were normal."""
-    power = scipy_stats.norm.ppf(stats.POWER)
-    return lambda alpha: float((scipy_stats.norm.ppf(1 - alpha / 2) + power) * error)
-
-
-def by_ranks(samples: Sequence[Array]) -> Callable[[float], float]:
-    """Smallest P(x > y) that a rank-sum test of the smallest two samples finds; a guide where no formula is known."""
-    n, m = sorted(map(len, samples))[:2]
-    return lambda alpha: stats.detectable_probability(n, m, alpha)
-
-
-def late_crashes(crashes: Array, share: float = 0.1) -> float:
-    """log(1 + crashes per 10^6 transitions) over the last part of a training, from those per 1000."""
-    return math.log1p(1000 * _tail(crashes, share).mean())
-
-
-def change(crashes: Array, share: float = 0.2) -> float:
-    """Change of log(1 + crashes per 10^6 transitions) from the first part of a training to the last."""
-    count = len(_tail(crashes, share))
-    return math.log1p(1000 * crashes[-count:].mean()) - math.log1p(1000 * crashes[:count].mean())
-
-
-def final_slope(crashes: Array, share: float = 0.2) -> float:
-    """Change of log(1 + crashes per 10^6 transitions) over the last part of a training, by a straight line."""
-    y = np.log1p(1000 * _tail(crashes, share))
-    return float(np.polyfit(np.linspace(0.0, 1.0, len(y)), y, 1)[0]) if len(y) > 1 else math.nan
-
-
-def of_curves(
-    data: Data, environment: str, method: str, number: Callable[[Array], float], column: str = "crashes_per_1000"
-) -> Array:
-    """A number of every training curve of a method."""
-    values = np.array([number(curve) for curve in data.curves(environment, method, column)], float)
-    return values[~np.isnan(values)]
-
-
-def both(data: Data, environment: str, period: int, method: str, metric: str) -> tuple[Array, Array]:
-    """A metric of the same policies under the Naive and under the Adversary, seed by seed."""
-    naive, attacked = (Where(environment, goals, period) for goals in ("naive", "adversary"))
-    seeds = sorted(set(data.seeds(naive, [method])) & set(data.seeds(attacked, [method])))
-    return data.sample(naive, method, metric, seeds), data.sample(attacked, method, metric, seeds)
-
-
-def _tail(values: Array, share: float) -> Array:
-    return values[-max(1, round(share * len(values))) :]
-
-
-def _median(x: Array) -> float:
-    return float(np.median(x)) if len(x) else math.nan
-
-
-def _name(metric: str) -> str:
-    return "crashes" if metric == "log_crashes" else metric
-
-
-def _detectable_shift(difference: Array, alpha: float) -> float:
-    """Of the signed-rank test, by the t test and the least relative efficiency that the former can have, 0.864.
-
-    Infinite where even n of n pairs that moved the same way are not significant.
+    References:
+        .. [1] Schuirmann, *A comparison of the two one-sided tests procedure and the power approach*,
+           J. Pharmacokinetics and Biopharmaceutics 15, 1987.
     """
-    if 2.0 ** (1 - np.count_nonzero(difference)) >= alpha:
+
+    measure: Measure
+    first: str
+    second: str
+    at_most: bool = False
+    """Whether only the first must not have more than the second."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """See ``Test``."""
+        return self.first, self.second
+
+    def __str__(self) -> str:
+        return f"{self.measure.name}: {self.first} {'at most' if self.at_most else '='} {self.second}"
+
+    @property
+    def settled(self) -> float:
+        """The margin within which it is settled, as a difference of what ``values`` gives."""
+        return math.log(SETTLED_RATIO) if self.measure.ratio else SETTLED_SHARE
+
+    def values(self, x: Array) -> Array:
+        """What differences are taken of."""
+        return np.log(x + self.measure.floor) if self.measure.ratio else x
+
+    def find(self, evidence: Evidence, place: Place) -> Finding | None:
+        """See ``Test``."""
+        samples = samples_of(self.measure, evidence, place, self.methods)
+        if len(samples) < 2:
+            return None
+        x, y = (self.values(samples[name]) for name in self.methods)
+        middle = float(np.median(x[:, None] - y))  # Hodges and Lehmann's estimate
+        interval = Interval(middle, -_furthest(y, x), _furthest(x, y))
+        within = max(interval.high, 0.0 if self.at_most else -interval.low)
+        p_for, p_against = (float(p[0]) for p in self.p_values(x[None], y[None]))
+        error = (interval.high - interval.low) / (2 * scipy_stats.norm.ppf(1 - ALPHA))
+        reach = float(scipy_stats.norm.ppf(1 - ALPHA) + scipy_stats.norm.ppf((1 + POWER) / 2)) * error
+        if self.measure.ratio:
+            effect, interval = "ratio", _exp(interval)
+            within, reach = (float(np.exp(min(z, 50.0))) for z in (max(within, 0.0), reach))
+        else:
+            effect, within = "difference", max(within, 0.0)
+        return Finding(
+            effect=effect, interval=interval, no_difference=1.0 if self.measure.ratio else 0.0, p_for=p_for,
+            p_against=p_against, detectable=reach, n={name: len(samples[name]) for name in self.methods},
+            equivalent_within=within,
+        )  # fmt: skip
+
+    def p_values(self, x: Array, y: Array, permutations: int | None = None) -> tuple[Array, Array]:
+        """p-values for and against of being settled, of ``values`` of shape (studies, n)."""
+        above, below = _sides(x, y, self.settled, permutations)
+        if self.at_most:
+            return below, above
+        back_above, back_below = _sides(y, x, self.settled, permutations)
+        return np.maximum(below, back_below), np.minimum(1.0, 2 * np.minimum(above, back_above))
+
+
+def _sides(x: Array, y: Array, margin: float, permutations: int | None = None) -> tuple[Array, Array]:
+    """p-values of x being above y + margin as often as not, and below."""
+    return permutation.p_values([x, y + margin], [(0, 1)], "superiority", permutations=permutations)
+
+
+def _furthest(x: Array, y: Array) -> float:
+    """Smallest shift d, to 1 %, for which P(x > y + d) is significantly below 1/2, at 5 % on this side."""
+    low, high = float(x.min() - y.max()) - 0.01, float(x.max() - y.min()) + 0.01
+    if _sides(x, y, high)[1] > ALPHA:
         return math.inf
-    return significance.detectable_mean(difference, alpha) / math.sqrt(0.864)
+    while high - low > 0.01:
+        middle = (low + high) / 2
+        low, high = (low, middle) if _sides(x, y, middle)[1] <= ALPHA else (middle, high)
+    return high
+
+
+@dataclass(frozen=True)
+class Mostly:
+    """Most policies of some methods have a positive number: the exact sign test. Policies at 0 count half."""
+
+    measure: Measure
+    methods: tuple[str, ...]
+    """See ``Test``; their policies are taken together."""
+
+    def __str__(self) -> str:
+        return f"{self.measure.name}: for most policies of {', '.join(self.methods)}"
+
+    def find(self, evidence: Evidence, place: Place) -> Finding | None:
+        """See ``Test``."""
+        numbers = {name: np.array([*self.measure(evidence, place, name).values()]) for name in self.methods}
+        numbers = {name: x for name, x in numbers.items() if len(x)}
+        x = np.concatenate([*numbers.values(), np.empty(0)])
+        n = len(x)
+        if n < LEAST:
+            return None
+        share = float((np.sign(x) + 1).mean() / 2)
+        interval = scipy_stats.binomtest(round(share * n), n).proportion_ci(stats.LEVEL)
+        p_for, p_against = (min(1.0, 2 * float(p)) for p in self.p_values(x))
+        return Finding(
+            effect="share of policies", interval=Interval(share, float(interval.low), float(interval.high)),
+            no_difference=0.5, p_for=p_for, p_against=p_against, detectable=detectable_share(n),
+            n={name: len(own) for name, own in numbers.items()},
+        )  # fmt: skip
+
+    def p_values(self, x: Array) -> tuple[Array, Array]:
+        """One-sided p-values for and against, of samples of shape (..., n)."""
+        up, down = (x > 0).sum(axis=-1), (x < 0).sum(axis=-1)
+        coin = scipy_stats.binom(up + down, 0.5)
+        return coin.sf(up - 1), coin.sf(down - 1)
+
+
+@dataclass(frozen=True)
+class Highest:
+    """The highest value of all belongs to a method: how many of its policies lie above all of another's [1]_.
+
+    It must reach above each of the others; one that reaches above it, by Bonferroni's rule, is enough against it. The
+    number is that of its policies above all others', or, negative, of the others' above all of its own.
+
+    References:
+        .. [1] Rosenbaum, *Tables for a Nonparametric Test of Location*, Annals of Mathematical Statistics 25, 1954.
+    """
+
+    measure: Measure
+    method: str
+    rivals: tuple[str, ...]
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """See ``Test``."""
+        return (self.method, *self.rivals)
+
+    def __str__(self) -> str:
+        return f"highest {self.measure.name}: {self.method}"
+
+    def find(self, evidence: Evidence, place: Place) -> Finding | None:
+        """See ``Test``."""
+        samples = samples_of(self.measure, evidence, place, self.methods)
+        own = samples.pop(self.method, None)
+        if own is None or not samples:
+            return None
+        rivals = list(samples.values())
+        p_for, p_against = (min(1.0, 2 * float(p[0])) for p in self.p_values(own[None], [x[None] for x in rivals]))
+        top = max(float(x.max()) for x in rivals)
+        above = (own > top).sum() or -max((x > own.max()).sum() for x in rivals)
+        enough = next(
+            (k for k in range(1, len(own) + 1) if 2 * _on_top(len(own), len(rivals[0]), k) <= ALPHA), math.inf
+        )
+        return Finding(
+            effect="policies above all others'", interval=Interval(float(above), math.nan, math.nan), no_difference=0.0,
+            p_for=p_for, p_against=p_against, detectable=float(enough),
+            n={name: len(x) for name, x in {self.method: own, **samples}.items()},
+        )  # fmt: skip
+
+    def p_values(self, own: Array, rivals: Sequence[Array]) -> tuple[Array, Array]:
+        """One-sided p-values for and against, of samples of shape (studies, n)."""
+        ahead = [_rosenbaum(own, x) for x in rivals]
+        behind = [_rosenbaum(x, own) for x in rivals]
+        return np.max(ahead, axis=0), np.minimum(1.0, len(rivals) * np.min(behind, axis=0))
+
+
+def _rosenbaum(x: Array, y: Array) -> Array:
+    count = (x > y.max(axis=-1, keepdims=True)).sum(axis=-1)
+    return _on_top(x.shape[-1], y.shape[-1], count)
+
+
+def _on_top(n: int, m: int, count: Array | int) -> Array:
+    """Probability that the ``count`` highest of n + m exchangeable values are all of the n."""
+    return scipy_stats.hypergeom(n + m, n, count).pmf(count)
+
+
+@dataclass(frozen=True)
+class Matters:
+    """More hangs on the method in one measure than in another.
+
+    It is the share of the variance of ranks that lies between methods: omega^2 [1]_, not biased by the number of
+    methods, of the policies that have both. Under the null hypothesis every policy might as well have its two ranks
+    exchanged.
+
+    References:
+        .. [1] Hays, *Statistics for Psychologists*, 1963, chapter 12.
+    """
+
+    more: Measure
+    less: Measure
+    methods: tuple[str, ...]
+    """See ``Test``."""
+
+    def __str__(self) -> str:
+        return f"variance between methods: {self.more.name} > {self.less.name}"
+
+    def find(self, evidence: Evidence, place: Place) -> Finding | None:
+        """See ``Test``."""
+        both: dict[str, Array] = {}
+        for name in self.methods:
+            a, b = (measure(evidence, place, name) for measure in (self.more, self.less))
+            seeds = sorted(a.keys() & b.keys())
+            if len(seeds) >= LEAST:
+                both[name] = np.array([[a[seed] for seed in seeds], [b[seed] for seed in seeds]])
+        if len(both) < 3:
+            return None
+        sizes = [x.shape[1] for x in both.values()]
+        values = np.concatenate(list(both.values()), axis=1)
+        p_for, p_against = (min(1.0, 2 * float(p[0])) for p in self.p_values(values[None], sizes))
+        ranks = scipy_stats.rankdata(values, axis=-1)
+        interval, error = self._interval(ranks, sizes)
+        reach = float(scipy_stats.norm.ppf(1 - ALPHA / 2) + scipy_stats.norm.ppf(POWER)) * error
+        return Finding(
+            effect="difference in omega^2", interval=interval, no_difference=0.0, p_for=p_for, p_against=p_against,
+            detectable=reach, n=dict(zip(both, sizes, strict=True)),
+        )  # fmt: skip
+
+    def p_values(self, values: Array, sizes: Sequence[int], permutations: int = 999) -> tuple[Array, Array]:
+        """One-sided p-values for and against, of values of shape (studies, 2, policies)."""
+        ranks = scipy_stats.rankdata(values, axis=-1)
+        swapped = np.random.default_rng(0).random((permutations + 1, 1, values.shape[-1])) < 0.5
+        swapped[0] = False
+        found = []
+        for own in ranks:
+            mixed = np.where(swapped, own[::-1], own)
+            share = omega_squared(mixed, sizes)
+            difference = share[:, 0] - share[:, 1]
+            found.append([(side * difference >= side * difference[0] - 1e-9).mean() for side in (1, -1)])
+        more, less = np.array(found).T
+        return more, less
+
+    def _interval(self, ranks: Array, sizes: Sequence[int]) -> tuple[Interval, float]:
+        ends = np.cumsum(sizes)
+        drawn = [np.random.default_rng(i).integers(end - n, end, (RESAMPLES, n))
+                 for i, (end, n) in enumerate(zip(ends, sizes, strict=True))]  # fmt: skip
+        share = omega_squared(ranks[:, np.concatenate(drawn, axis=1)], sizes)
+        difference = share[0] - share[1]
+        low, high = np.quantile(difference, stats.ENDS)
+        own = omega_squared(ranks, sizes)
+        return Interval(float(own[0] - own[1]), float(low), float(high)), float(difference.std())
+
+
+def omega_squared(values: Array, sizes: Sequence[int]) -> Array:
+    """Unbiased share of the variance between groups that lie one after another along the last axis; over the others."""
+    groups = np.split(values, np.cumsum(sizes)[:-1], axis=-1)
+    total = ((values - values.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)
+    within = sum(((x - x.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1) for x in groups)
+    error = within / (values.shape[-1] - len(groups))
+    return np.where(
+        total > 0, (total - within - (len(groups) - 1) * error) / np.where(total > 0, total + error, 1), 0.0
+    )
+
+
+@dataclass(frozen=True)
+class Best:
+    """A test between the best of some methods and the best of others.
+
+    They are those with the lowest mean on every other seed, and tested on the rest.
+    """
+
+    measure: Measure
+    directors: tuple[str, ...]
+    rivals: tuple[str, ...]
+    then: Callable[[str, str], Test]
+    """Of the two that were chosen."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """See ``Test``."""
+        return self.directors + self.rivals
+
+    def __str__(self) -> str:
+        return f"on other seeds: {self.then('the best Director', 'the best baseline')}"
+
+    def find(self, evidence: Evidence, place: Place) -> Finding | None:
+        """See ``Test``."""
+        numbers = {name: self.measure(evidence, place, name) for name in self.methods}
+        seeds = sorted({seed for own in numbers.values() for seed in own})
+        choosing, testing = (set(seeds[start::2]) for start in (0, 1))
+        chosen = []
+        for group in (self.directors, self.rivals):
+            own = {name: [numbers[name][seed] for seed in choosing & numbers[name].keys()] for name in group}
+            means = {name: float(np.mean(x)) for name, x in own.items() if len(x) >= LEAST}
+            if not means:
+                return None
+            chosen.append(min(means, key=means.__getitem__))
+        found = self.then(*chosen).find(evidence.only(testing), place)
+        return None if found is None else replace(found, chosen=f"{chosen[0]} against {chosen[1]}")
+
+
+def samples_of(measure: Measure, evidence: Evidence, place: Place, methods: Sequence[str]) -> dict[str, Array]:
+    """The samples of the methods that have enough policies."""
+    found = {name: np.array([*measure(evidence, place, name).values()]) for name in methods}
+    return {name: x for name, x in found.items() if len(x) >= LEAST}
+
+
+def _exp(interval: Interval) -> Interval:
+    with np.errstate(over="ignore"):
+        return Interval(*np.exp([interval.estimate, interval.low, interval.high]).tolist())
+
+
+@lru_cache
+def detectable_share(n: int) -> float:
+    """Smallest share above 1/2 that the two-sided sign test finds with a power of 80 %.
+
+    Infinite where even n of n is not significant.
+    """
+    enough = [count for count in range(n) if 2 * scipy_stats.binom.cdf(count, n, 0.5) <= ALPHA]
+    return 1 - float(scipy_stats.beta.ppf(1 - POWER, enough[-1] + 1, n - enough[-1])) if enough else math.inf
+
+
+@lru_cache
+def detectable_spread(n: int, m: int, studies: int = 400) -> float:
+    """Smallest ratio of standard deviations of normal samples that is found with a power of 80 %, simulated; to 3 %.
+
+    Infinite where a ratio of 100 is not found.
+    """
+    x, y = (np.random.default_rng(i).normal(size=(studies, k)) for i, k in enumerate((n, m)))
+    test = Ordered(NAIVE, (("x", "y"),), spread=True)
+
+    def lacking(log_ratio: float) -> float:
+        found, _ = test.p_values([math.exp(log_ratio) * x, y], [(0, 1)], permutations=199)
+        return POWER - float((2 * found <= ALPHA).mean())
+
+    top = math.log(100)
+    if lacking(top) > 0:
+        return math.inf
+    return math.exp(optimize.bisect(lacking, 0.0, top, xtol=0.03))
+
+
+def versus(first: Sequence[str], second: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """All pairs of two groups of methods."""
+    return tuple((a, b) for a in first for b in second if a != b)
+
+
+def falling(methods: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """All pairs of an order, of which the first has more: Jonckheere and Terpstra's."""
+    return tuple((a, b) for i, a in enumerate(methods) for b in methods[i + 1 :])

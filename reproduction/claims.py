@@ -1,161 +1,192 @@
-"""The outcome of a claim: findings, Holm's correction, verdicts."""
+"""Claims of the thesis as lists of clauses, and their verdicts, which can go either way.
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+A clause is one comparison with one number. It *holds* where a test rejects its opposite, *does not hold* where it
+rejects the clause itself, and is *undecided* otherwise. Either verdict is wrong in at most 5 % of all studies, as
+``python -m reproduction.verdicts`` measures. Nothing is corrected over clauses, but where one of several is enough.
+"""
 
-from deimos.study.data import Data, Where
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
 from deimos.study.stats import Interval
-from reproduction.significance import holm
+from reproduction.measures import Evidence, Place
 
 ALPHA = 0.05
-VERDICTS = ("supported", "contradicted", "undecided", "underpowered", "not testable")
-Verdict = Literal["supported", "contradicted", "undecided", "underpowered", "not testable"]
+LEAST = 3  # policies of a method, below which it takes no part
+Verdict = Literal["holds", "does not hold", "undecided"]
+VERDICTS: tuple[Verdict, ...] = ("holds", "does not hold", "undecided")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One test of a claim."""
+    """What the test of a clause found in one place."""
 
-    what: str
-    """What the claim says here, in symbols."""
-    where: Where | str
-    """The evaluation or environment."""
     effect: str
-    """Name of the effect that is measured."""
+    """Name of the number that is measured; the more of it, the more does the clause hold."""
     interval: Interval
-    """The effect with its 95 % interval."""
+    """The number with its 95 % interval; of an equivalence 90 %, that of two one-sided tests."""
+    no_difference: float
+    """The number where nothing differs."""
     p_for: float
-    """p-value against the claim being false: small supports it."""
+    """p-value against the clause being false: at most 5 % where it holds."""
     p_against: float
-    """p-value against the claim being true: small contradicts it."""
-    detectable: Callable[[float], float]
-    """Smallest effect that the test finds with a power of 80 %, by the level of the test."""
-    wanted: float
-    """Smallest effect of interest, declared beforehand: with less than it detectable, a miss says something."""
-    n: tuple[int, ...]
-    """Policies in every sample."""
-    required: bool = True
-    """Whether the claim is supported only if this is; otherwise it can only contradict it."""
+    """p-value against the clause being true: at most 5 % where it does not hold."""
+    detectable: float
+    """Smallest effect that the test finds with a power of 80 %; infinite where it can find none."""
+    n: Mapping[str, int]
+    """Policies of every method."""
+    equivalent_within: float | None = None
+    """Of an equivalence: the smallest ratio, or difference, within which it holds at 95 %."""
+    chosen: str = ""
+    """Of a choice made on other seeds: what was chosen."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """What it says."""
+        if self.p_for <= ALPHA:
+            return "holds"
+        return "does not hold" if self.p_against <= ALPHA else "undecided"
+
+
+class Test(Protocol):
+    """How a clause is tested."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Those that take part."""
+
+    def __str__(self) -> str:
+        """What it compares, in words."""
+
+    def find(self, evidence: Evidence, place: Place) -> Finding | None:
+        """What it finds; ``None`` where there are no data for it."""
 
 
 @dataclass(frozen=True)
-class Assessed:
-    """A finding with what it says after the correction for the number of tests of its claim."""
+class Clause:
+    """One comparison that a claim makes."""
 
-    finding: Finding
-    """The test."""
-    verdict: Verdict
-    """What it says."""
-    p: float
-    """The smaller of its two p-values, corrected as ``assess`` says."""
-    detectable: float
-    """Smallest effect that it could have found with a power of 80 %, at the corrected level."""
+    line: int
+    """Of the thesis's text, where it says so; 0 where it is the workshop paper's."""
+    words: str
+    """Some of its words there, by which ``python -m reproduction.lines`` finds the line again."""
+    test: Test
+    """How it is tested."""
+    environments: tuple[str, ...]
+    """Where it is said to hold."""
+    periods: tuple[int, ...] = ()
+    """The T [steps] at which it is; empty for every one."""
+
+    @property
+    def text(self) -> str:
+        """What it says, as it is tested."""
+        return str(self.test)
+
+    def places(self, evidence: Evidence) -> list[Place]:
+        """Where it can be tested."""
+        found = [place for name in self.environments for place in evidence.places(name)]
+        return [place for place in found if not self.periods or place.period in self.periods]
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the thesis and its predeclared test."""
+    """What the thesis says about one thing."""
 
     id: str
-    """C1 to C32."""
+    """C1 to C37."""
     text: str
-    """What the thesis says."""
-    environments: tuple[str, ...]
-    """Where it says so."""
-    test: str
-    """How it is tested, for the reader."""
-    findings: Callable[[Data, str], list[Finding]]
-    """Makes the tests in one environment; those whose data are missing are left out."""
-    planned: int
-    """Required tests when every method has results everywhere: with fewer, the verdict holds only in part."""
-    combine: Literal["all", "any"] = "all"
-    """Whether every required finding must support the claim, or one is enough."""
+    """In short."""
+    clauses: tuple[Clause, ...]
+    """What it says, comparison by comparison."""
+    one_is_enough: bool = False
+    """Whether it says that some of its clauses hold, not which: p-values for them are corrected by Holm's rule."""
     note: str = ""
     """What is not tested, and why."""
 
 
 @dataclass(frozen=True)
+class Result:
+    """A clause in one place."""
+
+    clause: Clause
+    """The clause."""
+    place: Place
+    """Where."""
+    finding: Finding
+    """What was found."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """What it says."""
+        return self.finding.verdict
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Methods that the clause speaks of and that have too few policies; none where it chose among them."""
+        if self.finding.chosen:
+            return ()
+        return tuple(name for name in self.clause.test.methods if name not in self.finding.n)
+
+
+@dataclass(frozen=True)
 class Outcome:
-    """The outcome of a claim."""
+    """A claim after its test."""
 
     claim: Claim
     """The claim."""
-    verdict: Verdict
-    """What its findings say together."""
-    assessed: list[Assessed] = field(default_factory=list)
-    """Its findings."""
-    missing: tuple[str, ...] = ()
-    """Environments that it speaks of and that have no data for it."""
+    results: tuple[Result, ...]
+    """Of every clause that there are data for, wherever it can be tested."""
+    without_data: tuple[Clause, ...] = ()
+    """Clauses that there are no data for anywhere."""
 
     @property
-    def made(self) -> int:
-        """Required tests that there were data for."""
-        return sum(each.finding.required for each in self.assessed)
+    def counts(self) -> Counter[Verdict]:
+        """How many of its results say what."""
+        return Counter(each.verdict for each in self.results)
 
     @property
-    def in_part(self) -> bool:
-        """Whether some of the claim's tests could not be made."""
-        return 0 < self.made < self.claim.planned
+    def line(self) -> str:
+        """How many of its clauses hold, in words."""
+        if not self.results:
+            return "no data"
+        rest = ", ".join(f"{self.counts[name]} {name}" for name in VERDICTS[1:] if self.counts[name])
+        enough = " (one is enough)" if self.claim.one_is_enough else ""
+        number = len(self.results)
+        told = f"{self.counts['holds']} of {number} clause{'s' * (number > 1)} hold{'s' * (self.counts['holds'] == 1)}"
+        return f"{told}{enough}" + (f"; {rest}" if rest else "")
+
+    def within(self, environment: str) -> "Outcome":
+        """Its results in one environment."""
+        return replace(self, results=tuple(each for each in self.results if each.place.environment == environment))
 
 
-def test(claim: Claim, data: Data) -> Outcome:
-    """Test a claim wherever there are data for it."""
-    found = {environment: claim.findings(data, environment) for environment in claim.environments}
-    findings = [finding for part in found.values() for finding in part]
-    missing = tuple(environment for environment, part in found.items() if not part)
-    assessed = assess(findings, claim.combine)
-    return Outcome(claim, combined(assessed, claim.combine, claim.planned), assessed, missing)
+def test(claim: Claim, evidence: Evidence) -> Outcome:
+    """Test every clause of a claim wherever there are data for it."""
+    results, without = [], []
+    for clause in claim.clauses:
+        found = [(place, clause.test.find(evidence, place)) for place in clause.places(evidence)]
+        own = [Result(clause, place, finding) for place, finding in found if finding is not None]
+        results += own
+        if not own:
+            without.append(clause)
+    if claim.one_is_enough:
+        corrected = holm([each.finding.p_for for each in results])
+        results = [
+            replace(each, finding=replace(each.finding, p_for=p)) for each, p in zip(results, corrected, strict=True)
+        ]
+    return Outcome(claim, tuple(results), tuple(without))
 
 
-def assess(findings: Sequence[Finding], combine: Literal["all", "any"] = "all", alpha: float = ALPHA) -> list[Assessed]:
-    """Say what each finding of a claim means, with p-values corrected so that the claim's verdicts have level alpha.
-
-    A claim that needs all its findings is supported only if every test rejects the opposite at level alpha. Such an
-    intersection-union test has level alpha as it is [1]_. One of its findings is enough to contradict it: there the
-    p-values are corrected by Holm's rule. Where one finding is enough to support, it is the other way round.
-
-    A finding that neither supports nor contradicts is ``undecided`` if its test would probably have found the
-    smallest effect of interest at the stricter of the two levels, and ``underpowered`` if not.
+def holm(p: Sequence[float]) -> list[float]:
+    """p-values adjusted for testing all of them, by Holm's step-down rule [1]_.
 
     References:
-        .. [1] Berger, *Multiparameter Hypothesis Testing and Acceptance Sampling*, Technometrics 24, 1982.
+        .. [1] Holm, *A Simple Sequentially Rejective Multiple Test Procedure*, Scand. J. Statistics 6, 1979.
     """
-    if not findings:
-        return []
-    for_claim, against = ([getattr(f, name) for f in findings] for name in ("p_for", "p_against"))
-    if combine == "all":
-        against = holm(against).tolist()
-    else:
-        for_claim = holm(for_claim).tolist()
-    assessed = []
-    for finding, p_for, p_against in zip(findings, for_claim, against, strict=True):
-        detectable = finding.detectable(alpha / len(findings))
-        verdict: Verdict = "undecided" if detectable <= finding.wanted else "underpowered"
-        if p_for < alpha:
-            verdict = "supported"
-        elif p_against < alpha:
-            verdict = "contradicted"
-        assessed.append(Assessed(finding, verdict, float(min(p_for, p_against)), detectable))
-    return assessed
-
-
-def combined(assessed: Sequence[Assessed], how: Literal["all", "any"] = "all", planned: int = 1) -> Verdict:
-    """The verdict over all findings of a claim.
-
-    With ``all``, one contradicted finding contradicts the claim, and every required one must support it. With
-    ``any``, one supported finding is enough, and the claim is contradicted only if all that were planned are.
-    """
-    required = [each.verdict for each in assessed if each.finding.required]
-    verdicts = [each.verdict for each in assessed]
-    if not required:
-        return "contradicted" if "contradicted" in verdicts else "not testable"
-    if how == "any":
-        decided: Verdict | None = "supported" if "supported" in required else None
-        every = len(required) >= planned and set(required) == {"contradicted"}
-        decided = decided or ("contradicted" if every else None)
-    else:
-        decided = "contradicted" if "contradicted" in verdicts else None
-        decided = decided or ("supported" if set(required) == {"supported"} else None)
-    open_ones = {verdict for verdict in required if verdict in ("undecided", "underpowered")}
-    return decided or ("underpowered" if "underpowered" in open_ones else "undecided")
+    adjusted, largest = [0.0] * len(p), 0.0
+    for rank, i in enumerate(sorted(range(len(p)), key=p.__getitem__)):
+        largest = max(largest, min(1.0, (len(p) - rank) * p[i]))
+        adjusted[i] = largest
+    return adjusted

@@ -9,12 +9,11 @@ import numpy as np
 from scipy import integrate
 from scipy import stats as scipy_stats
 
-from deimos.study import stats
+from deimos.study import permutation, stats
 from deimos.study.stats import Array, Interval
-from reproduction import significance
 
 LOGNORMAL_SIGMA = 1.0
-SPREAD = 2.0  # true ratio of the interquartile ranges, and of the standard deviations of the normal populations
+SPREAD = 2.0  # true ratio of the mean differences, and of the standard deviations of the normal populations
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,7 @@ def simulate(n: int = 10, populations: int = 2000, resamples: int = 2000, seed: 
         resamples: Bootstrap resamples of each.
         seed: Of it all.
     """
+    spread = permutation.log_spread_ratio([(0, 1)])
     kinds: list[tuple[str, str, Callable[[Array, Array, int], Interval], Callable[[str], float]]] = [
         ("IQM", "percentile", lambda x, y, s: stats.bootstrap([x], stats.iqm, resamples=resamples, seed=s), _true_iqm),
         ("median", "percentile", lambda x, y, s: stats.bootstrap([x], _median, resamples=resamples, seed=s),
@@ -47,8 +47,8 @@ def simulate(n: int = 10, populations: int = 2000, resamples: int = 2000, seed: 
         ("mean", "percentile", lambda x, y, s: stats.bootstrap([x], _mean, resamples=resamples, seed=s), _true_mean),
         ("mean", "BCa", lambda x, y, s: _bca(x, resamples, s), _true_mean),
         ("mean", "bootstrap-t", lambda x, y, s: stats.bootstrap_t(x, resamples=resamples, seed=s), _true_mean),
-        ("ratio of IQRs", "percentile of the logarithm",
-         lambda x, y, s: stats.bootstrap([SPREAD * x, y], significance.log_iqr_ratio, resamples=resamples, seed=s),
+        ("ratio of spreads", "percentile of the logarithm",
+         lambda x, y, s: stats.bootstrap([SPREAD * x, y], spread, resamples=resamples, seed=s),
          lambda kind: math.log(SPREAD)),
         ("P(X > Y)", "percentile", lambda x, y, s: stats.probability_of_improvement(
             [(x, y)], resamples=resamples, seed=s), lambda kind: 0.5),

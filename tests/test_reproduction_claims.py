@@ -1,23 +1,27 @@
-"""Claims: findings on populations whose truth is known, Holm's correction, and what a verdict means."""
+"""Claims: clauses on populations whose truth is known, what a verdict means, and what is read from a study."""
 
 import math
 
 import numpy as np
 import pytest
-from scipy import stats as scipy_stats
 
 from deimos.checks import RunError
-from deimos.study import stats
+from deimos.goals.methods import method as method_named
+from deimos.study import permutation
 from deimos.study.data import Data, Where
 from deimos.study.results import RESULT_COLUMNS, Results
 from deimos.study.stats import Interval
-from reproduction import claim_custom, claim_tests, claims, thesis
+from reproduction import claim_tests, claims, lines, measures
 from reproduction.claim_list import CLAIMS
-from reproduction.claims import Claim, Finding
+from reproduction.claim_tests import Matters, Ordered
+from reproduction.claims import Claim, Clause, Finding, holm
+from reproduction.measures import ATTACKED, GAIN, NAIVE, Evidence, Place
 from reproduction.thesis import ENVIRONMENTS, LEGGED_METHODS, PARTICLE_METHODS
 
 POINTS = 40
 BY_ID = {claim.id: claim for claim in CLAIMS}
+PENALTIES = ("penalty-10", "penalty-100")
+HERE = Place("directional", 100)
 
 
 def level(environment, method, goals, period):
@@ -33,7 +37,7 @@ def population(seeds=10, environments=ENVIRONMENTS, level=level, spread=0.5, met
     rows, lines = [], []
     for environment in environments:
         legged = environment.startswith("quad")
-        for method in methods or (LEGGED_METHODS if legged else PARTICLE_METHODS):
+        for method in methods or (*(LEGGED_METHODS if legged else PARTICLE_METHODS), *PENALTIES):
             for seed in range(seeds):
                 key = {
                     "environment": environment, "method": method, "seed": seed, "setting": environment,
@@ -44,7 +48,7 @@ def population(seeds=10, environments=ENVIRONMENTS, level=level, spread=0.5, met
                         crashes = int(np.exp(rng.normal(level(environment, method, goals, period), spread)))
                         rows.append(empty | key | {
                             "goals": goals, "goal_period": period, "worlds": 2000, "steps": 2000, "crashes": crashes,
-                            "crashes_per_1000": crashes / 4000, "crash_rate": crashes / 40_000,
+                            "crashes_per_1000": crashes / 4000, "crash_rate": min(1.0, crashes / 40_000),
                             "reward": rng.normal(0.8, 0.01), "score": rng.normal(0.8, 0.02),
                             "weak_adversary": False if goals == "adversary" else None, "fps": rng.normal(3e5, 1e3),
                             "num_envs": 2000, "env_steps": 2000, "trained_period": 100, "device": "cpu",
@@ -54,165 +58,273 @@ def population(seeds=10, environments=ENVIRONMENTS, level=level, spread=0.5, met
                 lines.append(key | {
                     "env_steps": tuple(24.0 * np.arange(1, POINTS + 1)), "reward": (0.7,) * POINTS,
                     "crashes_per_1000": tuple(crashes), "selected_fraction": tuple(rng.normal(0.98, 0.001, POINTS)),
+                    "goal_map": tuple(rng.integers(1, 9, 144)), "speed": rng.normal(1.0, 0.1),
+                    "risk": tuple(rng.uniform(0.4, 0.9, 5)), "goal_percentile": (50.0,) * POINTS,
                 })  # fmt: skip
     return Results(rows, lines)
 
 
 @pytest.fixture(autouse=True)
 def few_resamples(monkeypatch):
-    """Bootstrap little: no test here looks at the ends of an interval."""
-    monkeypatch.setattr(stats, "RESAMPLES", 200)
+    """Resample and permute little: 199 permutations are enough for p-values of 2.5 %."""
+    monkeypatch.setattr(claim_tests, "RESAMPLES", 100)
+    monkeypatch.setattr(permutation, "PERMUTATIONS", 199)
+
+
+def evidence(results, **more):
+    """That of some results."""
+    return Evidence(results.rows, results.curves, **more)
 
 
 @pytest.fixture(scope="module")
 def alike():
-    """Twenty seeds of everything, where no method differs from another."""
-    return Data(population(20))
+    """Eight seeds of everything, where no method differs from another, and rounds of Table 4.1."""
+    rng = np.random.default_rng(3)
+    rounds = [{"seconds": {place: {name: rng.uniform(1, 2) for name in ("uniform", "p25", "rnd", "vds", "cl")}
+                           for place in ENVIRONMENTS}} for _ in range(8)]  # fmt: skip
+    return evidence(population(8), speeds=rounds)
 
 
-def finding(p_for, p_against, detectable=0.7, required=True):
-    """A finding with these p-values, whose smallest effect of interest is 0.75."""
+def finding(p_for, p_against):
+    """A finding with these p-values."""
     return Finding(
-        what="x", where="y", effect="z", interval=Interval(0, 0, 0), p_for=p_for, p_against=p_against,
-        detectable=lambda alpha: detectable, wanted=0.75, n=(10, 10), required=required,
+        effect="z", interval=Interval(0, 0, 0), no_difference=0.0, p_for=p_for, p_against=p_against, detectable=1.0,
+        n={"uniform": 10},
     )  # fmt: skip
 
 
+class Told:
+    """A test that finds what it is told, wherever it is asked."""
+
+    methods = ("uniform", "p25")
+
+    def __init__(self, *found):
+        self.found = list(found)
+
+    def find(self, evidence, place):
+        """What is next."""
+        return self.found.pop(0)
+
+
+def claim_of(*found, **more):
+    """A claim whose clauses find these p-values, in one environment; ``None`` for one without data."""
+    tests = [Told(None if each is None else finding(*each)) for each in found]
+    return Claim("C0", "It is so.", tuple(Clause(1, "so", each, ("relative",)) for each in tests), **more)
+
+
 def test_all_claims_are_there():
-    """There are 32, numbered in order, each with its words, its environments and its test."""
-    assert [claim.id for claim in CLAIMS] == [f"C{i}" for i in range(1, 33)]
+    """There are 37, numbered in order, each with its words and clauses, whose methods exist."""
+    assert [claim.id for claim in CLAIMS] == [f"C{i}" for i in range(1, 38)]
     for claim in CLAIMS:
-        assert set(claim.environments) <= set(ENVIRONMENTS)
         assert claim.text.endswith(".")
-        assert claim.test
+        assert claim.clauses
+        for clause in claim.clauses:
+            assert set(clause.environments) <= set(ENVIRONMENTS)
+            assert clause.text
+            assert bool(clause.line) == bool(clause.words) == (claim.id != "C37")
+            for name in clause.test.methods:
+                assert method_named(name.partition(" @ ")[0])
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
-def test_complete_data_give_every_planned_test(alike, claim):
-    """With every method in every environment a claim makes exactly the tests that were planned."""
+def test_complete_data_decide_every_clause(alike, claim):
+    """With every method in every environment each clause has a finding in each of its places, with all its methods."""
     outcome = claims.test(claim, alike)
-    assert (outcome.made, outcome.missing, outcome.in_part) == (claim.planned, (), False)
-    for assessed in outcome.assessed:
-        assert 0.0 <= assessed.p <= 1.0
-        assert assessed.detectable >= 0.0
-        assert not math.isnan(assessed.finding.interval.estimate)
+    everywhere = sum(len(clause.places(alike)) for clause in claim.clauses)
+    unsafe = claim.id == "C12"  # no policy of these crashes in 1 % of its interactions
+    assert len(outcome.results) == everywhere - unsafe
+    assert len(outcome.without_data) == unsafe
+    for each in outcome.results:
+        assert 0.0 <= each.finding.p_for <= 1.0
+        assert 0.0 <= each.finding.p_against <= 1.0
+        assert each.finding.detectable > 0.0
+        assert not math.isnan(each.finding.interval.estimate)
+        assert not [name for name in each.missing if name in LEGGED_METHODS and name != "cl"]
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
+def test_no_data_is_no_verdict(claim):
+    """Where no environment of a claim was run, nothing is said of any clause."""
+    outcome = claims.test(claim, evidence(population(3, ["elsewhere"], methods=["uniform"])))
+    assert (outcome.line, outcome.results, outcome.without_data) == ("no data", (), claim.clauses)
+
+
+@pytest.mark.parametrize(
+    ("p_for", "p_against", "verdict"),
+    [(0.05, 1, "holds"), (1, 0.05, "does not hold"), (0.06, 0.06, "undecided")],
+)
+def test_verdict_goes_either_way(p_for, p_against, verdict):
+    """A p-value of at most 5 % decides, on either side alike."""
+    assert finding(p_for, p_against).verdict == verdict
+
+
+def test_line_of_a_claim_counts_clauses(alike):
+    """It says how many of them hold, how many do not and how many are undecided; those without data do not count."""
+    outcome = claims.test(claim_of((0.01, 1), (0.01, 1), (1, 0.01), (0.5, 1), None), alike)
+    assert outcome.line == "2 of 4 clauses hold; 1 does not hold, 1 undecided"
+    assert outcome.results[0].missing == ("p25",)
+    assert len(outcome.without_data) == 1
+    assert outcome.within("absolute").line == "no data"
+    assert outcome.within("relative").line == outcome.line
+    assert claims.test(claim_of((0.01, 1)), alike).line == "1 of 1 clause holds"
+
+
+def test_what_one_clause_decides_is_corrected(alike):
+    """Where one clause is enough, p-values for it are those of Holm's rule; those against it stay as they are."""
+    pair = [(0.03, 1), (1, 0.03)]
+    assert claims.test(claim_of(*pair), alike).line == "1 of 2 clauses holds; 1 does not hold"
+    outcome = claims.test(claim_of(*pair, one_is_enough=True), alike)
+    assert outcome.line == "0 of 2 clauses hold (one is enough); 1 does not hold, 1 undecided"
+    assert [each.finding.p_for for each in outcome.results] == [0.06, 1.0]
+
+
+def test_holm_on_the_textbook_example():
+    """Holm's procedure on 0.01, 0.04, 0.03, 0.005 multiplies by 4, 3, 2, 1 and never falls."""
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.6, 0.7]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_planted_effects_are_found():
+    """Populations in which the thesis is right make its clauses hold, and those in which it is wrong the opposite."""
+
+    def right(environment, method, goals, period):
+        if goals == "naive":
+            return 5.0
+        return {"p25": 5.0, "uniform": 7.0, "vds": 7.0, "p10": 6.5, "p50": 6.5}.get(method, 8.0)
+
+    data = evidence(population(20, ["directional", "absolute"], right, 0.3))
+    verdicts = {each.clause.test.methods: each.verdict for each in claims.test(BY_ID["C7"], data).results}
+    assert verdicts.pop(("p25",)) == "undecided"  # it crashes no more under attack here
+    assert set(verdicts.values()) == {"holds"}
+    crashes = [each for each in claims.test(BY_ID["C15"], data).results
+               if isinstance(each.clause.test, Ordered) and not each.clause.test.spread]  # fmt: skip
+    assert [each.verdict for each in crashes] == ["holds"] * 4
+    wrong = evidence(population(20, ["directional"], lambda e, m, g, t: 7.0 if m == "p25" else 5.0, 0.3))
+    found = [each.verdict for each in claims.test(BY_ID["C15"], wrong).results if each.clause in
+             [other.clause for other in crashes]]  # fmt: skip
+    assert found == ["does not hold"] * 4
+
+
+@pytest.mark.parametrize(("attacked", "naive", "verdict"), [(3.0, 0.0, "holds"), (0.0, 3.0, "does not hold")])
+def test_matters_more_where_methods_differ(attacked, naive, verdict):
+    """Methods that differ in one measure alone matter more there."""
+
+    def level(environment, method, goals, period):
+        place = PARTICLE_METHODS.index(method) / 9 - 0.5
+        return 6.0 + place * (attacked if goals == "adversary" else naive)
+
+    data = evidence(population(10, ["directional"], level, methods=PARTICLE_METHODS))
+    assert Matters(ATTACKED, NAIVE, PARTICLE_METHODS).find(data, HERE).verdict == verdict
+
+
+def test_weak_adversaries_count():
+    """A policy whose Adversary found nothing to learn from is in every sample like any other."""
+    results = population(5, ["directional"], methods=["uniform"])
+    for row in results.rows:
+        row["weak_adversary"] = row["goals"] == "adversary"
+    data = Evidence.of(Data(results))
+    assert [len(measure(data, HERE, "uniform")) for measure in (NAIVE, ATTACKED, GAIN)] == [5, 5, 5]
+
+
+def test_literal_directors_are_the_thesis():
+    """Where a study has methods that learn fear as the thesis does, they are what its names mean, unless told."""
+    results = population(4, ["directional"], methods=["uniform", "p25", "p25-literal", "p50"])
+    rates = {row["method"]: row["crash_rate"] for row in results.rows if row["seed"] == 3 and row["goals"] == "naive"}
+    data, as_named = evidence(results), evidence(results, renamed=False)
+    assert data.methods == {"uniform": "uniform", "p25": "p25-literal", "p50": "p50"}
+    assert NAIVE(data, HERE, "p25")[3] == rates["p25-literal"]
+    assert NAIVE(data.only([3]), HERE, "p25") == {3: rates["p25-literal"]}
+    assert NAIVE(as_named, HERE, "p25")[3] == rates["p25"]
+
+
+def test_attack_is_the_worst_where_rows_have_it():
+    """Safety under attack is the worst attacker's column, and in rows of 0.1.0 the Adversary's rate."""
+    results = population(4, ["directional"], methods=["uniform"])
+    adversary = ATTACKED(evidence(results), HERE, "uniform")
+    assert adversary == {row["seed"]: row["crash_rate"] for row in results.rows if row["goals"] == "adversary"}
+    for row in results.rows:
+        row |= {"worst": 0.1 * row["seed"], "goals": row["goals"].replace("adversary", "argmax")}
+    assert ATTACKED(evidence(results), HERE, "uniform") == pytest.approx({0: 0.0, 1: 0.1, 2: 0.2, 3: 0.3})
+
+
+def test_measures_of_other_places():
+    """``p75 @ 500`` are its policies at another T, and ``rnd @ particle`` all of Particle Gym's."""
+    results = population(3, methods=["rnd"])
+    data = evidence(results)
+    here, later = (NAIVE(data, Place("quad", period), "rnd") for period in (100, 500))
+    assert NAIVE(data, Place("quad", 100), "rnd @ 500") == later != here
+    assert len(NAIVE(data, Place("quad", 100), "rnd @ particle")) == 9
+
+
+def test_measures_of_curves():
+    """A curve's last tenth, its fall over training and in its last fifth are those of a known one."""
+    crashes = tuple(np.concatenate([np.full(20, 5.0), np.full(60, 1.0), np.linspace(2.0, 1.0, 20)]))
+    curve = {"environment": "directional", "method": "p25", "seed": 0, "crashes_per_1000": crashes,
+             "goal_map": tuple(np.eye(4).flatten()), "risk": (math.nan, 0.9, 0.7), "speed": 3.0}  # fmt: skip
+    data = Evidence([], [curve])
+    value = {name: getattr(measures, name)(data, HERE, "p25") for name in
+             ("LATE", "FALL", "LATE_FALL", "HALFWAY", "DIVERSITY", "RISK", "MOTION")}  # fmt: skip
+    assert value["LATE"][0] == pytest.approx(np.mean(crashes[-10:]))
+    assert value["FALL"][0] == pytest.approx(math.log1p(5000) - math.log1p(1500))
+    assert value["LATE_FALL"][0] == pytest.approx(math.log(2), rel=0.02)  # of the logarithm of a straight line
+    assert value["HALFWAY"][0] == pytest.approx(math.log1p(5000) - math.log1p(1000) - math.log(10))
+    assert (value["DIVERSITY"][0], value["MOTION"][0]) == (0.0, 3.0)
+    assert value["RISK"][0] == pytest.approx(0.3)
+    uniform = Evidence([], [curve | {"goal_map": (1,) * 16}])
+    assert measures.DIVERSITY(uniform, HERE, "p25")[0] == pytest.approx(1.0)
+    assert measures.DIVERSITY(Evidence([], [replace_map(curve)]), HERE, "p25") == {}
+
+
+def replace_map(curve):
+    """The same curve of a training without a map."""
+    return {name: value for name, value in curve.items() if name != "goal_map"}
+
+
+@pytest.mark.parametrize(("worlds", "known"), [(200, False), (690, False), (700, True), (1500, True)])
+def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, known):
+    """Where a policy at the limit is most probably without a crash, C11 has no data; else those without one count."""
+    results = population(4, ["relative"], methods=["vds"])
+    for row in results.rows:
+        row |= {"crashes": row["seed"] % 2, "worlds": worlds, "steps": 1000}  # 1 is below 1.5, and yet too many
+    outcome = claims.test(BY_ID["C11"], evidence(results))
+    assert [each.finding.interval.estimate for each in outcome.results] == [0.5] * known
+
+
+def test_safe_and_unsafe_policies_are_told_apart():
+    """C12 looks at policies that crash in less than 1 % of their interactions, and at the others."""
+    rates = {"naive": [0.001, 0.002, 0.003, 0.2, 0.3, 0.4], "argmax": [0.1, 0.1, 0.1, 0.1, 0.1, 0.1]}
+    rows = [{"environment": "relative", "goal_period": 100, "goals": goals, "method": "p25", "seed": seed,
+             "crash_rate": rate} for goals, own in rates.items() for seed, rate in enumerate(own)]  # fmt: skip
+    outcome = claims.test(BY_ID["C12"], Evidence(rows))
+    assert [(each.finding.n, each.finding.interval.estimate) for each in outcome.results] == [({"p25": 3}, 1.0)] * 2
+
+
+def test_lines_are_checked(tmp_path, monkeypatch, capsys):
+    """The command names the clauses whose words are not in their line, and only those."""
+    text = [""] * 800
+    for claim in CLAIMS:
+        for clause in claim.clauses:
+            text[clause.line - 1] += f" {clause.words}  " if clause.line else ""
+    assert lines.wrong(text) == []
+    text[549] = "something else"
+    assert lines.wrong(text) == ["C1: line 550 does not say 'RND does not lend itself well'"]
+    file = tmp_path / "thesis.txt"
+    file.write_text("\n".join(text))
+    monkeypatch.setattr("sys.argv", ["lines", str(file)])
+    assert lines.main() == 1
+    assert capsys.readouterr().out.startswith("C1: line 550")
 
 
 def test_only_some_methods_are_left():
-    """Data of the thesis's methods are those that a study without the others would have, curves and claims too."""
+    """Data of the thesis's methods are those that a study without the others would have, curves too."""
     with_more = Data(population(4, ["relative"], methods=[*PARTICLE_METHODS, "learnability"]))
     left = with_more.only(PARTICLE_METHODS)
     assert "learnability" in with_more.methods("relative")
     assert set(left.methods("relative")) == set(PARTICLE_METHODS)
     assert left.curves("relative", "learnability") == []
+    assert {row["method"] for row in left.curve_rows} == set(PARTICLE_METHODS)
     assert len(left.sample(Where("relative", "naive", 100), "learnability", "crashes")) == 0
-    claim = next(claim for claim in CLAIMS if claim.id == "C11")
-    assert claims.test(claim, left).made == claim.planned < claims.test(claim, with_more).made
-
-
-@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
-def test_no_data_is_not_testable(claim):
-    """Where no environment of a claim was run, it is not testable, and says where data are missing."""
-    outcome = claims.test(claim, Data(population(3, ["elsewhere"])))
-    assert (outcome.verdict, outcome.assessed, outcome.missing) == ("not testable", [], claim.environments)
-
-
-@pytest.mark.parametrize(
-    ("p_for", "p_against", "detectable", "verdict"),
-    [
-        (0.01, 1, 0.9, "supported"),
-        (1, 0.01, 0.9, "contradicted"),
-        (0.3, 1, 0.7, "undecided"),
-        (0.3, 1, 0.8, "underpowered"),
-    ],
-)
-def test_verdict_of_one_finding(p_for, p_against, detectable, verdict):
-    """A miss is undecided only if the test could have found the smallest effect of interest."""
-    (assessed,) = claims.assess([finding(p_for, p_against, detectable)])
-    assert (assessed.verdict, assessed.p) == (verdict, min(p_for, p_against))
-
-
-@pytest.mark.parametrize(("how", "alone", "together"), [("all", "supported", "contradicted"),
-                                                        ("any", "contradicted", "supported")])  # fmt: skip
-def test_only_what_one_finding_decides_is_corrected(how, alone, together):
-    """What needs every test of a claim takes p-values as they are; what one of them decides corrects them by Holm."""
-    of = {"supported": (0.03, 1), "contradicted": (1, 0.03)}
-    pair = [finding(*of[alone])] * 2
-    assert [(each.verdict, each.p) for each in claims.assess(pair, how)] == [(alone, 0.03)] * 2
-    assert claims.combined(claims.assess(pair, how), how, 2) == alone
-    pair = [finding(*of[together])] * 2
-    assert [(each.verdict, each.p) for each in claims.assess(pair, how)] == [("undecided", 0.06)] * 2
-    assert claims.combined(claims.assess(pair, how), how, 2) == "undecided"
-
-
-def test_effects_are_detectable_at_the_stricter_level():
-    """The minimum detectable effect is that at the level of Holm's first step."""
-    levels = []
-    spy = finding(1, 1)
-    object.__setattr__(spy, "detectable", lambda alpha: levels.append(alpha) or 1.0)
-    claims.assess([spy, spy])
-    assert levels == [0.025, 0.025]
-
-
-def test_verdict_of_a_claim():
-    """All required findings must support a claim and one contradicts it; where one is enough, only all contradict."""
-    yes, no, open_one = finding(1e-6, 1), finding(1, 1e-6), finding(0.5, 1)
-    for findings, every, one in (
-        ([yes, yes], "supported", "supported"),
-        ([yes, no], "contradicted", "supported"),
-        ([yes, open_one], "undecided", "supported"),
-        ([no, open_one], "contradicted", "undecided"),
-        ([no, no], "contradicted", "contradicted"),
-        ([yes, finding(0.5, 1, 0.9)], "underpowered", "supported"),
-        ([finding(1, 1, required=False)], "not testable", "not testable"),
-        ([yes, finding(1, 1, required=False)], "supported", "supported"),
-        ([yes, finding(1, 1e-6, required=False)], "contradicted", "supported"),
-    ):
-        assert claims.combined(claims.assess(findings)) == every
-        assert claims.combined(claims.assess(findings, "any"), "any") == one
-    assert claims.combined(claims.assess([no, no], "any"), "any", planned=3) == "undecided"
-
-
-def test_eight_seeds_can_support_a_claim_of_ten_tests():
-    """Signed ranks of 8 pairs reach p = 1 / 128 and no less: enough for a claim that needs all of its ten tests."""
-    rising = claim_tests.paired_more("", "here", np.arange(1.0, 9.0), np.zeros(8))
-    assert rising[0].p_for == 2 / 2**8
-    assert claims.combined(claims.assess(rising * 10), planned=10) == "supported"
-
-
-def test_planted_effects_are_found():
-    """Populations in which the thesis is right support its claims, and those in which it is wrong contradict them."""
-
-    def right(environment, method, goals, period):
-        if goals == "naive":
-            return 5.0 + 2 * (method == "rnd")
-        return {"p25": 5.0, "uniform": 7.0, "vds": 7.0, "p10": 6.5, "p50": 6.5}.get(method, 8.0)
-
-    data = Data(population(20, ["directional", "absolute"], right, 0.3))
-    attacked = claims.test(BY_ID["C7"], data)
-    by_method = {each.finding.what.split(":")[0]: each.verdict for each in attacked.assessed}
-    assert by_method["p25"] != "supported"  # it crashes no more under attack here
-    assert {verdict for name, verdict in by_method.items() if name not in ("p25", "rnd")} == {"supported"}
-    safest = claims.test(BY_ID["C15"], data)
-    crashes = [each.verdict for each in safest.assessed if each.finding.what.startswith("crashes")]
-    assert crashes == ["supported"] * 7
-    assert claims.test(BY_ID["C1"], data).verdict != "supported"  # all train alike
-    assert [each.verdict for each in claims.test(BY_ID["C11"], data).assessed] == []
-    swapped = Data(population(20, ["directional"], lambda e, m, g, t: 7.0 if m == "p25" else 5.0, 0.3))
-    assert claims.test(BY_ID["C15"], swapped).verdict == "contradicted"
-
-
-def test_weak_adversaries_stay_out():
-    """A row that is marked weak is in no sample, but counted."""
-    results = population(5, ["directional"], methods=["uniform"])
-    rows = results.rows
-    rows[1]["weak_adversary"] = True
-    data = Data(results)
-    assert data.weak == [rows[1]]
-    assert len(data.sample(Where("directional", "adversary", 100), "uniform", "crashes")) == 4
-    assert data.seeds(Where("directional", "adversary", 100), ["uniform"]) == [1, 2, 3, 4]
-    naive, attacked = claim_tests.both(data, "directional", 100, "uniform", "crashes")
-    assert len(naive) == len(attacked) == 4
 
 
 def test_argmax_is_the_thesis_adversary():
@@ -226,12 +338,6 @@ def test_argmax_is_the_thesis_adversary():
     assert data.goals == ["naive", "adversary", "scripted"]
     assert data.sample(Where("directional", "adversary", 100), "uniform", "crashes").tolist() == before.tolist()
     assert data.sample(Where("directional", "scripted", 100), "uniform", "crashes").tolist() == [9.0] * 5
-
-
-def test_best_p_needs_twenty_seeds():
-    """With fewer than twenty seeds the headline cannot be split and is not testable."""
-    for seeds, verdict in ((19, {"not testable"}), (20, set(claims.VERDICTS) - {"not testable"})):
-        assert claims.test(BY_ID["C28"], Data(population(seeds, ["relative"]))).verdict in verdict
 
 
 def table_of(results, number):
@@ -260,146 +366,3 @@ def test_policy_counts_once(table, ending):
     rows.append(rows[0] | {"hash": "another"})
     with pytest.raises(RunError, match=f"two rows of environment relative, method coop, seed 0{ending};"):
         Data(tables)
-
-
-def test_paired_test_is_wilcoxons():
-    """Its p-value is SciPy's on the pairs, for the side that the signed ranks lean to."""
-    rng = np.random.default_rng(1)
-    y = rng.normal(size=12)
-    x = y + rng.normal(0.8, 1, size=12)
-    (found,) = claim_tests.paired_more("", "here", x, y)
-    (mirrored,) = claim_tests.paired_more("", "here", y, x)
-    assert found.p_for == mirrored.p_against == scipy_stats.wilcoxon(x, y).pvalue
-    assert found.p_against == mirrored.p_for == 1.0
-    assert claim_tests.paired_more("", "here", x, x)[0].p_for == 1.0
-
-
-@pytest.mark.parametrize(("pairs", "still", "alpha"), [(5, 0, 0.05), (6, 0, 0.05), (6, 1, 0.05), (8, 0, 0.005)])
-def test_paired_test_that_cannot_reject_detects_nothing(pairs, still, alpha):
-    """No effect is detectable exactly where even pairs that all moved the same way are not significant."""
-    moved = np.concatenate([np.arange(1.0, 1.0 + pairs - still), np.zeros(still)])
-    (found,) = claim_tests.paired_more("", "here", moved, np.zeros(pairs))
-    assert math.isinf(found.detectable(alpha)) == (found.p_for >= alpha)
-
-
-def test_one_sample_test_is_students():
-    """Above and below its limit it gives SciPy's two-sided p-value."""
-    x = np.random.default_rng(2).normal(1, 1, size=9)
-    p = scipy_stats.ttest_1samp(x, 0.2).pvalue
-    (found,) = claim_tests.positive("", "here", "", x, 1.0, at=0.2)
-    assert (min(found.p_for, found.p_against), max(found.p_for, found.p_against)) == (pytest.approx(p), 1.0)
-    assert claim_tests.positive("", "here", "", np.ones(4), 1.0)[0].p_for == 0.0
-
-
-def test_policies_are_the_unit_of_nearly_no_crashes():
-    """Of five policies one crashes 1000 times in 4 10^6 steps and one 4 times: three of five are below the limit."""
-    results = population(5, ["relative"], methods=["vds"])
-    rows = results.rows
-    for row, crashes in zip([row for row in rows if row["goals"] == "naive"], (0, 3, 4, 1000, 3), strict=True):
-        row["crashes"] = crashes
-    (found,) = claim_custom.nearly_none(Data(results), "relative")
-    assert found.interval.estimate == 0.6
-    assert (found.interval.low, found.interval.high) == pytest.approx((0.1466, 0.9473), abs=1e-4)
-    assert found.p_for == pytest.approx(16 / 32)  # 3, 4 or 5 heads of 5
-    assert found.p_against == pytest.approx(26 / 32)  # 3 or fewer
-    assert math.isinf(found.detectable(1 / 32))
-    assert found.detectable(0.05) == pytest.approx(0.8 ** (1 / 5))  # all five must be below it
-
-
-@pytest.mark.parametrize(("worlds", "tested"), [(200, False), (690, False), (700, True), (1500, True)])
-def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, tested):
-    """Where a policy at the limit is most probably without a crash, C11 has no data; else those without one count."""
-    results = population(4, ["relative"], methods=["vds"])
-    rows = results.rows
-    for row in rows:
-        row |= {"crashes": row["seed"] % 2, "worlds": worlds, "steps": 1000}  # 1 is below 1.5, and yet too many
-    outcome = claims.test(BY_ID["C11"], Data(results))
-    assert [each.finding.interval.estimate for each in outcome.assessed] == [0.5] * tested
-    assert outcome.missing == (() if tested else ("relative",))
-    assert (outcome.verdict == "not testable") != tested
-
-
-def test_mean_ranks_are_of_whole_policies():
-    """Ranks are meaned over the evaluations that all methods have; a policy that lacks one of them does not count."""
-    results = population(4, ["relative"], methods=["rnd", "vds"])
-    rows = results.rows
-    for row in rows:
-        row["crashes"] = 10 * row["seed"] + (row["method"] == "rnd") + 100 * (row["goals"] == "adversary")
-    rows[1]["weak_adversary"] = True  # rnd's first policy
-    theirs, own = claim_custom._mean_ranks(Data(results), "relative", "rnd", "vds")
-    assert (own.tolist(), theirs.tolist()) == ([1, 2, 4, 6], [3, 5, 7])
-    for row in rows:
-        row["weak_adversary"] = row["goals"] == "adversary" and row["method"] == "rnd"
-    theirs, own = claim_custom._mean_ranks(Data(results), "relative", "rnd", "vds")
-    assert (own.tolist(), theirs.tolist()) == ([1, 3, 5, 7], [2, 4, 6, 8])
-
-
-def test_vertex_of_a_known_parabola():
-    """Log crashes on an exact parabola have their vertex where it is."""
-    samples = {
-        name: np.full(4, 3.0 + 0.002 * (place - 62.0) ** 2)
-        for name, place in thesis.ACHIEVED.items()
-        if name != "uniform"
-    }
-    interval, slopes, places = claim_custom.vertex(samples, 50)
-    assert (interval.estimate, interval.low, interval.high) == pytest.approx((62.0, 62.0, 62.0))
-    assert places == pytest.approx(62.0)
-    assert slopes[0] == pytest.approx(50 * 0.004 * (0.5 - 62))
-    assert slopes[1] == pytest.approx(50 * 0.004 * (99.5 - 62))
-    assert thesis.ACHIEVED["p25"] == 62.5
-    assert thesis.ACHIEVED["p90"] == 95.0
-
-
-@pytest.mark.parametrize(("shape", "p_for", "p_against", "verdict"), [
-    (lambda x: x**2, 2 / 1001, 1.0, "supported"),  # falls, then rises, in each of 1000 resamples
-    (lambda x: -(x**2), 1.0, 4 / 1001, "contradicted"),  # twice as much: either end would contradict
-    (lambda x: x, 1.0, 4 / 1001, "contradicted"),
-    (lambda x: -x, 1.0, 4 / 1001, "contradicted"),
-], ids=["hump", "upside down", "rising", "falling"])  # fmt: skip
-def test_lowest_point_is_inside_a_planted_hump_only(monkeypatch, shape, p_for, p_against, verdict):
-    """Populations on a curve give the p-values of slopes that have their sign in every resample."""
-    monkeypatch.setattr(stats, "RESAMPLES", 1000)
-    place = {name: (x - 50) / 50 for name, x in thesis.ACHIEVED.items()}
-
-    def level(environment, method, goals, period):
-        return 8.0 + 2.0 * shape(place.get(method, 0.0))
-
-    data = Data(population(4, ["directional"], level, 0.01))
-    inside = [f for f in claim_custom.hump(data, "directional") if f.what == "the lowest point lies inside"]
-    assert [(f.p_for, f.p_against) for f in inside] == [(pytest.approx(p_for), pytest.approx(p_against))] * 2
-    assert claims.test(BY_ID["C25"], data).verdict == verdict
-
-
-def test_eta_squared_is_the_anova_share():
-    """It is the sum of squares between the groups over the total one."""
-    groups = [np.array([1.0, 2, 3]), np.array([4.0, 6]), np.array([0.0, 0, 1])]
-    values = np.concatenate(groups)
-    between = sum(len(g) * (g.mean() - values.mean()) ** 2 for g in groups)
-    expected = between / ((values - values.mean()) ** 2).sum()
-    assert claim_custom._eta_squared(*groups) == pytest.approx(expected)
-    assert claim_custom._eta_squared(np.ones(3), np.ones(2)) == 0.0
-
-
-def test_energy_distance_is_its_definition():
-    """It is 2 E|X - Y| - E|X - X'| - E|Y - Y'| on scaled columns; equal populations are not told apart, others are."""
-    rng = np.random.default_rng(3)
-    x, y = rng.normal(size=(8, 2)), rng.normal([5.0, 0.0], size=(7, 2))
-    scale = np.concatenate([x, y]).std(axis=0)
-    a, b = x / scale, y / scale
-
-    def apart(u, v):
-        return np.mean([np.linalg.norm(p - q) for p in u for q in v])
-
-    distance, p = claim_custom.energy_test(x, y)
-    assert distance == pytest.approx(2 * apart(a, b) - apart(a, a) - apart(b, b))
-    assert p < 0.005
-    assert claim_custom.energy_test(x, x + 1e-9)[1] > 0.9
-
-
-def test_claim_in_part():
-    """A claim whose tests could be made only for some methods holds only in part."""
-    data = Data(population(10, ["directional"], methods=["uniform", "p25", "coop"]))
-    outcome = claims.test(BY_ID["C14"], data)
-    assert 0 < outcome.made < BY_ID["C14"].planned
-    assert outcome.in_part
-    assert isinstance(outcome.claim, Claim)

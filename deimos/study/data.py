@@ -95,6 +95,11 @@ class Data:
         return Data(Results(rows, curves), self.style, self.cells)
 
     @property
+    def curve_rows(self) -> list[Row]:
+        """The rows of all training curves."""
+        return self._results.curves
+
+    @property
     def environments(self) -> list[str]:
         """Their names, in order."""
         return self._sorted({row["environment"] for row in self.rows})

@@ -1,0 +1,150 @@
+"""The kinds of tests that clauses are made of: against SciPy, formulas, and samples whose truth is known."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats as scipy_stats
+
+from deimos.study import permutation, stats
+from reproduction import claim_tests
+from reproduction.claim_tests import Alike, Best, Highest, Mostly, Ordered, falling, versus
+from reproduction.measures import NAIVE, SCORE, Evidence, Place
+
+HERE = Place("directional", 100)
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    """Resample and permute little: 199 permutations are enough for p-values of 2.5 %."""
+    monkeypatch.setattr(claim_tests, "RESAMPLES", 100)
+    monkeypatch.setattr(permutation, "PERMUTATIONS", 199)
+
+
+def only(method_values, column="crash_rate", goals="naive", curves=()):
+    """Evidence of an evaluation in which a column has these values, by method."""
+    rows = [
+        {"environment": "directional", "goal_period": 100, "goals": goals, "method": name, "seed": seed, column: value}
+        for name, values in method_values.items() for seed, value in enumerate(values)
+    ]  # fmt: skip
+    return Evidence(rows, curves)
+
+
+def test_ordered_averages_over_pairs():
+    """Its effect is the mean P(X > Y) of the pairs that have enough policies; methods that lack them are missing."""
+    data = only({"rnd": [3, 4, 5], "uniform": [1, 2, 3.5], "vds": [6, 7, 8], "p25": [1, 2]})
+    found = Ordered(NAIVE, versus(["rnd"], ["uniform", "vds", "p25"])).find(data, HERE)
+    assert found.interval.estimate == pytest.approx((8 / 9 + 0) / 2)
+    assert found.n == {"rnd": 3, "uniform": 3, "vds": 3}
+    assert found.detectable == stats.detectable_probability(3, 6)
+    assert Ordered(NAIVE, (("rnd", "p25"),)).find(data, HERE) is None
+    assert found.p_for == pytest.approx(1.0, abs=0.5)
+    assert "rnd > uniform, vds, p25" in str(Ordered(NAIVE, versus(["rnd"], ["uniform", "vds", "p25"])))
+
+
+def test_order_is_jonckheeres():
+    """All pairs of an order are compared, the earlier with the later."""
+    assert falling(["a", "b", "c"]) == (("a", "b"), ("a", "c"), ("b", "c"))
+
+
+def test_alike_names_the_smallest_ratio():
+    """Two methods of ten policies each, within 3 % of another, are alike within a ratio a little above that."""
+    rates = 0.1 * np.exp(np.linspace(-0.03, 0.03, 10))
+    data = only({"vds": rates, "uniform": rates, "p90": 3 * rates})
+    found = Alike(NAIVE, "vds", "uniform").find(data, HERE)
+    assert found.verdict == "holds"
+    assert 1.0 < found.equivalent_within < 1.06
+    assert found.interval.estimate == pytest.approx(1.0)
+    assert found.no_difference == 1.0
+    far = Alike(NAIVE, "p90", "uniform").find(data, HERE)
+    assert far.verdict == "does not hold"
+    assert 3.0 < far.equivalent_within < 3.2
+    assert far.interval.low == pytest.approx(3.0, rel=0.06)
+    assert Alike(NAIVE, "uniform", "p90", at_most=True).find(data, HERE).verdict == "holds"
+    assert Alike(NAIVE, "p90", "uniform", at_most=True).find(data, HERE).verdict == "does not hold"
+
+
+def test_alike_is_settled_within_one_and_a_half():
+    """Tight populations 1.4 apart are settled, 1.6 apart they are not; scores are by differences of 0.05."""
+    rates = 0.1 * np.exp(np.linspace(-0.01, 0.01, 12))
+    data = only({"uniform": rates, "p10": 1.4 * rates, "p25": 1.6 * rates})
+    found = {name: Alike(NAIVE, name, "uniform").find(data, HERE).verdict for name in ("p10", "p25")}
+    assert found == {"p10": "holds", "p25": "does not hold"}
+    scores = np.linspace(0.79, 0.81, 12)
+    data = only({"uniform": scores, "p10": scores + 0.03, "p25": scores + 0.08}, "score")
+    near, far = (Alike(SCORE, name, "uniform").find(data, HERE) for name in ("p10", "p25"))
+    assert (near.verdict, far.verdict, near.no_difference) == ("holds", "does not hold", 0.0)
+    assert 0.03 < near.equivalent_within < 0.05
+
+
+def test_few_policies_are_never_alike():
+    """Three equal policies a side cannot be told from others: no ratio is named, and nothing is settled."""
+    found = Alike(NAIVE, "vds", "uniform").find(only({"vds": [0.1] * 3, "uniform": [0.2, 0.1, 0.05]}), HERE)
+    assert found.verdict == "undecided"
+    assert found.equivalent_within > 1.5
+
+
+def test_mostly_is_the_sign_test():
+    """Nine of ten policies above 0 have the two-sided p-value of SciPy's binomial test; those at 0 drop out of it."""
+    data = only({"vds": [1.0] * 9 + [-1.0], "rnd": [0.0] * 5}, "score")
+    found = Mostly(SCORE, ("vds",)).find(data, HERE)
+    assert found.p_for == pytest.approx(scipy_stats.binomtest(9, 10).pvalue)
+    assert (found.p_against, found.interval.estimate) == (1.0, 0.9)
+    assert (found.interval.low, found.interval.high) == pytest.approx(scipy_stats.binomtest(9, 10).proportion_ci())
+    still = Mostly(SCORE, ("rnd",)).find(data, HERE)
+    assert (still.p_for, still.p_against, still.interval.estimate) == (1.0, 1.0, 0.5)
+    both = Mostly(SCORE, ("vds", "rnd", "p25")).find(data, HERE)
+    assert both.n == {"vds": 10, "rnd": 5}
+
+
+def test_detectable_share_has_the_promised_power():
+    """A share that large keeps to the sign test's bound in 80 % of all samples; of five nothing is found."""
+    share = claim_tests.detectable_share(10)
+    assert scipy_stats.binom(10, share).sf(8) == pytest.approx(0.8)  # 9 of 10 is p = 0.02, 8 of 10 is 0.11
+    assert claim_tests.detectable_share(5) == math.inf
+
+
+def test_detectable_spread_has_the_promised_power():
+    """At the ratio that it names, fresh normal samples are told apart in 80 %."""
+    ratio = claim_tests.detectable_spread(10, 10)
+    rng = np.random.default_rng(9)
+    x, y = ratio * rng.normal(size=(600, 10)), rng.normal(size=(600, 10))
+    more, _ = Ordered(NAIVE, (("a", "b"),), spread=True).p_values([x, y], [(0, 1)])
+    # Both shares are binomial, of 400 and 600 studies; four standard errors of them together, and the step of 3 %.
+    assert (2 * more <= 0.05).mean() == pytest.approx(0.8, abs=4 * math.sqrt(0.16 / 400 + 0.16 / 600) + 0.02)
+
+
+def test_highest_counts_orders():
+    """Its p-value is the share of all orders that have as many on top: Rosenbaum's, against each of the others."""
+    test = Highest(SCORE, "antagonist", ("p25", "rnd"))
+    assert claim_tests._on_top(5, 7, 3) == pytest.approx(math.comb(5, 3) / math.comb(12, 3))
+    values = np.arange(10.0)
+    found = test.find(only({"antagonist": values + 5.5, "p25": values, "rnd": values - 1}, "score"), HERE)
+    assert found.p_for == pytest.approx(2 * math.comb(10, 6) / math.comb(20, 6))
+    assert (found.p_against, found.interval.estimate) == (1.0, 6.0)
+    behind = test.find(only({"antagonist": values - 5.5, "p25": values, "rnd": values - 9}, "score"), HERE)
+    assert behind.p_against == pytest.approx(min(1.0, 2 * 2 * math.comb(10, 6) / math.comb(20, 6)))
+    assert (behind.p_for, behind.interval.estimate) == (1.0, -6.0)
+    assert behind.detectable == 5  # of ten, five on top are p = 0.033, four are 0.087
+
+
+def test_omega_squared_is_hays():
+    """It is (SSB - (k - 1) MSW) / (SST + MSW), and 0 where nothing varies."""
+    groups = [np.array([1.0, 2, 3]), np.array([4.0, 6]), np.array([0.0, 0, 1])]
+    values = np.concatenate(groups)
+    between = sum(len(g) * (g.mean() - values.mean()) ** 2 for g in groups)
+    total = ((values - values.mean()) ** 2).sum()
+    error = (total - between) / (len(values) - 3)
+    assert claim_tests.omega_squared(values, [3, 2, 3]) == pytest.approx((between - 2 * error) / (total + error))
+    assert claim_tests.omega_squared(np.ones(5), [2, 3]) == 0.0
+
+
+def test_best_is_chosen_and_tested_on_different_seeds():
+    """What is best on every other seed is tested on the rest, even where it is the worst there."""
+    rates = {"p10": [0.1, 0.9] * 5, "p25": [0.5, 0.2] * 5, "uniform": [0.3, 0.3] * 5, "vds": [0.4, 0.1] * 5}
+    rates = {name: np.array(x) + 0.001 * np.arange(10) for name, x in rates.items()}
+    test = Best(NAIVE, ("p10", "p25"), ("uniform", "vds"), lambda best, rival: Ordered(NAIVE, ((best, rival),)))
+    found = test.find(only(rates), HERE)
+    assert (found.chosen, found.interval.estimate, found.n) == ("p10 against uniform", 1.0, {"p10": 5, "uniform": 5})
+    assert found.verdict == "holds"
+    assert test.find(only({name: x[:4] for name, x in rates.items()}), HERE) is None
