@@ -98,7 +98,7 @@ train = { num_envs = 8, ppo = { epochs = 2 } }
     assert cell.config.env == dataclasses.replace(base.env, terrain="rough")
     assert cell.config.ppo == dataclasses.replace(base.ppo, epochs=2)
     assert (cell.config.num_envs, cell.config.eval) == (8, base.eval)
-    with pytest.raises(RunError, match=r"Environment 'hills': preset must be the name of one, got 3"):
+    with pytest.raises(RunError, match=r"preset must be a text, got 3"):
         plan.expand(described(tmp_path, toml.replace('"quad"', "3")))
     other = toml.replace("{ terrain", '{ kind = "particle", terrain')
     with pytest.raises(RunError, match=r"Environment 'hills': preset 'quad' is for quad, not for particle"):
@@ -146,7 +146,7 @@ def test_cell_survives_its_file(tmp_path):
     (tmp_path / "cell.json").write_text(json.dumps(cell.to_dict()))
     assert plan.read_cell(tmp_path / "cell.json") == cell
     (tmp_path / "cell.json").write_text('{"schema": 99}')
-    with pytest.raises(RunError, match="its schema is 99, not 1"):
+    with pytest.raises(RunError, match="its schema is 99, not 2"):
         plan.read_cell(tmp_path / "cell.json")
 
 
@@ -166,16 +166,38 @@ ERRORS = {
     TOML.replace('variant = "absolute"', 'variant = "cubic"'): "'far': variant must be one of",
     TOML.replace('variant = "absolute"', "friction = 1"): "'far': .*Config has no friction; it has: ",
     TOML.replace("num_envs = 64", "num_worlds = 64"): "TrainConfig has no num_worlds; it has: ",
-    TOML.replace("num_envs = 64", "seed = 64"): "seed cannot stand in 'train': the grid of the study says it",
+    TOML.replace("num_envs = 64", "seed = 64"): "seed cannot stand in 'train' or be a factor: the grid",
     TOML.replace("num_envs = 64", "num_envs = 0"): "num_envs must be at least 1, got 0",
     TOML.replace("[50, 100]", "[50, 5000]"): "eval.steps must be at least 2 T = 10000, got 2000",
     TOML.replace("[50, 100]", "[50, 50]"): r"goal_periods must be one or more different numbers, got \(50, 50\)",
-    TOML.replace("seeds", "seed"): "A study has no seed; it has: base, environment",
-    TOML.replace("goal_periods", "periods"): r"An \[\[environment\]\] has no periods; it has: env, goal_periods",
+    TOML.replace("seeds", "seed"): "A study has no seed; it has: attack, audit_worlds, base, design, environment",
+    TOML.replace("goal_periods", "periods"): r"An \[\[environment\]\] has no periods; it has: audit_worlds, env",
     "seeds = 3": r"A study must have an \[\[environment\]\]",
     'base = "huge.toml"': r"huge\.toml is not a study's TOML file",
     'base = "study.toml"': r"study\.toml is a base of itself",
-    "base = 3": r"study\.toml is not a study's TOML file",
+    "base = 3": r"study\.toml: base must be a text, got 3",
+    TOML.replace("[3, 5]", "1000000000000"): "seeds must be at most 100000, got 1000000000000",
+    TOML.replace("[3, 5]", '"0-1000000000000"'): "seeds must be at most 100000, got '0-1000000000000'",
+    TOML.replace("[3, 5]", "true"): "seeds must be a number of seeds, .* got True",
+    TOML.replace("[3, 5]", "{ a = 1 }"): "seeds must be a number of seeds, .* got {'a': 1}",
+    TOML.replace('name = "far"', 'name = "far"\npreset = []'): r"preset must be a text, got \[\]",
+    TOML.replace('name = "far"', 'name = ["far"]'): r"name must be a text, got \['far'\]",
+    TOML.replace("[train]\nnum_envs = 64\nppo = { hidden = [16, 16] }", "train = true"): "train must be a table, got",
+    TOML.replace('["uniform", "p25"]', '"uniform"'): "methods must be a list, each entry a text, got 'uniform'",
+    TOML.replace('["uniform", "p25"]', "[[1]]"): r"methods must be a list, each entry a text, got \[\[1\]\]",
+    TOML.replace("[50, 100]", "[true]"): r"goal_periods must be a list, each entry a whole number, got \[True\]",
+    TOML.replace("[50, 100]", "50"): "goal_periods must be a list, each entry a whole number, got 50",
+    TOML.replace("{ env_steps = 500, ppo = { epochs = 2 } }", "[1]"): r"train must be a table, got \[1\]",
+    TOML.replace("ppo = { hidden = [16, 16] }", "ppo = 3"): "PPOConfig must be a table of its fields, got 3",
+    TOML.replace(
+        "ppo = { hidden = [16, 16] }", "eval = { fear = [1] }"
+    ): r"FearConfig must be a table of its fields, got \[1\]",
+    'environment = ["x"]': r"environment must be a list, each entry a table, got \['x'\]",
+    "environment = 3": "environment must be a list, each entry a table, got 3",
+    "train = " + 2000 * "{ a = " + "1" + 2000 * " }": r"study\.toml is not .* \(it is nested too deep\)",
+    "seeds = " + 5000 * "[" + 5000 * "]": r"study\.toml is not a study's TOML file \(it is nested too deep\)",
+    "audit_worlds = -1\n" + TOML: "audit_worlds must be at least 0, got -1",
+    "plugins = 3\n" + TOML: "plugins must be a list, each entry a text, got 3",
     "seeds = = 3": r"study\.toml is not a study's TOML file",
 }
 

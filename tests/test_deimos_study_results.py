@@ -1,7 +1,6 @@
 """The results of a study: read from cells and from tables, exported whole, and merged."""
 
 import csv
-import json
 import math
 import os
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from deimos.checks import RunError
+from deimos.run.folder import RunFolder
 from deimos.study import results
 from deimos.study.data import Data, Where
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results, merge, read_table, write_table
@@ -32,12 +32,14 @@ def result(hash, goals="naive", **more):
     """A row of an evaluation."""
     values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
     own = {"hash": hash, "seed": int(hash), "goals": goals}
+    own |= {"worst": math.nan, "worst_attacker": None, "worst_interactions": math.nan}  # nobody attacked it
     return {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | own | more
 
 
 def curve(hash):
     """The training curve of a cell."""
-    line = {"environment": "x", "method": "y", "seed": 0, "hash": hash, "setting": "x", "selector": "x", "num_envs": 1}
+    values = {str: "x", int: 1, float: 0.5, tuple: (), dict: {}}
+    line = {name: values[kind] for name, kind in CURVE_COLUMNS.items()} | {"method": "y", "seed": 0, "hash": hash}
     return line | dict.fromkeys(("env_steps", "reward", "crashes_per_1000", "selected_fraction"), (1.0,))
 
 
@@ -51,7 +53,7 @@ def fill_cell(folder, rows, line):
     """A folder with the result of one cell."""
     path = folder / "cells" / "one"
     path.mkdir(parents=True)
-    (path / "result.json").write_text(json.dumps({"schema": results.SCHEMA, "rows": rows, "curve": line}))
+    RunFolder(path).write_json("result.json", {"schema": results.SCHEMA, "rows": rows, "curve": line})
 
 
 def test_rows_come_back_as_they_were(path):
@@ -171,6 +173,49 @@ def test_training_curve_is_cut_into_stretches():
     }  # fmt: skip
 
 
+def test_curve_of_fear_knows_where_it_stood_still():
+    """A stretch says in which share of its rollouts fear was fitted, and is NaN where a column has no value."""
+    rows = [
+        {"env_steps": "24", "reward": "1", "crashes_per_1000": "0", "selected_fraction": "1", "fear/auroc": auroc,
+         "fear/loss": loss, "fear/chosen": "0.5"}
+        for auroc, loss in (("", ""), ("", ""), ("0.5", ""), ("0.7", "0.3"))
+    ]  # fmt: skip
+    found = results._curve(rows, 2)
+    assert found["fear_fitted"] == [0.0, 0.5]
+    assert math.isnan(found["fear_auroc"][0])
+    assert found["fear_auroc"][1] == pytest.approx(0.6)
+    assert found["fear_chosen"] == [0.5, 0.5]
+    assert "goal_percentile" not in found
+
+
+def attacked(hash, goals, even, odd):
+    """A row of 20 interactions, half of them in even worlds, with as many crashes in either."""
+    return result(
+        hash,
+        goals,
+        interactions=20,
+        interaction_crashes=even + odd,
+        even_interactions=10,
+        even_interaction_crashes=even,
+    )
+
+
+def test_worst_is_of_attackers_that_all_have_met(tmp_path):
+    """Even worlds choose the worst attacker and odd ones report it; one that not every policy met does not count."""
+    rows = [
+        result("1"), attacked("1", "argmax", 3, 1), attacked("1", "scripted", 2, 9), attacked("1", "search", 9, 9),
+        result("2"), attacked("2", "argmax", 0, 5), attacked("2", "scripted", 4, 2),
+    ]  # fmt: skip
+    fill(tmp_path / "a", rows)
+    found = {row["hash"]: (row["worst_attacker"], row["worst"], row["worst_interactions"])
+             for row in Results.read(tmp_path / "a").rows}  # fmt: skip
+    assert found == {"1": ("argmax", 0.1, 10), "2": ("scripted", 0.2, 10)}
+    fill(tmp_path / "b", [attacked("2", "search", 6, 3)])
+    rows[:] = [row for row in rows if row["hash"] == "1"]
+    fill(tmp_path / "c", rows)
+    assert {row["worst_attacker"] for row in Results.read(tmp_path / "c").rows} == {"search"}
+
+
 def test_merge_adds_what_is_new(tmp_path):
     """Merging adds the rows of every source once, counts what was there, and says what differs."""
     fill(tmp_path / "a", [result("1"), result("2")])
@@ -193,6 +238,7 @@ def test_export_writes_the_tables_of_cells(tmp_path):
 
 OTHERS = {
     "setting": ({"setting": "y"}, "environment 'x' were run with 2 different settings"),
+    "code": ({"code": "y"}, "environment 'x', naive, were made by 2 versions of the code"),
     "selector": ({"selector": "y"}, "'x' stands for 2 different selectors in environment 'x'"),
     "doubled policy": ({"seed": 1}, "two rows of environment x, method x, seed 1"),
 }

@@ -56,7 +56,7 @@ def file(tmp_path_factory):
 def whole(file, tmp_path_factory):
     """The study run without interruption."""
     folder = tmp_path_factory.mktemp("studies") / "whole"
-    cli.RunOptions(folder=folder, file=file, workers=2).run()
+    cli.RunOptions(folder=folder, file=file, workers=2, allow_uncommitted=True).run()
     return StudyFolder(folder)
 
 
@@ -134,15 +134,15 @@ def test_finished_study_starts_nothing(whole, file, monkeypatch):
     """Giving the command again adds no row and starts no process."""
     paths = [whole.cell_path(cell) / "result.json" for cell in whole.cells()]
     before = [path.read_bytes() for path in paths]
-    monkeypatch.setattr(subprocess, "Popen", None)
-    cli.RunOptions(folder=whole.path, file=file).run()
+    monkeypatch.setattr(LocalProcesses, "run", lambda self, cell: pytest.fail("something was started"))
+    cli.RunOptions(folder=whole.path, file=file, allow_uncommitted=True).run()
     assert [path.read_bytes() for path in paths] == before
 
 
 def test_stopped_and_killed_study_ends_with_the_same_table(whole, file, tmp_path):
     """A study interrupted, then killed with SIGKILL, ends with the table of one that was not, no cell twice."""
     study = StudyFolder(tmp_path / "broken")
-    options = cli.RunOptions(folder=study.path, file=file, workers=2)
+    options = cli.RunOptions(folder=study.path, file=file, workers=2, allow_uncommitted=True)
     with pytest.raises(SystemExit) as stop:
         options.run(stopped=lambda: min(iterations(study).values(), default=0) >= 2)
     assert stop.value.code == 130
@@ -197,7 +197,10 @@ def test_worker_that_dies_is_retried_once_then_given_up(file, tmp_path, capsys):
     cli.ShowOptions(folder=study.path).run()
     assert f"{victim.name} failed: {error}" in capsys.readouterr().out
     cli.RunOptions(folder=study.path, retry_failed=True).run()
-    assert capsys.readouterr() == (f"{study.path}\n", f"Next: deimos study report {study.path}\n")
+    said = capsys.readouterr()
+    assert said.out == f"{study.path}\n"
+    assert said.err.startswith("1 run(s): 0.0 M transitions (FPS measured on a short run of each kind) + ")
+    assert said.err.endswith(f" core-hours.\nNext: deimos study report {study.path}\n")
     assert study.finished(study.cells()) == {cell.digest for cell in study.cells()}
 
 
@@ -306,5 +309,6 @@ def test_broken_run_is_one_line_of_a_worker(whole, tmp_path, capsys):
     run = study.cell_path(cell) / "run"
     run.mkdir()
     (run / "checkpoint.pt").write_text("not a checkpoint")
+    (run / "config.json").write_text("{}")
     assert worker.main([str(study.path), cell.name]) == 2
-    assert capsys.readouterr().err == f"{Path(run)} is not a run folder: it holds no config.json.\n"
+    assert capsys.readouterr().err == f"{Path(run) / 'config.json'} is not that of a run of schema 1.\n"

@@ -64,6 +64,7 @@ ELSEWHERE = {
     r"pip install torch==": "it fetches from another host; no test does",
     r"deimos pool |.* --pool ": "tests/test_deimos_attackers.py, with policies that crash",
     r"python examples/\w+\.py$": "tests/test_examples.py",
+    r"reproduction/freeze ": "tests/test_reproduction_studies.py, in a repository of its own",
 }
 """Commands that are run elsewhere, and where."""
 
@@ -180,7 +181,10 @@ class Session:
                 name = "study"
             else:
                 seeds = arguments[arguments.index("--seeds") + 1] if "--seeds" in arguments else "0"
+                arguments = [*arguments, "--allow-uncommitted"]  # whatever this checkout holds
                 arguments = shortened(arguments, {"--seeds": "{0}-{0}".format(*re.findall(r"\d+", seeds))})
+        if arguments[:2] == ["study", "attack"]:
+            arguments = [*arguments, "--allow-uncommitted"]
         if name == "play":  # MuJoCo decides once in a process how it renders
             self.process(sys.executable, "-m", "deimos", *shortened(arguments, BUDGETS[name]))
             return

@@ -1,47 +1,109 @@
 """The studies of the thesis, as files: what is in them, and that their cells are still those of the committed rows."""
 
+import os
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from deimos.study import plan
+from deimos.study.results import check_comparable, identity
 from reproduction.thesis import DIRECTOR_METHODS, LEGGED_METHODS, PARTICLE_METHODS
 
+PARTICLE_VARIANTS = ("directional", "relative", "absolute")
+
 ROOT = Path(__file__).parent.parent
-FILES = {
-    path.stem: path for path in [*(ROOT / "reproduction" / "studies").glob("*.toml"), ROOT / "examples/study.toml"]
-}
-PARTICLE = [name for name in FILES if not name.startswith("quad")]
+STUDIES = ROOT / "reproduction" / "studies"
+FILES = {path.stem: path for path in [*STUDIES.glob("*.toml"), *(ROOT / "examples").glob("*.toml")]}
+BLOCKS = {f"particle_{letter}": count for letter, count in zip("abcdef", (330, 90, 40, 40, 80, 80), strict=True)}
+"""The blocks of the populations of Particle Gym, with their numbers of cells."""
+
+
+@pytest.fixture
+def pools(tmp_path, monkeypatch):
+    """A working directory with the files that cells are made from."""
+    folder = tmp_path / "reproduction" / "pool"
+    folder.mkdir(parents=True)
+    for name in PARTICLE_VARIANTS:
+        (folder / f"{name}.pt").write_text(name)
+    monkeypatch.chdir(tmp_path)
 
 
 def test_every_study_of_the_thesis_is_there():
-    """Each figure of the thesis has its study."""
-    assert set(FILES) == {
-        "absolute", "relative", "directional", "particle", "quad", "quad_arm", "population", "pilots", "study",
-    }  # fmt: skip
+    """Particle Gym has its blocks and their base, each robot its study."""
+    assert set(FILES) == {*BLOCKS, "particle", "quad", "quad_arm", "population", "pilots", "study", "sweep"}
 
 
-@pytest.mark.parametrize("name", PARTICLE)
-def test_studies_of_particle_gym_expand(name):
+@pytest.mark.parametrize("name", [name for name in FILES if not name.startswith("quad")])
+def test_studies_of_particle_gym_expand(name, pools):
     """Every study of Particle Gym is a valid grid of different cells."""
-    description = plan.read(FILES[name])
-    cells = plan.expand(description, seeds=[0, 1])
+    cells = plan.expand(plan.read(FILES[name]))
     assert len({cell.digest for cell in cells}) == len({cell.name for cell in cells}) == len(cells)
-    expected = sum(len(each.get("methods", description["methods"])) for each in description["environment"])
-    assert len(cells) == 2 * expected
+    assert len(cells) == BLOCKS.get(name, len(cells))
 
 
-def test_studies_are_the_thesis():
+def test_blocks_make_one_table(pools):
+    """The cells of all blocks can be compared: an environment is one setting, and all meet the same attackers."""
+    cells = [cell for name in BLOCKS for cell in plan.expand(plan.read(FILES[name]))]
+    check_comparable(map(identity, cells))
+    assert {cell.config.eval.attackers for cell in cells} == {("argmax", "pooled", "scripted")}
+    assert {cell.config.eval.pool.stem == cell.environment for cell in cells} == {True}
+    for name in BLOCKS:
+        (more,) = plan.rounds(plan.read(FILES[name]))
+        assert (more.attackers, more.seeds) == (("argmax-long", "search", "q-fear"), (0, 3, 6, 9))
+
+
+def test_studies_are_the_thesis(pools):
     """Particle Gym has ten methods, ten seeds and 2000 or 5000 steps; the legged ones twelve, thirty and two T."""
-    description = plan.read(FILES["particle"])
-    cells = plan.expand(description, seeds=[0])
+    description = plan.read(FILES["particle_a"])
+    cells = plan.expand(description)
     steps = {cell.environment: cell.config.env_steps for cell in cells}
     assert steps == {"directional": 2000, "relative": 2000, "absolute": 5000}
     assert {cell.config.num_envs for cell in cells} == {2000}
-    assert (description["seeds"], set(description["methods"])) == (10, {*PARTICLE_METHODS, "learnability"})
+    assert {cell.config.seed for cell in cells} == set(range(10))
+    names = {name.removesuffix("-literal") for name in description["methods"]}
+    assert names == {*PARTICLE_METHODS, "learnability"}
+    for cell in cells:  # as in the thesis, fear learns from the last 2 T steps alone
+        assert getattr(cell.config.goals, "memory", 0) == 0 or cell.config.method in ("rnd", "vds", "learnability")
     assert (len(DIRECTOR_METHODS), len(PARTICLE_METHODS), len(LEGGED_METHODS)) == (7, 10, 12)
     for name in ("quad", "quad_arm"):
         description = plan.read(FILES[name])
         assert (description["seeds"], set(description["methods"])) == (30, set(LEGGED_METHODS))
         (environment,) = description["environment"]
         assert (environment["name"], environment["goal_periods"]) == (name, [100, 500])
+
+
+PYTHON = """#!/usr/bin/env bash
+[ "$*" = "-m venv .venv" ] && mkdir -p .venv/bin && printf '#!/bin/sh\\necho pip "$@" > asked\\n' > .venv/bin/pip \\
+    && chmod +x .venv/bin/pip
+"""
+
+
+def test_frozen_commit_has_a_worktree_of_its_own(tmp_path):
+    """The command makes a worktree of a commit, into which it installs that commit's own sources."""
+    home, frozen, tools = (tmp_path / name for name in ("home", "frozen", "tools"))
+    (home / "reproduction").mkdir(parents=True)
+    tools.mkdir()
+    (tools / "python3").write_text(PYTHON)
+    (tools / "python3").chmod(0o755)
+    script = home / "reproduction" / "freeze"
+    script.write_bytes((ROOT / "reproduction" / "freeze").read_bytes())
+    script.chmod(0o755)
+
+    def git(*arguments):
+        command = ["git", "-C", str(home), "-c", "user.name=x", "-c", "user.email=x@example.org", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    git("init", "-q")
+    for text in ("one", "two"):
+        (home / "source").write_text(text)
+        git("add", "-A")
+        git("commit", "-q", "-m", text)
+    env = os.environ | {"PATH": f"{tools}{os.pathsep}{os.environ['PATH']}"}
+    command = [str(script), "HEAD~1", str(frozen)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+    assert (frozen / "source").read_text() == "one"
+    assert (frozen / "asked").read_text() == "pip install --quiet -c constraints.txt -e .[all]\n"
+    assert done.stdout.splitlines()[-1].startswith(f"cd {frozen} && .venv/bin/deimos study run runs/particle_a --file ")
+    wrong = subprocess.run(command[:2], env=env, capture_output=True, text=True, check=False)
+    assert (wrong.returncode, wrong.stderr) == (2, "usage: reproduction/freeze COMMIT FOLDER\n")

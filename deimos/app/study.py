@@ -4,7 +4,7 @@ from functools import partial
 from typing import Any
 
 from deimos.app import console
-from deimos.study.cli import COMMANDS, RunOptions
+from deimos.study.cli import COMMANDS, LONG
 
 
 def main(arguments: list[str], program: str) -> None:
@@ -15,7 +15,7 @@ def main(arguments: list[str], program: str) -> None:
 
 def _run(options: Any, arguments: list[str], program: str) -> None:
     parsed = console.parse(options, arguments, program)
-    if isinstance(parsed, RunOptions):  # the one that takes long
+    if isinstance(parsed, LONG):
         with console.stop_on_interrupt() as stopped, console.progress("study") as report:
             parsed.run(stopped, report)
     else:

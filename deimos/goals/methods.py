@@ -38,6 +38,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "shuffled": ("director", {"percentile": 75, "control": "shuffled"}),
     "state-blind": ("director", {"percentile": 75, "control": "state-blind"}),
     "swapped": ("swapped", {}),
+    "p75-penalty": ("penalty", {"base": "p75"}),
     "uniform-ensemble": ("vds", {"rule": "uniform"}),
     "vds-argmax": ("vds", {"rule": "argmax"}),
     "rnd-raw": ("rnd", {"whiten": False}),

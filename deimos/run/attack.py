@@ -72,6 +72,10 @@ class AttackerConfig(abc.ABC):
     needs_pool: ClassVar[bool] = False
     """Whether it is made from the file ``EvalConfig.pool``."""
 
+    def learning_steps(self, steps: int) -> int:
+        """Steps of every world that it learns from, where the thesis's Adversary learns from ``steps``."""
+        return 0
+
     @abc.abstractmethod
     def prepare(self, target: Target) -> Attack:
         """Learn what there is to learn about a policy."""

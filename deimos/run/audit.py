@@ -6,6 +6,7 @@ gets another candidate goal, and the policy is rolled out for T steps under each
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from deimos.nn.random import Purpose, normals, uniforms
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
 from deimos.run.trainer import Trainer
+from deimos.sim.env import Env
 
 CANDIDATES = 50  # goals tried in every context
 BATCH = 256  # contexts cloned at a time
@@ -193,8 +195,94 @@ def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Te
         trainer.loop.advance(step)
     draw = uniforms(trainer.config.seed, Purpose.AUDIT_CONTEXT, rows, rows.new_tensor(act.steps))[:, 0]
     rows = rows[draw.argsort()[:BATCH]]
+    tried = _tried(env, rows, clones)
+    trainer.loop.advance(step)
+    return tried
+
+
+def _tried(env: Env, rows: Tensor, clones: Clones) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What candidates would do in worlds whose goals are due; see ``_next_contexts``."""
     obs = env.obs[rows]
     candidates = env.sample_goals(rows, CANDIDATES).clone()
     survived = clones.try_out(env, rows, candidates)
-    trainer.loop.advance(step)
     return rows, env.state(obs), obs[:, env.goal_slice], candidates, survived
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a selector chose in the next decision of some worlds, beside what would have become of every candidate."""
+
+    percentile: list[float]
+    """Percentile of the chosen goal among 50 candidates by how soon each crashes the policy, ties counting half, in
+    the worlds where candidates differ."""
+    auroc: list[float]
+    """How often fear ranks a candidate that crashes above one that does not, in the worlds that have both; empty
+    without a fear network that has learnt."""
+    place: Tensor
+    """Where each world was in the box of its world, in [-1, 1], shape (n, goal_dim): its position or, where that is no
+    part of the state or has another size, the active goal in the box of valid goals."""
+    chosen: Tensor
+    """Where the chosen goal is in the box of valid goals, in [-1, 1], shape (n, goal_dim); none where these are no
+    box."""
+
+
+@torch.no_grad()
+def audit_choices(trainer: Trainer, worlds: int, clones: Clones) -> Choices:
+    """Measure one decision of a training run's selector in each of some worlds.
+
+    The run's own worlds continue as in training, without learning, for T steps. So no world counts twice, and those
+    whose episode ends before their goal is due do not count.
+
+    Args:
+        trainer: A run. Its worlds move on.
+        worlds: How many of its worlds, drawn at random; at least 1.
+        clones: Where candidates are tried; see ``audit_clones``.
+    """
+    env, loop = trainer.env, trainer.loop
+    act, tried = _Explorer(trainer), _Explorer(trainer, first_world=env.num_envs)
+    act.steps = tried.steps = trainer.iteration * env.goal_period  # so that no two audits of a run draw the same
+    clones.act = tried
+    every = torch.arange(env.num_envs, device=env.device)
+    draw = uniforms(trainer.config.seed, Purpose.AUDIT_CONTEXT, every, every.new_tensor(act.steps))[:, 0]
+    wanted = torch.zeros_like(draw, dtype=torch.bool)
+    wanted[draw.argsort()[:worlds]] = True
+    parts = []
+    for _ in range(env.goal_period):
+        step = env.step(act(env.obs))
+        rows = (step.goal_due & ~step.terminated & ~step.truncated & wanted).nonzero().squeeze(1)
+        if len(rows):
+            parts.append(_choices(trainer, rows, clones))
+            wanted[rows] = False
+        loop.advance(step)
+    nothing = torch.zeros(0, env.goal_dim, device=env.device)
+    return Choices(
+        percentile=[value for part in parts for value in part.percentile],
+        auroc=[value for part in parts for value in part.auroc],
+        place=torch.cat([nothing, *(part.place for part in parts)]),
+        chosen=torch.cat([nothing, *(part.chosen for part in parts)]),
+    )
+
+
+def audit_clones(trainer: Trainer) -> Clones:
+    """Worlds for ``audit_choices`` to try candidates in, for as many audits of the run as one likes."""
+    return _explorers(trainer)[1]
+
+
+def _choices(trainer: Trainer, rows: Tensor, clones: Clones) -> Choices:
+    env, selector = trainer.env, trainer.loop.selector
+    rows, state, goal, candidates, survived = _tried(env, rows, clones)
+    chosen = selector.propose(rows, state, goal, candidates, env.draw(rows)).goal
+    pick = (candidates == chosen.unsqueeze(1)).all(2).int().argmax(1)
+    percentile = picks.percentile(-survived, pick)[survived.amin(1) < survived.amax(1)].tolist()
+    afraid, ranks = fear_selector(selector), []
+    if afraid is not None and afraid.fear.fitted:
+        crashed = survived < env.goal_period
+        pairs = zip(afraid.score(state, goal, candidates), crashed, strict=True)
+        ranks = [auroc(score, label) for score, label in pairs if 0 < int(label.sum()) < CANDIDATES]
+    bounds = env.goal_bounds(rows)
+    if bounds is None:
+        return Choices(percentile, ranks, chosen[:0], chosen[:0])
+    middle, half = (bounds[0] + bounds[1]) / 2, (bounds[1] - bounds[0]) / 2
+    position = env.place(rows)
+    where = (goal - middle) / half if position is None else position
+    return Choices(percentile, ranks, where, (chosen - middle) / half)

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import types
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,8 @@ def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
     Raises:
         ValueError: If a field is unknown or a value is not allowed.
     """
+    if not isinstance(data, Mapping):
+        raise ValueError(f"{cls.__name__} must be a table of its fields, got {data!r}.")
     data = dict(data)
     if cls in _PLUGINS:
         if "kind" not in data:

@@ -248,6 +248,26 @@ class Env(abc.ABC):
         """
         return None
 
+    def place(self, rows: Tensor) -> Tensor | None:
+        """Where the listed worlds are in the box that they crash outside of.
+
+        Args:
+            rows: Worlds, int64, shape (B,).
+
+        Returns:
+            Shape (B, goal_dim), in [-1, 1] inside; ``None`` where there is no such box.
+        """
+        return None
+
+    def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
+        """Put worlds where any goal is dangerous and where none is, to ask a fear network about both.
+
+        Returns:
+            The former and the latter, int64, shapes (m,) and (n,); ``None`` where the environment knows no such places.
+            Their goals are uniform.
+        """
+        return None
+
     def strata(self) -> list[str]:
         """What kind of world each one is, such as the ground that it stands on, for evaluation; empty for no kinds."""
         return []

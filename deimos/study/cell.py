@@ -9,18 +9,26 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable
-from itertools import chain
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from deimos.checks import RunError, SimulationError, one_line
+from deimos.goals.fear_selector import fear_selector
 from deimos.run import training
+from deimos.run.attackers.pooled import save_fear
 from deimos.run.evaluation import evaluate_run
 from deimos.run.folder import RunFolder
+from deimos.run.trainer import Trainer
 from deimos.sim.shared import one_stream
-from deimos.study.folder import StudyFolder
+from deimos.study.audits import Audits, speed
+from deimos.study.folder import FEAR, StudyFolder
 from deimos.study.lock import hold
 from deimos.study.plan import Cell
-from deimos.study.results import result
+from deimos.study.results import evaluated, result
+from deimos.study.source import check_sources, code
 
 STOPPED = 130
 PATIENCE_SECONDS = 5.0  # a worker whose runner was killed needs a moment to see it
@@ -37,7 +45,8 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
     cell is finished.
 
     Raises:
-        RunError: If another process works on it, a file cannot be read or written, or the run cannot begin.
+        RunError: If another process works on it, a file cannot be read or written, the run cannot begin, or the code is
+            not that of the cell.
         SimulationError: If a number is not finite.
     """
 
@@ -47,23 +56,65 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
 
     home = study.cell_path(cell)
     with hold(home / "lock", f"Cell {cell.name}", patience=PATIENCE_SECONDS):
-        path = home / "run"
         device = training.resolve_device(cell.config.device)
-        with one_stream(device):
-            if (path / "checkpoint.pt").exists():
-                trainer, folder = training.resume(path)
-            else:
-                shutil.rmtree(path, ignore_errors=True)  # it was killed before its first checkpoint
-                trainer, folder = training.start(cell.config, path, None)
-            if not training.train(trainer, folder, stopped=stopped) or stopped():
-                return False
-            tasks = [cell.config.env.with_goal_period(period) for period in cell.goal_periods]
-            try:
-                rows = [evaluate_run(folder, task, cell.config.eval, device, watch, again=False) for task in tasks]
-            except _Interrupted:
-                return False
-        RunFolder(home).write_json("result.json", result(cell, folder, chain.from_iterable(rows)))
+        try:
+            with one_stream(device):
+                if not (home / "result.json").exists():
+                    check_sources(f"Cell {cell.name}", cell.sources, cell.plugins, cell.config.eval.pool)
+                    if not _train(RunFolder(home), cell, device, stopped) or stopped():
+                        return False
+                    _finish(RunFolder(home), cell, device, watch)
+                _attack(study, cell, device, watch)
+        except _Interrupted:
+            return False
         return True
+
+
+def _train(home: RunFolder, cell: Cell, device: torch.device, stopped: Callable[[], bool]) -> bool:
+    """Train to the end, with audits on the way, and keep the fear network; returns whether it came there."""
+    path = home.path / "run"
+    if (path / "checkpoint.pt").exists() and not (path / "config.json").exists():
+        print(f"{path} holds no config.json; the cell is made again.", file=sys.stderr)
+    if (path / "checkpoint.pt").exists() and (path / "config.json").exists():
+        trainer, folder = training.resume(path)
+    else:
+        shutil.rmtree(path, ignore_errors=True)  # it was killed before its first checkpoint
+        trainer, folder = training.start(cell.config, path, None)
+    audits = Audits(home, trainer.config, cell.audit_worlds)
+    if not training.train(trainer, folder, lambda row, fps: audits.after(trainer), stopped):
+        return False
+    _keep_fear(home.path / FEAR, trainer)
+    return True
+
+
+def _keep_fear(path: Path, trainer: Trainer) -> None:
+    """Keep the fear network of a selector that has one which has learnt: a file that the attacker ``pooled`` reads."""
+    afraid = fear_selector(trainer.loop.selector)
+    if afraid is not None and afraid.fear.fitted:
+        save_fear(path, afraid.fear, trainer.env, {})
+
+
+def _finish(home: RunFolder, cell: Cell, device: torch.device, watch: Callable[[str, float], None]) -> None:
+    """Evaluate what was trained, and write ``result.json``."""
+    folder, config = RunFolder(home.path / "run"), cell.config
+    tasks = [config.env.with_goal_period(period) for period in cell.goal_periods]
+    parts = [evaluate_run(folder, task, config.eval, device, watch, again=False) for task in tasks]
+    audited: dict[str, Any] = Audits(home, config, cell.audit_worlds).row()
+    if audited:
+        audited["speed"] = speed(folder, config.env, config.eval.seed, device)
+    home.write_json("result.json", result(cell, folder, [row for part in parts for row in part], audited))
+
+
+def _attack(study: StudyFolder, cell: Cell, device: torch.device, watch: Callable[[str, float], None]) -> None:
+    """Evaluate a finished cell under the study's further attackers that it has not met, and add the rows."""
+    home, made_by = RunFolder(study.cell_path(cell)), code().name
+    for period, attackers in study.missing(cell).items():
+        folder = RunFolder.open(home.path / "run")
+        config = replace(cell.config.eval, attackers=attackers)
+        rows = evaluate_run(folder, cell.config.env.with_goal_period(period), config, device, watch, again=False)
+        found = home.read_json("result.json")
+        fresh = evaluated(cell, folder, [row for row in rows if row["goals"] in attackers], made_by)
+        home.write_json("result.json", found | {"rows": found["rows"] + fresh})
 
 
 def main(arguments: list[str], stopped: Callable[[], bool] = lambda: False) -> int:

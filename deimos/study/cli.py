@@ -16,11 +16,13 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from deimos.checks import RunError, check_at_least
-from deimos.study import plan
+from deimos.study import archive, factors, plan
 from deimos.study.engine import LocalProcesses
+from deimos.study.estimate import estimate
 from deimos.study.folder import StudyFolder
 from deimos.study.results import check_comparable, identity, merge
 from deimos.study.runner import Progress, Runner
+from deimos.study.source import check_sources, code
 
 WIDEST = 10_000  # columns of a table
 
@@ -58,6 +60,10 @@ class RunOptions(_FolderOptions):
     """Parallel runs, at least 1."""
     retry_failed: bool = False
     """Whether to try the cells again that were given up."""
+    allow_uncommitted: bool = False
+    """Whether sources may differ from the commit that is checked out; a hash of them stands for it then."""
+    estimate: bool = False
+    """Whether to print what the study takes, and start nothing."""
 
     def __post_init__(self) -> None:
         check_at_least("workers", self.workers, 1)
@@ -84,36 +90,155 @@ class RunOptions(_FolderOptions):
         """
         study = StudyFolder(self.folder)
         if self.file is not None:
-            cells = self._described(self.file)
-            found = study.results()
-            check_comparable([*found.rows, *found.curves, *map(identity, [*study.cells(), *cells])])
-            study.add(cells)
+            self._add(study, plan.read(self.file))
         if not study.cells():
             raise RunError(f"{study.path} holds no study; begin one with --file.")
+        _say_strays(study)
         if self.retry_failed:
             study.forget_failures()
-        end = Runner(study, LocalProcesses(study), self.workers).run(
-            lambda progress: report(_summary(progress), _share(progress)), stopped
-        )
-        if end.finished + len(end.failed) < end.total:
-            print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
-                  f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
-            raise SystemExit(130)
-        if end.failed:
-            name, error = next(iter(end.failed.items()))
-            raise RunError(
-                f"{len(end.failed)} of {end.total} cells failed, {name} first: {error}. See log.txt in their folders; "
-                f"--retry-failed tries them again."
-            )
-        print(study.path)
-        print(f"Next: deimos study report {study.path}", file=sys.stderr)
+        open_ = _open(study)
+        if open_:
+            print(estimate(study, open_), file=sys.stderr, flush=True)
+        if not self.estimate:
+            _work(study, self.workers, stopped, report)
 
-    def _described(self, file: Path) -> list[plan.Cell]:
+    def _add(self, study: StudyFolder, description: dict) -> None:
+        """Add what a file describes to a study, after all that can be wrong with it was checked."""
         train = {name: getattr(self, name) for name in ("num_envs", "env_steps", "device", "threads")}
-        return plan.expand(
-            plan.read(file), seeds=self.seeds, methods=self.methods, environments=self.environments,
+        cells = plan.expand(
+            description, seeds=self.seeds, methods=self.methods, environments=self.environments,
             train={name: x for name, x in train.items() if x is not None},
         )  # fmt: skip
+        rounds = plan.rounds(description)
+        found = study.results()
+        check_comparable([*found.rows, *found.curves, *map(identity, [*study.cells(), *cells])])
+        _check_committed(self.allow_uncommitted)
+        if description.get("factors"):
+            print(factors.describe(description["factors"], description.get("design", {})), file=sys.stderr)
+        study.add(cells)
+        study.add_rounds(rounds)
+
+
+def _check_committed(allowed: bool) -> None:
+    """Say what stands for the code of new rows where no commit does; ``RunError`` unless that is ``allowed``."""
+    here = code()
+    if here.changed and not allowed:
+        raise RunError(
+            f"{len(here.changed)} source file(s) differ from commit {here.commit} ({here.changed[0]} first), so no "
+            f"commit says what made the rows. Commit them, or let a hash stand for them by --allow-uncommitted."
+        )
+    if here.name == here.sources:
+        print(f"No commit says what code this is; a hash of it does: {here.name}.", file=sys.stderr)
+
+
+def _say_strays(study: StudyFolder) -> None:
+    if strays := study.strays():
+        print(
+            f"{len(strays)} folder(s) in {study.path / 'cells'} hold no cell.json ({strays[0]} first) and are left "
+            f"out; give the study's --file again to make such cells anew.", file=sys.stderr,
+        )  # fmt: skip
+
+
+def _open(study: StudyFolder) -> list[plan.Cell]:
+    """The cells of a study that are not finished; raises ``RunError`` if one is to be trained by other code."""
+    cells = study.cells()
+    finished = study.finished(cells)
+    left = [cell for cell in cells if cell.digest not in finished]
+    untrained = [cell for cell in left if not (study.cell_path(cell) / "result.json").exists()]
+    for cell in {tuple(sorted(cell.sources.items())): cell for cell in untrained}.values():
+        check_sources(f"Cell {cell.name}", cell.sources, cell.plugins, cell.config.eval.pool)
+    return left
+
+
+def _work(study: StudyFolder, workers: int, stopped: Callable[[], bool], report: Callable[[str, float], None]) -> None:
+    """Work on a study until it is finished; see ``RunOptions.run``."""
+    end = Runner(study, LocalProcesses(study), workers).run(
+        lambda progress: report(_summary(progress), _share(progress)), stopped
+    )
+    if end.finished + len(end.failed) < end.total:
+        print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
+              f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
+        raise SystemExit(130)
+    if end.failed:
+        name, error = next(iter(end.failed.items()))
+        raise RunError(
+            f"{len(end.failed)} of {end.total} cells failed, {name} first: {error}. See log.txt in their folders; "
+            f"--retry-failed tries them again."
+        )
+    print(study.path)
+    print(f"Next: deimos study report {study.path}", file=sys.stderr)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttackOptions(_FolderOptions):
+    """Evaluate the policies of a finished study under further attackers.
+
+    What was killed continues when the command is given again, or by ``run``. Policies that are not in the folder any
+    more come from its archive.
+    """
+
+    attackers: tuple[str, ...]
+    """Names of the attackers."""
+    seeds: str | None = None
+    """Seeds of the policies that meet them. By default all."""
+    workers: int = 1
+    """Policies at a time, at least 1."""
+    allow_uncommitted: bool = False
+    """Whether sources may differ from the commit that is checked out; a hash of them stands for it then."""
+
+    def __post_init__(self) -> None:
+        check_at_least("workers", self.workers, 1)
+        self._round()
+
+    def _round(self) -> plan.AttackRound:
+        seeds = tuple(plan.parse_seeds(self.seeds)) if self.seeds else ()
+        return plan.AttackRound(attackers=self.attackers, seeds=seeds)
+
+    def run(
+        self,
+        stopped: Callable[[], bool] = lambda: False,
+        report: Callable[[str, float], None] = lambda said, share: None,
+    ) -> None:
+        """Attack what has not met all of them yet; for the arguments and errors see ``RunOptions.run``."""
+        study = StudyFolder(self.folder)
+        archive.unpack(study)
+        cells = study.cells()
+        if not cells:
+            raise RunError(f"{study.path} holds no policies: neither cells nor {archive.FILE}.")
+        trained = [cell for cell in cells if (study.cell_path(cell) / "result.json").exists()]
+        if len(trained) < len(cells):
+            raise RunError(
+                f"{len(cells) - len(trained)} of {len(cells)} cells are not finished; finish them first: deimos study "
+                f"run {study.path}"
+            )
+        lost = {row["hash"] for row in study.results().rows} - {cell.digest for cell in cells}
+        if lost:
+            print(f"{len(lost)} policies of the tables are lost and stay as they are.", file=sys.stderr)
+        _check_committed(self.allow_uncommitted)
+        study.add_rounds([self._round()])
+        _work(study, self.workers, stopped, report)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackOptions(_FolderOptions):
+    """Put the policies of the finished cells into policies.zip, beside those that are in it."""
+
+    def run(self) -> None:
+        """Write the archive; ``RunError`` if there is no policy."""
+        path, count = archive.pack(StudyFolder(self.folder))
+        print(f"{path}: {count} policies, {path.stat().st_size / 1024 / count:.1f} kB each")
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnpackOptions(_FolderOptions):
+    """Put the policies of policies.zip back into folders of cells, to look at them or to attack them."""
+
+    def run(self) -> None:
+        """Write them; ``RunError`` if there is no archive."""
+        study = StudyFolder(self.folder)
+        if not (study.path / archive.FILE).exists():
+            raise RunError(f"{study.path} holds no {archive.FILE}.")
+        print(f"{archive.unpack(study)} policies put back into {study.path / 'cells'}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +268,7 @@ class ShowOptions(_FolderOptions):
         screen = Console()
         needed = Measurement.get(screen, screen.options.update(width=WIDEST), table).maximum
         Console(width=max(screen.width, needed)).print(table)  # the terminal wraps what does not fit; nothing is cut
+        _say_strays(study)
         if cells:
             finished = study.finished(cells)
             print(f"{len(finished)} of {len(cells)} cells are finished.")
@@ -200,10 +326,12 @@ class ReportOptions:
 
 
 COMMANDS: dict[str, Any] = {
-    "run": RunOptions, "show": ShowOptions, "merge": MergeOptions, "export": ExportOptions, "report": ReportOptions,
+    "run": RunOptions, "show": ShowOptions, "attack": AttackOptions, "pack": PackOptions, "unpack": UnpackOptions,
+    "merge": MergeOptions, "export": ExportOptions, "report": ReportOptions,
 }  # fmt: skip
-"""The options of every command, whose ``run`` does it; that of ``RunOptions`` takes what says when to stop
-and what shows progress."""
+"""The options of every command, whose ``run`` does it; those of ``LONG`` take what says when to stop and what shows
+progress."""
+LONG = (RunOptions, AttackOptions)
 
 
 def _share(progress: Progress) -> float:

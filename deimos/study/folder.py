@@ -1,20 +1,25 @@
 """A study's folder: ``cells/NAME/`` for every cell, and the tables of an export or a merge.
 
-A cell's folder holds ``cell.json`` (what it is), ``run/`` (its run folder), ``result.json`` once it is finished,
-``log.txt`` (what its workers said) and ``failures.jsonl`` (how they died).
+A cell's folder holds ``cell.json`` (what it is), ``run/`` (its run folder), ``audits.json`` (what was measured late in
+its training), ``fear.pt`` (its fear network, where it has one), ``result.json`` once it is finished, ``log.txt`` (what
+its workers said) and ``failures.jsonl`` (how they died). ``attack.json`` has the attackers that were added later.
 """
 
+import contextlib
 import json
 import time
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
+from deimos.run.config import from_dict, to_dict
 from deimos.run.folder import RunFolder
 from deimos.study.lock import hold
-from deimos.study.plan import Cell, read_cell
+from deimos.study.plan import AttackRound, Cell, read_cell
 from deimos.study.results import Results
+
+ATTACK, FEAR = "attack.json", "fear.pt"
 
 
 class StudyFolder:
@@ -43,6 +48,39 @@ class StudyFolder:
                 path.mkdir(parents=True, exist_ok=True)
                 RunFolder(path).write_json("cell.json", cell.to_dict())
 
+    def strays(self) -> list[str]:
+        """Names of folders among the cells that do not say what cell they are."""
+        return sorted(path.name for path in self.path.glob("cells/*") if not (path / "cell.json").exists())
+
+    def rounds(self) -> list[AttackRound]:
+        """The attackers that were added."""
+        if not (self.path / ATTACK).exists():
+            return []
+        try:
+            found = RunFolder(self.path).read_json(ATTACK)
+            return [from_dict(AttackRound, each) for each in found]
+        except (AttributeError, TypeError, ValueError) as error:
+            raise RunError(f"{self.path / ATTACK} does not list attackers ({one_line(error)}).") from error
+
+    def add_rounds(self, rounds: Iterable[AttackRound]) -> None:
+        """Add attackers; those that are there already are not added twice."""
+        known = self.rounds()
+        if fresh := [each for each in dict.fromkeys(rounds) if each not in known]:
+            RunFolder(self.path).write_json(ATTACK, [to_dict(each) for each in [*known, *fresh]])
+
+    def missing(self, cell: Cell) -> dict[int, tuple[str, ...]]:
+        """The added attackers that a finished cell has not met yet, by T; none where it has met all."""
+        wanted = [each for each in self.rounds() if not each.seeds or cell.config.seed in each.seeds]
+        names = dict.fromkeys(name for each in wanted for name in each.attackers)
+        if not names:
+            return {}
+        rows = Results.of_cell(self.cell_path(cell)).rows or [
+            row for row in self.results().rows if row["hash"] == cell.digest
+        ]
+        met = {(row["goal_period"], row["goals"]) for row in rows}
+        left = {period: tuple(n for n in names if (period, n) not in met) for period in cell.goal_periods}
+        return {period: attackers for period, attackers in left.items() if attackers}
+
     def cells(self) -> list[Cell]:
         """All cells, seed by seed; see ``cell``."""
         found = [self.cell(path.parent.name) for path in sorted(self.path.glob("cells/*/cell.json"))]
@@ -66,15 +104,20 @@ class StudyFolder:
 
     def finished(self, cells: Iterable[Cell]) -> set[str]:
         """Digests of those of ``cells`` that have results, in their folders or in the study's tables."""
+        cells = list(cells)
         there = {cell.digest for cell in cells if (self.cell_path(cell) / "result.json").exists()}
         others = {cell.digest for cell in cells} - there
-        return there | (others & {row["hash"] for row in self.results().rows} if others else set())
+        there |= others & {row["hash"] for row in self.results().rows} if others else set()
+        return {cell.digest for cell in cells if cell.digest in there and not self.missing(cell)}
 
     def failures(self, cell: Cell) -> list[str]:
         """How a cell's workers have died so far, one line each."""
         path = self.cell_path(cell) / "failures.jsonl"
-        lines = path.read_text().splitlines() if path.exists() else []
-        return [json.loads(line)["error"] for line in lines if line.endswith("}")]
+        found = []
+        for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
+            with contextlib.suppress(ValueError, KeyError, TypeError):  # a kill may leave half a line
+                found.append(str(json.loads(line)["error"]))
+        return found
 
     def record_failure(self, cell: Cell, error: str) -> None:
         """Write down how a worker died."""

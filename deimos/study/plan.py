@@ -6,24 +6,39 @@ import json
 import re
 import tomllib
 import typing
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial, reduce
 from pathlib import Path
 from typing import Any
 
-from deimos.checks import RunError, one_line
+from deimos.checks import RunError, check_at_least, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets
+from deimos.run.attack import attacker
 from deimos.run.config import from_dict, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
+from deimos.study import factors
+from deimos.study.factors import merged
+from deimos.study.source import import_plugins, sources
+from deimos.study.tables import check_keys, check_kind, shown
 
-SCHEMA = 1  # of cell.json
-_KEYS = {"base", "seeds", "methods", "train", "environment"}
-_ENVIRONMENT_KEYS = {"name", "preset", "env", "methods", "train", "goal_periods"}
+SCHEMA = 2  # of cell.json
+MOST_SEEDS = 100_000
+_OWN: dict[str, tuple[type, type | None]] = {
+    "methods": (list, str), "train": (dict, None), "audit_worlds": (int, None),
+}  # fmt: skip
+_KEYS: dict[str, tuple[type, type | None]] = _OWN | {
+    "base": (str, None), "plugins": (list, str), "environment": (list, dict), "factors": (dict, None),
+    "design": (dict, None), "attack": (list, dict),
+}  # fmt: skip
+_ENVIRONMENT_KEYS: dict[str, tuple[type, type | None]] = _OWN | {
+    "name": (str, None), "preset": (str, None), "env": (dict, None), "goal_periods": (list, int),
+}  # fmt: skip
 _GRID = {"env", "method", "selector", "seed", "evaluation"}  # of TrainConfig: the grid's, not the settings'
 
 
@@ -37,8 +52,19 @@ class Cell:
     """The run, with the evaluation's sizes."""
     goal_periods: tuple[int, ...]
     """The T that the policy is evaluated at [steps]."""
+    base_environment: str = ""
+    """Name of the environment in the study's file, which factors divide."""
+    levels: dict[str, Any] = field(default_factory=dict)
+    """Level of every factor, by its name."""
+    audit_worlds: int = 100
+    """Worlds whose choices are audited at a time late in the training, at least 0; 0 for no audits."""
+    plugins: tuple[str, ...] = ()
+    """Modules that are imported before names are resolved."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """What the numbers depend on beside all this; see ``deimos.study.source.sources``."""
 
     def __post_init__(self) -> None:
+        check_at_least("audit_worlds", self.audit_worlds, 0)
         if not self.goal_periods or len(set(self.goal_periods)) < len(self.goal_periods):
             raise ValueError(f"goal_periods must be one or more different numbers, got {self.goal_periods}.")
         for period in self.goal_periods:
@@ -47,20 +73,27 @@ class Cell:
     @cached_property
     def digest(self) -> str:
         """First 12 hexadecimal digits of the SHA-256 of everything that the numbers depend on."""
-        selector, periods = _spelled_out(self.config.goals), list(self.goal_periods)
-        return _digest(config=to_dict(self.config), selector=selector, goal_periods=periods)
+        return _digest(
+            config=self._config(), selector=_spelled_out(self.config.goals), goal_periods=list(self.goal_periods),
+            audit_worlds=self.audit_worlds, plugins=list(self.plugins), sources=self.sources,
+        )  # fmt: skip
 
     @cached_property
     def setting(self) -> str:
-        """The same of what the cells of one environment must share to be compared: all but selector and seed."""
-        config = to_dict(self.config)
-        shared = {name: value for name, value in config.items() if name not in ("method", "selector", "seed")}
-        return _digest(config=shared, goal_periods=list(self.goal_periods))
+        """The same of what the cells of one environment must share to be compared: all but selector, seed, plugins."""
+        shared = {name: value for name, value in self._config().items() if name not in ("method", "selector", "seed")}
+        common = {name: value for name, value in self.sources.items() if name not in self.plugins}
+        return _digest(config=shared, goal_periods=list(self.goal_periods), sources=common)
 
     @cached_property
     def selector(self) -> str:
         """The same of what the cells of one method must share: what the method's name stands for."""
         return _digest(selector=_spelled_out(self.config.goals))
+
+    def _config(self) -> dict:
+        """The run's configuration; the file of the pool is told by its hash, wherever it lies."""
+        fields = to_dict(self.config)
+        return fields | {"eval": {name: value for name, value in fields["eval"].items() if name != "pool"}}
 
     @cached_property
     def name(self) -> str:
@@ -93,6 +126,7 @@ def read_cell(path: Path) -> Cell:
     try:
         if (found := data.pop("schema")) != SCHEMA:
             raise ValueError(f"its schema is {found}, not {SCHEMA}")
+        import_plugins(data["plugins"])
         return from_dict(Cell, data)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
@@ -101,21 +135,37 @@ def read_cell(path: Path) -> Cell:
 def read(path: Path) -> dict:
     """Read the description of a study from a TOML file.
 
-    Its keys: ``seeds`` (see ``parse_seeds``), ``methods`` (names), ``train`` (fields of
-    ``TrainConfig`` for all cells), and an ``[[environment]]`` for each environment or variant, with ``name``,
-    ``env`` (its ``kind`` and fields) and, if they differ there, ``methods``, ``train`` and ``goal_periods``; its
-    ``preset`` is one of ``deimos.run.presets``, where its environment and settings come from that are not said.
-    ``base`` names another such file, as seen from this one, where everything comes from that is not said.
+    Its keys:
+
+    * ``seeds`` (see ``parse_seeds``) and ``methods`` (names);
+    * ``train``: fields of ``TrainConfig`` for all cells;
+    * ``environment``: for each environment or variant its ``name``, ``env`` (``kind`` and fields) and, if they differ
+      there, ``methods``, ``train``, ``audit_worlds`` and ``goal_periods``; its ``preset`` is one of
+      ``deimos.run.presets``, where its environment and settings come from that are not said;
+    * ``factors`` and ``design``: see ``deimos.study.factors``;
+    * ``audit_worlds``: see ``Cell``;
+    * ``plugins``: names of modules that register selectors, attackers or environments;
+    * ``attack``: further attackers for some seeds, see ``rounds``;
+    * ``base``: another such file, as seen from this one, where everything comes from that is not said.
 
     Raises ``RunError`` if it or its base cannot be read or is not TOML.
     """
+    return _read(path, ())
+
+
+def _read(path: Path, readers: tuple[Path, ...]) -> dict:
+    if path.resolve() in readers:
+        raise RunError(f"{path} is a base of itself.")
     try:
         data = tomllib.loads(path.read_text())
-        return read(path.parent / data["base"]) | data if "base" in data else data
     except RecursionError as error:
-        raise RunError(f"{path} is a base of itself.") from error
-    except (OSError, TypeError, ValueError) as error:
-        raise RunError(f"{path} is not a study's TOML file ({error}).") from error
+        raise RunError(f"{path} is not a study's TOML file (it is nested too deep).") from error
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} is not a study's TOML file ({one_line(error)}).") from error
+    if "base" not in data:
+        return data
+    base = path.parent / check_kind(f"{path}: base", data["base"], str)
+    return _read(base, (*readers, path.resolve())) | data
 
 
 def expand(
@@ -134,48 +184,100 @@ def expand(
     Raises:
         RunError: If something is unknown, missing, doubled or out of range.
     """
-    _check_keys("A study", description, _KEYS)
+    _check_table("A study", description, _KEYS, {"seeds"})
     tables = description.get("environment", [])
-    if not isinstance(tables, list) or not tables:
+    if not tables:
         raise RunError("A study must have an [[environment]].")
-    names = [str(table.get("name", "")) for table in tables]
+    for table in tables:
+        _check_table("An [[environment]]", table, _ENVIRONMENT_KEYS)
+    names = [table.get("name", "") for table in tables]
     _check_unique("environment", names)
     if unknown := [name for name in environments or () if name not in names]:
         raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}.")
     wanted = names if environments is None else environments
     numbers = parse_seeds(description.get("seeds", 10) if seeds is None else seeds)
+    import_plugins(description.get("plugins", ()))
     try:
+        points = factors.expand(description.get("factors", {}), description.get("design", {}))
         grid = [
             cell for name, table in zip(names, tables, strict=True) if name in wanted
-            for cell in _environment(table, description, methods, train or {})
+            for index, point in enumerate(points)
+            for cell in _environment(table, description, methods, train or {}, point, _place(index, len(points)))
         ]  # fmt: skip
-        return [replace(cell, config=replace(cell.config, seed=seed)) for seed in numbers for cell in grid]
-    except (AttributeError, TypeError, ValueError) as error:  # what from_dict and the configurations raise
+        made_from = cache(partial(sources, tuple(description.get("plugins", ()))))  # it asks git, once
+        return [
+            replace(cell, config=replace(cell.config, seed=seed), sources=made_from(cell.config.eval.pool))
+            for seed in numbers for cell in grid
+        ]  # fmt: skip
+    except (AttributeError, RecursionError, TypeError, ValueError) as error:  # of from_dict and the configurations
         raise RunError(one_line(error)) from error
 
 
-def _environment(table: dict, study: dict, methods: Sequence[str] | None, train: dict) -> list[Cell]:
+def _place(index: int, count: int) -> str:
+    """What the name of an environment ends in at a point of a design."""
+    return f".{index:0{len(str(count - 1))}d}" if count > 1 else ""
+
+
+def _environment(
+    table: dict, study: dict, methods: Sequence[str] | None, train: dict, point: factors.Point, place: str
+) -> list[Cell]:
     """A cell, without its seed, for each method of an environment; arguments as those of ``expand``."""
-    _check_keys("An [[environment]]", table, _ENVIRONMENT_KEYS)
-    name = table.get("name")
-    if not isinstance(name, str) or not name.replace("_", "").replace(".", "").isalnum():
-        raise RunError(f"An [[environment]] must have a name of letters, digits, '.' and '_', got {name!r}.")
+    name = table.get("name", "")
+    if not name.replace("_", "").replace(".", "").isalnum():
+        raise RunError(f"An [[environment]] must have a name of letters, digits, '.' and '_', got {shown(name)}.")
     shared, own = study.get("train", {}), table.get("train", {})
-    if taken := sorted((set(shared) | set(own)) & _GRID):
-        raise RunError(f"{', '.join(taken)} cannot stand in 'train': the grid of the study says it.")
+    if taken := sorted((set(shared) | set(own)) & _GRID | set(point.fields) & (_GRID - {"env"})):
+        raise RunError(f"{', '.join(taken)} cannot stand in 'train' or be a factor: the grid of the study says it.")
     methods = list(table.get("methods", study.get("methods")) or [] if methods is None else methods)
     if not methods:
         raise RunError(f"Environment '{name}' has no methods.")
     _check_unique("method", methods)
     try:
         ready = _training_preset(table)
-        env = from_dict(EnvConfig, _merged(ready.pop("env", {}), table.get("env", {})))
+        tried = point.fields.get("env", {})
+        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried)))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error
-    fields = reduce(_merged, (ready, {"threads": 1}, shared, own, train, {"env": to_dict(env)}))
+    fields = reduce(merged, (ready, {"threads": 1}, shared, own, train, point.fields, {"env": to_dict(env)}))
     configs = [from_dict(TrainConfig, fields | {"method": each}) for each in methods]
-    periods = tuple(table.get("goal_periods") or [env.goal_period])
-    return [Cell(environment=name, config=config, goal_periods=periods) for config in configs]
+    plugins = tuple(study.get("plugins", ()))
+    worlds = table.get("audit_worlds", study.get("audit_worlds", Cell.audit_worlds))
+    return [
+        Cell(
+            environment=name + place, config=config, goal_periods=tuple(table.get("goal_periods") or [env.goal_period]),
+            base_environment=name, levels=point.levels, audit_worlds=worlds, plugins=plugins,
+        )
+        for config in configs
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttackRound:
+    """Attackers that some policies of a study meet beside those of its cells."""
+
+    attackers: tuple[str, ...]
+    """Their names, at least 1."""
+    seeds: tuple[int, ...] = ()
+    """Seeds of the policies; none for all."""
+
+    def __post_init__(self) -> None:
+        if not self.attackers:
+            raise ValueError("attackers must be one or more names, got none.")
+        for name in self.attackers:
+            attacker(name)
+
+
+def rounds(description: dict) -> list[AttackRound]:
+    """The ``[[attack]]`` of a study: ``attackers``, names, and the ``seeds`` (see ``parse_seeds``) that meet them."""
+    found = []
+    for table in description.get("attack", []):
+        _check_table("An [[attack]]", table, {"attackers": (list, str)}, {"seeds"})
+        seeds = tuple(parse_seeds(table["seeds"])) if "seeds" in table else ()
+        try:
+            found.append(AttackRound(attackers=tuple(table.get("attackers", ())), seeds=seeds))
+        except ValueError as error:
+            raise RunError(f"An [[attack]]: {error}") from error
+    return found
 
 
 def _training_preset(table: dict) -> dict:
@@ -183,8 +285,6 @@ def _training_preset(table: dict) -> dict:
     if "preset" not in table:
         return {}
     name = table["preset"]
-    if not isinstance(name, str):
-        raise ValueError(f"preset must be the name of one, got {name!r}.")
     kind = table.get("env", {}).get("kind", presets.environment(name))
     if kind != presets.environment(name):
         raise ValueError(f"preset '{name}' is for {presets.environment(name)}, not for {kind}.")
@@ -198,7 +298,7 @@ def parse_seeds(given: Any) -> list[int]:
     Raises ``RunError`` for anything else, and if a seed is there twice.
     """
     spans = []
-    if type(given) is int or re.fullmatch(r"[1-9]\d*", str(given)):
+    if type(given) is int or (isinstance(given, str) and re.fullmatch(r"[1-9]\d*", given)):
         spans = [range(int(given))]
     elif isinstance(given, str | list):
         for part in given.split(",") if isinstance(given, str) else map(str, given):
@@ -206,26 +306,23 @@ def parse_seeds(given: Any) -> list[int]:
             spans.append(range(int(found[1]), int(found[2] or found[1]) + 1) if found else range(0))
     if not spans or not all(spans):
         example = "a number of seeds, a range that rises like 10-19 or a list like 0,3,5"
-        raise RunError(f"seeds must be {example}, got {given!r}.")
+        raise RunError(f"seeds must be {example}, got {shown(given)}.")
+    if any(span.stop - span.start > MOST_SEEDS for span in spans):
+        raise RunError(f"seeds must be at most {MOST_SEEDS}, got {shown(given)}.")
     seeds = [seed for span in spans for seed in span]
     _check_unique("seed", seeds)
     return seeds
 
 
 def _check_unique(what: str, values: Sequence[Any]) -> None:
-    if doubled := sorted({value for value in values if list(values).count(value) > 1}):
+    if doubled := sorted(value for value, count in Counter(values).items() if count > 1):
         raise RunError(f"Every {what} must be given once; doubled: {', '.join(map(str, doubled))}.")
 
 
-def _check_keys(what: str, data: dict, known: set[str]) -> None:
-    if unknown := sorted(set(data) - known):
-        raise RunError(f"{what} has no {', '.join(unknown)}; it has: {', '.join(sorted(known))}.")
-
-
-def _merged(base: dict, over: dict) -> dict:
-    """``base`` with what ``over`` says, table by table."""
-    merged = dict(base)
-    for key, value in over.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merged(merged[key], value) if both else value
-    return merged
+def _check_table(
+    what: str, table: dict, kinds: Mapping[str, tuple[type, type | None]], others: Collection[str] = ()
+) -> None:
+    """Raise ``RunError`` for a key that a table does not have, or a value of another kind."""
+    check_keys(what, table, {*kinds, *others})
+    for key in kinds.keys() & table.keys():
+        check_kind(key, table[key], *kinds[key])

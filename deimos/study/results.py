@@ -15,8 +15,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 from deimos.files import write_whole
+from deimos.run.evaluation import worst
 from deimos.run.folder import RunFolder
 from deimos.study.plan import Cell
 
@@ -25,6 +26,8 @@ Row = dict[str, Any]
 
 _CELL: dict[str, type] = {
     "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
+    # The environment in the study's file, the levels of its factors there, and the code that made the row.
+    "base_environment": str, "levels": dict, "code": str,
 }  # fmt: skip
 RESULT_COLUMNS = _CELL | {
     # What was run.
@@ -38,16 +41,30 @@ RESULT_COLUMNS = _CELL | {
     "first_goal_steps": int, "first_goal_crashes": int,
     "adversary_steps": int, "adversary_interactions": int, "adversary_crashes": int, "adversary_auroc": float,
     "weak_adversary": bool, "uninformed": bool, "even_interactions": int, "even_interaction_crashes": int,
+    # Under the worst attacker that all policies of its environment and T met; see ``evaluation.worst``.
+    "worst": float, "worst_attacker": str, "worst_interactions": int,
     # By what.
     "fps": float, "weights": str, "device": str, "versions": str,
 }  # fmt: skip
-MEANS = ("reward", "crashes_per_1000", "selected_fraction")
-"""Columns of ``progress.csv`` that a training curve has means of."""
-CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS), tuple)
+MEANS = {
+    "reward": "reward", "crashes_per_1000": "crashes_per_1000", "selected_fraction": "selected_fraction",
+    "goal_percentile": "goal_percentile", "fear_chosen": "fear/chosen", "fear_auroc": "fear/auroc",
+}  # fmt: skip
+"""Columns of a training curve, and those of ``progress.csv`` that they are means of."""
+AUDITS: dict[str, type] = {
+    "exact_percentile": tuple, "exact_contexts": tuple, "auroc": tuple, "auroc_contexts": tuple, "risk": tuple,
+    "goal_map": tuple, "speed": float,
+}  # fmt: skip
+"""What ``deimos.study.audits`` finds late in a training."""
+CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS, "fear_fitted"), tuple) | AUDITS
 TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 FORMER_NAMES = {"selected_share": "selected_fraction"}
 """Columns of version 0.1.0 that have another name today."""
-LATER_COLUMNS = {"goal_groups", "uninformed", "even_interactions", "even_interaction_crashes"}
+LATER_COLUMNS = {
+    "goal_groups", "uninformed", "even_interactions", "even_interaction_crashes", "base_environment", "levels", "code",
+    "worst", "worst_attacker", "worst_interactions", "goal_percentile", "fear_chosen", "fear_auroc", "fear_fitted",
+    *AUDITS,
+}  # fmt: skip
 """Columns that its tables lack."""
 
 
@@ -68,15 +85,28 @@ class Results:
         """
         found = cls()
         for path in sorted(folder.glob("cells/*/result.json")):
-            data = RunFolder(path.parent).read_json(path.name)
-            if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-                raise RunError(f"{path} is not the result of a cell of schema {SCHEMA}.")
-            found.rows += [_row(RESULT_COLUMNS, row) for row in data["rows"]]
-            found.curves.append(_row(CURVE_COLUMNS, data["curve"]))
+            own = cls.of_cell(path.parent)
+            found.rows += own.rows
+            found.curves += own.curves
         found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())))
+        found.find_worst()
         if not found.rows and not may_be_empty:
             raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
         return found
+
+    @classmethod
+    def of_cell(cls, home: Path) -> "Results":
+        """Those of one cell's folder; none where it has not finished. Raises ``RunError`` as ``read``."""
+        path = home / "result.json"
+        if not path.exists():
+            return cls()
+        data = RunFolder(home).read_json(path.name)
+        try:
+            if data["schema"] != SCHEMA:
+                raise ValueError(f"its schema is {data['schema']}")
+            return cls([_row(RESULT_COLUMNS, row) for row in data["rows"]], [_row(CURVE_COLUMNS, data["curve"])])
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{path} is not the result of a cell of schema {SCHEMA} ({one_line(error)}).") from error
 
     def add(self, other: "Results") -> int:
         """Take over the rows of cells that are not here yet; returns how many rows of evaluations that were."""
@@ -85,6 +115,18 @@ class Results:
         self.rows += fresh
         self.curves += [line for line in other.curves if line["hash"] not in drawn]
         return len(fresh)
+
+    def find_worst(self) -> None:
+        """Fill in the columns of the worst attacker, which depend on what all policies of an environment met."""
+        policies: dict[tuple, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+        for row in self.rows:
+            policies[row["environment"], row["goal_period"]][row["hash"]].append(row)
+        for group in policies.values():
+            found = worst([*group.values()])
+            for rows, its in zip(group.values(), found or [{}] * len(group), strict=True):
+                values = (its.get("crash_rate", math.nan), its.get("attacker"), its.get("interactions", math.nan))
+                for row in rows:
+                    row |= dict(zip(("worst", "worst_attacker", "worst_interactions"), values, strict=True))
 
     def check(self) -> None:
         """Raise ``RunError`` if what cannot be compared is mixed, or if a policy is there twice.
@@ -105,21 +147,28 @@ class Results:
             write_table(folder / name, columns, rows)
 
 
-def result(cell: Cell, run: RunFolder, evaluated: Iterable[Row]) -> Row:
-    """What a finished cell writes to its ``result.json``, from its run and the rows of its evaluations."""
+def result(cell: Cell, run: RunFolder, rows: Iterable[Row], audited: Row | None = None) -> Row:
+    """What a finished cell writes to its ``result.json``, from its run, the rows of its evaluations and its audits."""
+    curve = _curve(run.read_csv("progress.csv")) | (audited or {})
+    rows = evaluated(cell, run, rows, cell.sources.get("code"))
+    return {"schema": SCHEMA, "rows": rows, "curve": identity(cell) | curve}
+
+
+def evaluated(cell: Cell, run: RunFolder, rows: Iterable[Row], code: str | None) -> list[Row]:
+    """Rows of evaluations of a cell, as ``result.json`` has them; ``code`` evaluated it."""
     stored = run.read_json("config.json")
     names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
     shared = identity(cell) | {
+        "code": code,
         "env_steps": stored["config"]["env_steps"],
         "trained_period": cell.config.env.goal_period,
-        "fps": median(float(row["fps"]) for row in run.read_csv("timing.csv")),
+        "fps": median([float(row["fps"]) for row in run.read_csv("timing.csv")] or [math.nan]),
         "device": stored["config"]["device"],
         "versions": " ".join(f"{name}={stored['versions'][name]}" for name in names),
     }
-    rows = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in evaluated]
+    full = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in rows]
     # Where a goal has one group of components, its tracking is the reward.
-    rows = [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in rows]
-    return {"schema": SCHEMA, "rows": rows, "curve": identity(cell) | _curve(run.read_csv("progress.csv"))}
+    return [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in full]
 
 
 def _curve(rows: list[dict[str, str]], points: int = 100) -> Row:
@@ -127,8 +176,19 @@ def _curve(rows: list[dict[str, str]], points: int = 100) -> Row:
     rows = [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
     count = min(points, len(rows))
     stretches = [rows[len(rows) * i // count : len(rows) * (i + 1) // count] for i in range(count)]
-    means = {name: [sum(float(row[name]) for row in part) / len(part) for part in stretches] for name in MEANS}
-    return {"env_steps": [float(part[-1]["env_steps"]) for part in stretches]} | means
+    curves = {name: values for name, column in MEANS.items() if (values := _means(stretches, column))}
+    losses = [[row.get("fear/loss") for row in part] for part in stretches]
+    if rows and "fear/loss" in rows[0]:  # it is empty where a rollout taught fear nothing
+        curves["fear_fitted"] = [sum(bool(loss) for loss in part) / len(part) for part in losses]
+    return {"env_steps": [float(part[-1]["env_steps"]) for part in stretches]} | curves
+
+
+def _means(stretches: Sequence[Sequence[dict[str, str]]], column: str) -> list[float]:
+    """Means of a column, NaN where a stretch has no value of it; empty where the selector does not log it."""
+    if not stretches or column not in stretches[0][0]:
+        return []
+    values = [[float(row[column]) for row in part if row[column]] for part in stretches]
+    return [sum(part) / len(part) if part else math.nan for part in values]
 
 
 def identity(cell: Cell) -> Row:
@@ -136,6 +196,8 @@ def identity(cell: Cell) -> Row:
     return {
         "environment": cell.environment, "method": cell.config.label, "seed": cell.config.seed,
         "hash": cell.digest, "setting": cell.setting, "selector": cell.selector, "num_envs": cell.config.num_envs,
+        "base_environment": cell.base_environment or cell.environment, "levels": cell.levels,
+        "code": cell.sources.get("code"),
     }  # fmt: skip
 
 
@@ -167,6 +229,7 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
         differing += sum(ours[key] != theirs[key] for key in both)
         added += merged.add(found)
     merged.check()
+    merged.find_worst()
     target.mkdir(parents=True, exist_ok=True)
     merged.write(target)
     return added, present, differing
@@ -177,10 +240,17 @@ def check_comparable(rows: Iterable[Row]) -> None:
 
     ``rows`` are of either kind, or the identities of cells.
     """
-    settings, selectors = defaultdict(set), defaultdict(set)
+    settings, selectors, codes = defaultdict(set), defaultdict(set), defaultdict(set)
     for row in rows:
+        codes[row["environment"], row.get("goals", "training")].add(row["code"])
         settings[row["environment"]].add(row["setting"])
         selectors[row["environment"], row["method"]].add(row["selector"])
+    for (environment, what), found in codes.items():
+        if len(found) > 1:
+            raise RunError(
+                f"The rows of environment '{environment}', {what}, were made by {len(found)} versions of the code "
+                f"({', '.join(sorted(map(str, found)))}) and cannot be compared; keep those of one in a folder."
+            )
     for environment, found in settings.items():
         if len(found) > 1:
             raise RunError(
@@ -238,7 +308,8 @@ def _row(columns: dict[str, type], given: Row) -> Row:
 def _value(kind: type, given: Any) -> Any:
     """The value of a column, from the text in a table or from JSON; what is missing is NaN where numbers stand."""
     if kind is tuple:
-        return tuple(map(float, given.split() if isinstance(given, str) else given or ()))
+        parts = given.split() if isinstance(given, str) else given or ()
+        return tuple(math.nan if part is None else float(part) for part in parts)
     if kind in (dict, list):
         found: Any = json.loads(given) if given and isinstance(given, str) else given or kind()
         return found if kind is list else {name: math.nan if value is None else value for name, value in found.items()}

@@ -9,6 +9,10 @@ from deimos.run.attack import Attack, AttackerConfig, Target, argmax_director, l
 class Config(AttackerConfig):
     """Its network learns from 1500 steps under uniform goals."""
 
+    def learning_steps(self, steps: int) -> int:
+        """See ``AttackerConfig.learning_steps``."""
+        return steps
+
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``."""
         fear, facts = learn_fear(target, target.steps, own_goals=False)

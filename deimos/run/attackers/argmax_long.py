@@ -16,6 +16,10 @@ class Config(AttackerConfig):
     def __post_init__(self) -> None:
         check_at_least("longer", self.longer, 1)
 
+    def learning_steps(self, steps: int) -> int:
+        """See ``AttackerConfig.learning_steps``."""
+        return self.longer * steps
+
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``."""
         fear, facts = learn_fear(target, self.longer * target.steps, own_goals=True)

@@ -17,6 +17,7 @@ from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.run.attack import HELD_OUT, Attack, AttackerConfig, Target, argmax_director, collect, learnt_from, quality
 from deimos.run.config import from_dict, to_dict
+from deimos.sim.env import Env
 
 SCHEMA = 1  # of the file
 
@@ -78,8 +79,23 @@ def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
         "adversary_crashes": int(data.crashed.sum()),
         "adversary_auroc": quality(fear, data.where(data.env % HELD_OUT == 0)),
     }  # fmt: skip
+    save_fear(path, fear, env, facts)
+    return facts
+
+
+def save_fear(path: Path, fear: Fear, env: Env, facts: dict[str, Any]) -> None:
+    """Write the file of a fear network.
+
+    Args:
+        path: The file.
+        fear: The network.
+        env: Worlds that it is for.
+        facts: What rows of the attacker say of it.
+
+    Raises:
+        RunError: If the file cannot be written.
+    """
     network = {name: weights.cpu() for name, weights in fear.network.state_dict().items()}
     save_tensors(path, {
-        "schema": SCHEMA, "layout": str(env.layout), "fear": to_dict(first.fear), "network": network, "facts": facts,
+        "schema": SCHEMA, "layout": str(env.layout), "fear": to_dict(fear.config), "network": network, "facts": facts,
     })  # fmt: skip
-    return facts

@@ -140,6 +140,20 @@ class Particle(WarpEnv):
             goal = position + goal * (self.goal_period - int(self.tensors["goal_clock"][world]))
         return Sketch(HALF_SIDE, position, goal)
 
+    def place(self, rows: Tensor) -> Tensor:
+        """See ``Env.place``."""
+        return self.tensors["position"][rows] / HALF_SIDE
+
+    def risk_contrast(self) -> tuple[Tensor, Tensor]:
+        """See ``Env.risk_contrast``: at rest, 1 u from a wall and at the origin (thesis, 4.2)."""
+        rows = torch.arange(self.num_envs, device=self.device)
+        risky, safe = rows[::2], rows[1::2]
+        for name in ("position", "velocity"):
+            self.tensors[name].zero_()
+        self.tensors["position"][risky, 0] = 1.0 - HALF_SIDE
+        self.set_goals(rows, self.sample_goals(rows, 1).squeeze(1).clone())
+        return risky, safe
+
     def scripted_goals(self, rows: Tensor, goal: Tensor) -> Tensor:
         """See ``Env.scripted_goals``: full speed away from the origin, or the farthest place beyond the position.
 

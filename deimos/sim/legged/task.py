@@ -250,6 +250,15 @@ class Locomotion(WarpEnv):
         reverse = torch.where(self.goal[rows, :count] < 0, 1.0, -1.0) * self._seen_range[:count]
         return torch.cat([reverse, goal[:, count:]], dim=1)
 
+    def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
+        """See ``Env.risk_contrast``: as they are, on stairs and on flat ground (thesis, 4.1)."""
+        shapes = [shape for shape, _ in self.tiles()]
+        risky, safe = (
+            torch.tensor([i for i, shape in enumerate(shapes) if shape.startswith(kind)], device=self.device)
+            for kind in ("stairs", "flat")
+        )
+        return (risky, safe) if len(risky) and len(safe) else None
+
     def strata(self) -> list[str]:
         """See ``Env.strata``: shape and level of the tile; empty on flat ground."""
         return [] if self.config.terrain == "flat" else [f"{shape} {level}" for shape, level in self.tiles()]

@@ -1,0 +1,100 @@
+"""The policies of a study in one file, ``policies.zip``, so that a new attacker needs no new training.
+
+It has of every cell ``cell.json``, ``run/config.json``, ``run/policy.pt`` and, where there is one, ``fear.pt``. The
+same files give the same bytes: names are sorted, and there are no times.
+"""
+
+import re
+import zipfile
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO
+
+from deimos.checks import RunError, one_line
+from deimos.files import UNREADABLE, write_whole
+from deimos.run.folder import RunFolder
+from deimos.study.folder import FEAR, StudyFolder
+from deimos.study.results import SCHEMA, Results
+
+FILE = "policies.zip"
+PARTS = ("cell.json", "run/config.json", "run/policy.pt", FEAR)
+MOST_BYTES = 2**28  # of a part
+_NAME = re.compile(rf"([\w.+-]+)/({'|'.join(map(re.escape, PARTS))})", re.ASCII)
+
+
+def pack(study: StudyFolder) -> tuple[Path, int]:
+    """Write the policies of a study's finished cells into its archive, beside those that are in it already.
+
+    Returns:
+        The archive, and how many policies it holds.
+
+    Raises:
+        RunError: If there is none, or a file cannot be read or written.
+    """
+    path = study.path / FILE
+    files = _read(path) if path.exists() else {}
+    cells = study.cells()
+    finished = study.finished(cells)
+    for cell in cells:
+        home = study.cell_path(cell)
+        if cell.digest in finished and (home / "run" / "policy.pt").exists():
+            files |= {f"{cell.name}/{part}": (home / part).read_bytes() for part in PARTS if (home / part).exists()}
+    if not files:
+        raise RunError(f"{study.path} has no finished cell whose policy could be packed.")
+
+    def write(file: BinaryIO) -> None:
+        with zipfile.ZipFile(file, "w") as archive:
+            for name in sorted(files):
+                info = zipfile.ZipInfo(name)  # of 1980, wherever and whenever it is written
+                info.compress_type, info.create_system, info.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
+                archive.writestr(info, files[name], compresslevel=9)
+
+    write_whole(path, write)
+    return path, len({name.partition("/")[0] for name in files})
+
+
+def unpack(study: StudyFolder) -> int:
+    """Put the policies of a study's archive back where cells lie, with their rows of the study's tables.
+
+    Cells that are there stay as they are. Returns how many were put back; raises ``RunError`` if the archive is broken.
+    """
+    path = study.path / FILE
+    if not path.exists():
+        return 0
+    files, tables = _read(path), Results.read(study.path)
+    back = 0
+    for name in sorted({entry.partition("/")[0] for entry in files}):
+        home = study.path / "cells" / name
+        if (home / "cell.json").exists():
+            continue
+        (home / "run").mkdir(parents=True, exist_ok=True)
+        _put_rows(home, tables)
+        for part in reversed(PARTS):  # cell.json is the last: with it the cell is there
+            if data := files.get(f"{name}/{part}"):
+                write_whole(home / part, partial(_write, data))
+        back += 1
+    return back
+
+
+def _write(data: bytes, file: BinaryIO) -> None:
+    file.write(data)
+
+
+def _put_rows(home: Path, tables: Results) -> None:
+    """Make a cell's ``result.json`` of its rows in the tables, so that it is finished."""
+    digits = home.name.rpartition("-")[2]  # the first of its hash
+    rows, curves = ([row for row in part if row["hash"].startswith(digits)] for part in (tables.rows, tables.curves))
+    if rows and curves:
+        RunFolder(home).write_json("result.json", {"schema": SCHEMA, "rows": rows, "curve": curves[0]})
+
+
+def _read(path: Path) -> dict[str, bytes]:
+    """The files of an archive by their names."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                if not _NAME.fullmatch(info.filename) or info.file_size > MOST_BYTES:
+                    raise ValueError(f"it holds {info.filename!r}, {info.file_size} bytes")
+            return {name: archive.read(name) for name in archive.namelist()}
+    except UNREADABLE as error:
+        raise RunError(f"{path} is no archive of policies, or it is broken ({one_line(error)}).") from error

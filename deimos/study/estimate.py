@@ -1,0 +1,105 @@
+"""What the open cells of a study take, told before they start."""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from statistics import median
+
+import torch
+
+from deimos.nn.threads import on_threads
+from deimos.run import training
+from deimos.run.attack import attacker, uniform_goals
+from deimos.run.audit import CANDIDATES
+from deimos.run.config import kind
+from deimos.run.evaluation import EvalConfig, play
+from deimos.sim.shared import one_stream
+from deimos.study.audits import points
+from deimos.study.folder import StudyFolder
+from deimos.study.plan import Cell
+
+SECONDS = 10.0  # of training that a kind of cells is measured for, at most; a period of goals if that is less
+PLAYED = 50  # steps of a policy that evaluations are measured by
+OF_ORACLE = 100  # candidates that an attacker tries in clones
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How fast a kind of cells is."""
+
+    training: float
+    """Transitions per second."""
+    acting: float
+    """World-steps per second of a policy that only acts."""
+
+
+def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
+    """A line on what the cells of a study that are not finished take; it measures each kind of cells for some seconds.
+
+    Training is as fast as the finished cells of a kind were where there are any, and acting as measured.
+    """
+    cells = list(cells)
+    kinds: dict[tuple[str, str], list[Cell]] = defaultdict(list)
+    for cell in cells:
+        kinds[cell.setting, kind(cell.config.goals)].append(cell)
+    ran: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for row in study.results().rows:
+        ran[row["setting"], row["method"]].append(row["fps"])
+    trained = acted = hours = 0.0
+    measured = False
+    for own in kinds.values():
+        speed = _measure(own[0])
+        for cell in own:
+            known = [fps for fps in ran[cell.setting, cell.config.label] if fps > 0]
+            measured |= not known
+            transitions, steps = cost(cell)
+            trained, acted = trained + transitions, acted + steps
+            hours += (transitions / (median(known) if known else speed.training) + steps / speed.acting) / 3600
+    source = "measured on a short run of each kind" if measured else "of the finished cells"
+    return (
+        f"{len(cells)} run(s): {trained / 1e6:,.1f} M transitions (FPS {source}) + {acted / 1e6:,.1f} M world-steps of "
+        f"attacks, evaluations and audits = {hours:.2f} core-hours."
+    )
+
+
+def cost(cell: Cell) -> tuple[int, int]:
+    """Transitions of a cell's training, and world-steps of its evaluations, attacks and audits."""
+    config = cell.config
+    transitions = config.iterations * config.ppo.num_steps * config.num_envs
+    evaluated = len(cell.goal_periods) * evaluation_steps(config.eval, ("naive", *config.eval.attackers))
+    period = config.env.goal_period
+    audited = len(points(config.iterations)) * period * (config.num_envs + cell.audit_worlds * CANDIDATES)
+    return transitions, evaluated + (audited if cell.audit_worlds else 0)
+
+
+def evaluation_steps(config: EvalConfig, goals: Iterable[str]) -> int:
+    """World-steps of an evaluation under some goals, those that attackers learn from and the score's scale included."""
+    total = 2 * config.worlds * config.steps  # the policy that does nothing, and the reference
+    for name in goals:
+        worlds = config.worlds_against(name)
+        tries = 0 if name == "naive" or not attacker(name).few_worlds else OF_ORACLE
+        total += worlds * config.steps * (1 + tries)
+        if name != "naive":
+            total += config.worlds * attacker(name).learning_steps(config.adversary_steps)
+    return total
+
+
+def _measure(cell: Cell) -> Speed:
+    """The speeds of a kind of cells, by a training that has just begun."""
+    config = cell.config
+    device = training.resolve_device(config.device)
+    with on_threads(config.threads or 1), one_stream(device):
+        trainer = training.build(config, device)
+        trainer.iterate()  # compiles
+        begin, done = time.monotonic(), 0
+        while not done or (done * config.ppo.num_steps < config.env.goal_period and time.monotonic() - begin < SECONDS):
+            trainer.iterate()
+            done += 1
+        rate = done * config.ppo.num_steps * config.num_envs / (time.monotonic() - begin)
+        env = config.env.for_evaluation().resolved(device).build(config.eval.worlds, device, 0)
+        begin = time.monotonic()
+        play(env, trainer.ppo.actor, uniform_goals(env), PLAYED)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return Speed(rate, PLAYED * config.eval.worlds / (time.monotonic() - begin))

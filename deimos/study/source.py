@@ -1,0 +1,122 @@
+"""What code a cell's numbers come from: a commit where one says it, else a hash of the sources."""
+
+import hashlib
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import deimos
+from deimos.checks import RunError, one_line
+
+PACKAGES = ("deimos", "deimos.kernels", "deimos.terrain")
+DIGITS = 12  # of a commit or a SHA-256
+
+
+@dataclass(frozen=True)
+class Code:
+    """The code of this process."""
+
+    commit: str
+    """The commit that is checked out; empty where this is no checkout or git is missing."""
+    changed: tuple[str, ...]
+    """Source files that differ from it, or that it does not have."""
+    sources: str
+    """A hash of all sources, which a checkout and a wheel of the same sources share."""
+
+    @property
+    def name(self) -> str:
+        """The commit or, where that does not say all, the sources."""
+        return self.commit if self.commit and not self.changed else self.sources
+
+
+def code() -> Code:
+    """The code of this process, as it lies on the disk now."""
+    folders = {name: Path(importlib.import_module(name).__path__[0]) for name in PACKAGES}
+    files = {f"{name}/{path.relative_to(folder)}": path for name, folder in folders.items() for path in _files(folder)}
+    home = Path(deimos.__file__).resolve().parent.parent
+    commit = _git(home, "rev-parse", f"--short={DIGITS}", "HEAD") if (home / ".git").exists() else ""
+    changed = _git(home, "status", "--porcelain", "--untracked-files=all", "--", *map(str, folders.values()))
+    return Code(commit, tuple(line[3:] for line in changed.splitlines()) if commit else (), f"sources-{_hash(files)}")
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of a package; those of packages inside, in a wheel, are theirs."""
+    inner = {folder / name.rpartition(".")[2] for name in PACKAGES if name != "deimos"}
+    return [
+        path for path in sorted(folder.rglob("*"))
+        if path.is_file() and "__pycache__" not in path.parts and not inner.intersection(path.parents)
+    ]  # fmt: skip
+
+
+def _hash(files: dict[str, Path]) -> str:
+    digest = hashlib.sha256()
+    for name, path in sorted(files.items()):
+        digest.update(f"{name}\0{hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return digest.hexdigest()[:DIGITS]
+
+
+def _git(home: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", "-C", str(home), *arguments], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.rstrip("\n")
+
+
+def import_plugins(names: Iterable[str]) -> None:
+    """Import modules that register selectors, attackers or environments; those of the working directory too.
+
+    Raises:
+        RunError: If one is not there or is broken.
+    """
+    if os.getcwd() not in map(os.path.abspath, sys.path):  # as ``python -m`` has it, a script of an environment not
+        sys.path.append(os.getcwd())
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # a foreign file may raise anything
+            reason = f"{type(error).__name__}: {one_line(error)}"
+            raise RunError(f"plugins: the module {name} cannot be imported ({reason}).") from error
+
+
+def sources(plugins: Sequence[str], pool: Path | None) -> dict[str, str]:
+    """What a cell's numbers depend on beside its configuration.
+
+    Args:
+        plugins: Modules, which must be imported.
+        pool: File of the attacker ``pooled``; ``None`` for none.
+
+    Returns:
+        The ``code`` and, by its SHA-256, every plugin and the ``pool``.
+
+    Raises:
+        RunError: If the pool cannot be read.
+    """
+    try:
+        files = {name: Path(str(sys.modules[name].__file__)) for name in plugins} | ({"pool": pool} if pool else {})
+        return {"code": code().name} | {name: file_hash(path) for name, path in files.items()}
+    except OSError as error:
+        raise RunError(f"{error.filename} cannot be read ({error.strerror}).") from error
+
+
+def file_hash(path: Path) -> str:
+    """First digits of a file's SHA-256."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS]
+
+
+def check_sources(what: str, wanted: dict[str, str], plugins: Sequence[str], pool: Path | None) -> None:
+    """Raise ``RunError`` unless the code, the plugins and the pool are still those that a cell was made with."""
+    found = sources(plugins, pool) | {"code": wanted.get("code", "")}
+    here = code()
+    if wanted.get("code") not in (here.commit if not here.changed else "", here.sources):
+        raise RunError(
+            f"{what} was made from {wanted.get('code')}, and this is {here.name}: cells of two versions never mix. "
+            f"Continue with that version (a worktree of its commit), or begin a new study."
+        )
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise RunError(f"{what}: the file of '{name}' is not the one that it was made with; put that one back.")

@@ -1,0 +1,300 @@
+"""What a study keeps of its policies and of their trainings, and what later attackers make of them."""
+
+import dataclasses
+import math
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+
+import pytest
+import torch
+
+from deimos.checks import RunError
+from deimos.run.evaluation import evaluate
+from deimos.run.folder import RunFolder
+from deimos.study import cell as worker
+from deimos.study import cli, plan
+from deimos.study.folder import StudyFolder
+from deimos.study.lock import hold
+
+STUDY = """
+seeds = 1
+methods = ["uniform", "p25"]
+[train]
+num_envs = 16
+env_steps = 960
+device = "cpu"
+ppo = { hidden = [8], epochs = 1 }
+eval = { worlds = 16, steps = 40, adversary_steps = 40 }
+[[environment]]
+name = "directional"
+env = { kind = "particle", variant = "directional", goal_period = 10, max_speed = 200.0, max_force = 200.0 }
+"""
+WORST = ("worst", "worst_attacker", "worst_interactions")  # they depend on who attacked
+LONG = {"attackers": ("argmax-long",), "allow_uncommitted": True}
+
+ATTACK = """
+import sys
+from pathlib import Path
+from deimos.study import cli
+cli.AttackOptions(folder=Path(sys.argv[1]), attackers=("argmax-long",), allow_uncommitted=True).run()
+"""
+
+PLUGIN = '''
+"""Uniform goals under another name, in a module that is not installed."""
+
+from dataclasses import dataclass
+
+from deimos import plugins
+from deimos.goals import selectors
+from deimos.goals.selectors import uniform
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(uniform.Config):
+    """See ``uniform.Config``."""
+
+
+plugins.register(selectors, "even", __name__)
+'''
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """The study in a TOML file."""
+    path = tmp_path_factory.mktemp("toml") / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(file, tmp_path_factory):
+    """The study, finished."""
+    study = StudyFolder(tmp_path_factory.mktemp("studies") / "whole")
+    study.add(plan.expand(plan.read(file)))
+    assert all([worker.run(study, cell) for cell in study.cells()])
+    return study
+
+
+def copied(whole, folder):
+    """A copy of a study."""
+    shutil.copytree(whole.path, folder)
+    return StudyFolder(folder)
+
+
+def table(study, without=()):
+    """Its results without what depends on the clock, NaN made comparable, in a fixed order."""
+    rows = [{k: repr(v) for k, v in row.items() if k not in ("fps", *without)} for row in study.results().rows]
+    return sorted(rows, key=lambda row: (row["hash"], row["goals"]))
+
+
+def test_audits_leave_no_trace_in_the_training(whole, tmp_path):
+    """A cell's training is the same bit for bit without audits, and audits stand in its training curve."""
+    study = StudyFolder(tmp_path / "study")
+    study.add([dataclasses.replace(cell, audit_worlds=0) for cell in whole.cells()])
+    for cell, twin in zip(study.cells(), whole.cells(), strict=True):
+        assert cell.digest != twin.digest
+        assert worker.run(study, cell)
+        mine, its = (folder.cell_path(each) for folder, each in ((study, cell), (whole, twin)))
+        assert (mine / "run" / "progress.csv").read_bytes() == (its / "run" / "progress.csv").read_bytes()
+        assert not (mine / "audits.json").exists()
+        assert [*RunFolder(its).read_json("audits.json")] == ["32", "34", "36", "38", "40"]
+    assert all(math.isnan(line["speed"]) for line in study.results().curves)
+    curves = {line["method"]: line for line in whole.results().curves}
+    for line in curves.values():
+        known = [value for value in line["exact_percentile"] if not math.isnan(value)]
+        assert known
+        assert all(0.0 <= value <= 100.0 for value in known)
+        assert len(line["exact_contexts"]) == 5
+        assert sum(line["goal_map"]) > 0
+        assert line["speed"] > 0.0
+    assert all(map(math.isnan, curves["uniform"]["auroc"]))
+    assert all(0.0 <= value <= 1.0 for value in curves["p25"]["risk"])
+    assert curves["p25"]["fear_fitted"][-1] == 1.0
+
+
+def test_interrupted_audits_are_the_same(whole, tmp_path):
+    """A training that is stopped in the midst of its audits ends with the audits of one that was not."""
+    study = StudyFolder(tmp_path / "study")
+    study.add([cell for cell in whole.cells() if cell.config.method == "p25"])
+    (cell,) = study.cells()
+    home = study.cell_path(cell)
+    assert not worker.run(study, cell, stopped=lambda: (home / "audits.json").exists())
+    assert [*RunFolder(home).read_json("audits.json")] == ["32"]
+    assert worker.run(study, cell)
+    assert (home / "audits.json").read_bytes() == (whole.cell_path(cell) / "audits.json").read_bytes()
+
+
+def test_cell_keeps_its_fear_network(whole):
+    """A Director's cell has its fear network as a file for the attacker ``pooled``; Uniform's has none."""
+    for cell in whole.cells():
+        path = whole.cell_path(cell) / "fear.pt"
+        assert path.exists() == (cell.config.method == "p25")
+        if path.exists():
+            sizes = dataclasses.replace(cell.config.eval, pool=path, attackers=("pooled",))
+            rows = evaluate(lambda obs: torch.zeros(len(obs), 3), cell.config.env, sizes, torch.device("cpu"))
+            assert [(row["goals"], row.get("uninformed")) for row in rows] == [("naive", None), ("pooled", False)]
+
+
+def test_attack_adds_rows_and_survives_a_kill(whole, tmp_path):
+    """Further attackers add a row for every policy, each once, also where the command was killed in the middle."""
+    once, killed = (copied(whole, tmp_path / name) for name in ("once", "killed"))
+    cli.AttackOptions(folder=once.path, **LONG).run()
+    runner = subprocess.Popen([sys.executable, "-c", ATTACK, str(killed.path)], stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 120
+    while len(killed.results().rows) == 6:
+        assert time.monotonic() < end, "nobody was attacked"
+        time.sleep(0.02)
+    runner.kill()
+    runner.wait()
+    for cell in killed.cells():  # its worker ends by itself
+        with hold(killed.cell_path(cell) / "lock", cell.name, patience=60.0):
+            pass
+    cli.RunOptions(folder=killed.path).run()
+    assert table(killed) == table(once)
+    assert [row["goals"] for row in table(once)] == ["'argmax'", "'argmax-long'", "'naive'", "'scripted'"] * 2
+    cli.AttackOptions(folder=once.path, seeds="5-7", attackers=("search",), allow_uncommitted=True).run()
+    assert len(once.results().rows) == 8  # there are no such seeds
+    kept = [row for row in table(once, WORST) if row["goals"] != "'argmax-long'"]
+    assert kept == table(whole, WORST)
+
+
+def test_study_file_may_name_further_attackers(file, tmp_path):
+    """What a file's ``[[attack]]`` says is added to the study: some seeds meet more attackers."""
+    description = plan.read(file) | {"attack": [{"attackers": ["search"], "seeds": [0]}, {"attackers": ["search"]}]}
+    study = StudyFolder(tmp_path)
+    for _ in range(2):
+        study.add_rounds(plan.rounds(description))
+    assert [(each.attackers, each.seeds) for each in study.rounds()] == [(("search",), (0,)), (("search",), ())]
+    for table, message in (
+        ({"attackers": ["nobody"]}, "There is no attacker 'nobody'"),
+        ({"attackers": []}, "attackers must be one or more names, got none"),
+        ({"attackers": ["search"], "seeds": "x"}, "seeds must be a number of seeds"),
+        ({"who": ["search"]}, r"An \[\[attack\]\] has no who; it has: attackers, seeds"),
+    ):
+        with pytest.raises(RunError, match=message):
+            plan.rounds({"attack": [table]})
+    (tmp_path / "attack.json").write_text('[{"attackers": 3}]')
+    with pytest.raises(RunError, match=r"attack\.json does not list attackers"):
+        study.rounds()
+
+
+def test_unfinished_study_is_not_attacked(file, tmp_path):
+    """A study that holds nothing, or cells without a policy, is refused with the way out."""
+    with pytest.raises(RunError, match=r"holds no policies: neither cells nor policies\.zip"):
+        cli.AttackOptions(folder=tmp_path, **LONG).run()
+    study = StudyFolder(tmp_path)
+    study.add(plan.expand(plan.read(file)))
+    with pytest.raises(RunError, match="2 of 2 cells are not finished; finish them first: deimos study run"):
+        cli.AttackOptions(folder=tmp_path, **LONG).run()
+
+
+def test_archive_stands_for_the_cells(whole, tmp_path, capsys):
+    """The archive has the same bytes whenever it is packed, and with the tables it is enough to attack a study."""
+    study, other = (copied(whole, tmp_path / name) for name in ("study", "other"))
+    cli.ExportOptions(folder=study.path).run()
+    cli.PackOptions(folder=study.path).run()
+    path = study.path / "policies.zip"
+    first = path.read_bytes()
+    path.unlink()
+    cli.PackOptions(folder=study.path).run()
+    assert path.read_bytes() == first
+    assert "policies.zip: 2 policies" in capsys.readouterr().out
+    shutil.rmtree(study.path / "cells")
+    for each in (study, other):
+        cli.AttackOptions(folder=each.path, **LONG).run()
+    assert table(study) == table(other)
+    for cell in whole.cells():
+        for part in ("run/policy.pt", "run/config.json", "cell.json"):
+            assert (study.cell_path(cell) / part).read_bytes() == (whole.cell_path(cell) / part).read_bytes()
+    cli.PackOptions(folder=study.path).run()
+    assert path.read_bytes() == first
+
+
+def test_archive_alone_gives_the_policies_back(whole, tmp_path, capsys):
+    """Without tables too the policies come back, where they are not there yet; and there must be an archive."""
+    study = copied(whole, tmp_path / "study")
+    with pytest.raises(RunError, match=r"holds no policies\.zip"):
+        cli.UnpackOptions(folder=study.path).run()
+    cli.PackOptions(folder=study.path).run()
+    shutil.rmtree(study.cell_path(study.cells()[0]))
+    cli.UnpackOptions(folder=study.path).run()
+    assert capsys.readouterr().out.endswith(f"1 policies put back into {study.path / 'cells'}\n")
+    assert study.cells() == whole.cells()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RunError, match="has no finished cell whose policy could be packed"):
+        cli.PackOptions(folder=tmp_path / "empty").run()
+
+
+@pytest.mark.parametrize("name", ["../evil", "a/b/policy.pt", "x/cell.json.exe", "/etc/cell.json"])
+def test_foreign_archive_is_refused(tmp_path, name):
+    """An archive that would write anything but the files of cells is refused, and nothing of it is written."""
+    with zipfile.ZipFile(tmp_path / "policies.zip", "w") as archive:
+        archive.writestr(name, "x")
+    with pytest.raises(RunError, match=r"policies\.zip is no archive of policies, or it is broken"):
+        cli.UnpackOptions(folder=tmp_path).run()
+    assert [path.name for path in tmp_path.iterdir()] == ["policies.zip"]
+
+
+def test_cells_of_another_commit_are_refused(whole, file, tmp_path):
+    """A cell that was begun by other code is continued neither by the runner nor by its worker, and never mixed."""
+    study = StudyFolder(tmp_path / "study")
+    cell = whole.cells()[0]
+    study.add([dataclasses.replace(cell, sources=cell.sources | {"code": "0123456789ab"})])
+    with pytest.raises(RunError, match=r"was made from 0123456789ab, and this is .*: cells of two versions never mix"):
+        cli.RunOptions(folder=study.path).run()
+    with pytest.raises(RunError, match="was made from 0123456789ab"):
+        worker.run(study, study.cells()[0])
+    with pytest.raises(RunError, match="made by 2 versions of the code"):
+        cli.RunOptions(folder=study.path, file=file, allow_uncommitted=True).run()
+    assert len(study.cells()) == 1
+
+
+def test_study_imports_its_plugins(tmp_path, monkeypatch):
+    """A selector of a module that the study names trains in its workers; with another source it is another cell."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_selector.py").write_text(PLUGIN)
+    file = tmp_path / "study.toml"
+    file.write_text('plugins = ["my_selector"]\n' + STUDY.replace('"uniform", "p25"', '"even"'))
+    study = StudyFolder(tmp_path / "study")
+    cli.RunOptions(folder=study.path, file=file, allow_uncommitted=True).run()
+    assert {row["method"] for row in study.results().rows} == {"even"}
+    (cell,) = study.cells()
+    assert cell.plugins == ("my_selector",)
+    (tmp_path / "my_selector.py").write_text(PLUGIN + "# changed\n")
+    (other,) = plan.expand(plan.read(file))
+    assert (other.digest != cell.digest, other.setting == cell.setting) == (True, True)
+    (study.cell_path(cell) / "result.json").unlink()
+    with pytest.raises(RunError, match="the file of 'my_selector' is not the one that it was made with"):
+        worker.run(study, cell)
+    file.write_text('plugins = ["no_such_module"]\n' + STUDY)
+    with pytest.raises(RunError, match="plugins: the module no_such_module cannot be imported"):
+        plan.expand(plan.read(file))
+
+
+def test_run_that_lost_its_configuration_is_made_again(whole, tmp_path, capsys):
+    """A checkpoint without the configuration that it belongs to is no run: that is said, and the cell begins again."""
+    study = StudyFolder(tmp_path / "study")
+    study.add(whole.cells()[:1])
+    (cell,) = study.cells()
+    run = study.cell_path(cell) / "run"
+    run.mkdir()
+    (run / "checkpoint.pt").write_text("whatever")
+    assert worker.main([str(study.path), cell.name]) == 0
+    assert capsys.readouterr().err == f"{run} holds no config.json; the cell is made again.\n"
+    assert table(study, WORST) == [row for row in table(whole, WORST) if row["hash"] == repr(cell.digest)]
+
+
+def test_strays_are_said(whole, tmp_path, capsys):
+    """A folder of a cell that does not say what it is counts for nothing, is named, and is made again from the file."""
+    study = copied(whole, tmp_path / "study")
+    cell = study.cells()[0]
+    (study.cell_path(cell) / "cell.json").unlink()
+    cli.ShowOptions(folder=study.path).run()
+    assert f"1 folder(s) in {study.path / 'cells'} hold no cell.json ({cell.name} first)" in capsys.readouterr().err
+    study.add([cell])
+    assert (study.strays(), len(study.cells())) == ([], 2)
+    (study.cell_path(cell) / "failures.jsonl").write_text('junk}\n[1]\n{"error": "it died"}\n{"err')
+    assert study.failures(cell) == ["it died"]
