@@ -5,8 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from deimos.run.trainer import TrainConfig
+from deimos.sim.envs.particle import Config
 from deimos.study import figures, outcomes, report
 from deimos.study.data import Data
+from deimos.study.plan import Cell
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results
 from reproduction import figures as thesis
 
@@ -166,3 +169,19 @@ def test_levels_are_drawn_by_factor(tmp_path, monkeypatch):
     text = (tmp_path / "report.md").read_text()
     assert "directional with env.max_force inf, reward sharp." in text
     assert "## By level\n\n![directional, T = 100: crashes under attack and score by the level" in text
+
+
+def test_hyper_parameters_stand_in_one_table():
+    """Every field has its value in each environment; what the grid sets, and what is not set, is left out."""
+    sizes = {"directional": 64, "relative": 32}
+    cells = [
+        Cell(environment=name, config=TrainConfig(method="p25", num_envs=count, env=Config(variant=name)),
+             goal_periods=(100,)) for name, count in sizes.items()
+    ]  # fmt: skip
+    (table,) = report.hyper_parameters(cells)
+    rows = {row.pop("field"): row for row in table}
+    assert rows["num_envs"] == {"directional": "64", "relative": "32"}
+    assert rows["env.variant"] == {"directional": "directional", "relative": "relative"}
+    assert rows["ppo.hidden"]["directional"] == "64 64"
+    assert not {"method", "seed", "env.goal_range"} & set(rows)
+    assert report.hyper_parameters([]) == ["They are in the cells of the study, which are not beside these tables."]

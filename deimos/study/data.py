@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from deimos.study.folder import StudyFolder
+from deimos.study.plan import Cell
 from deimos.study.results import Results, Row
 from deimos.study.stats import Array
 
@@ -69,8 +71,10 @@ class Data:
     results are no one study; see ``Results.check``.
     """
 
-    def __init__(self, results: Results, style: Style | None = None) -> None:
+    def __init__(self, results: Results, style: Style | None = None, cells: Sequence[Cell] = ()) -> None:
         results.check()
+        self.cells = cells
+        """What made them; none where the tables are all that there is."""
         self._results, self.rows = results, results.rows
         self.weak = [row for row in self.rows if row["weak_adversary"]]
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
@@ -83,12 +87,12 @@ class Data:
     @classmethod
     def read(cls, folder: Path, style: Style | None = None) -> "Data":
         """The results of a folder; raises ``RunError`` if there are none, or as ``Results.read`` and ``check`` do."""
-        return cls(Results.read(folder, may_be_empty=False), style)
+        return cls(Results.read(folder, may_be_empty=False), style, StudyFolder(folder).cells())
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
         rows, curves = ([row for row in rows if row["method"] in methods] for rows in (self.rows, self._results.curves))
-        return Data(Results(rows, curves), self.style)
+        return Data(Results(rows, curves), self.style, self.cells)
 
     @property
     def curve_rows(self) -> list[Row]:

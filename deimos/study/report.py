@@ -10,15 +10,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import sem
 
+from deimos.run.config import to_dict
 from deimos.study import figures, stats
 from deimos.study.data import Data, Style, Where
 from deimos.study.document import Block, to_html, to_markdown
 from deimos.study.figures import Figures
 from deimos.study.outcomes import SAFE, attacked, base_of, of_environment, of_factors, settings_of
+from deimos.study.plan import Cell
 from deimos.study.stats import Array
 
 Pictures = Mapping[str, Sequence[Block]]
@@ -93,7 +96,34 @@ def what_was_run(data: Data) -> list[Block]:
             "goals": _values(own, "goals"), "setting": _values(own, "setting"),
         })  # fmt: skip
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
-    return ["## What was run", rows, *_uninformed(data), "Run on " + "; ".join(versions) + "."]
+    return [
+        "## What was run", rows, *_uninformed(data), "Run on " + "; ".join(versions) + ".",
+        "### Hyper-parameters", *hyper_parameters(data.cells),
+    ]  # fmt: skip
+
+
+def hyper_parameters(cells: Sequence[Cell]) -> list[Block]:
+    """Every field of the environments, of the learner and of the evaluation, those that are not set left out.
+
+    A selector's are those that its method's name stands for.
+    """
+    if not cells:
+        return ["They are in the cells of the study, which are not beside these tables."]
+    environments = {cell.environment: _flat(to_dict(cell.config)) for cell in cells}
+    names = dict.fromkeys(name for fields in environments.values() for name in fields)
+    rows = [{"field": name} | {place: fields.get(name, "-") for place, fields in environments.items()}
+            for name in names if name.partition(".")[0] not in ("method", "selector", "seed")]  # fmt: skip
+    return [rows]
+
+
+def _flat(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    found: dict[str, str] = {}
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{prefix}{name}.")
+        elif value is not None:
+            found[prefix + name] = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    return found
 
 
 def _values(rows: Sequence[dict], column: str) -> str:
