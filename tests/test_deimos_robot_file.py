@@ -233,6 +233,16 @@ def test_a_draft_says_what_the_model_says(tmp_path):
     assert robot.max_torque == (9.0,) * 3
 
 
+def test_what_has_no_name_is_named_after_its_joint(tmp_path):
+    """The draft of a model whose bodies and geoms have no names reads as the one with names, and builds."""
+    path = write_scout(tmp_path)
+    path.write_text(re.sub(r'<body name="\w+"', "<body", path.read_text()).replace('name="pad_fl"', ""))
+    robot = robot_draft.draft(path)[0]
+    assert robot.front_left.feet == ("knee_fl_geom1",)
+    assert robot.front_right.feet == ("pad_fr",)
+    assert robot.build(tmp_path).parts[1] == ("knee_fl_geom1",)
+
+
 @pytest.mark.parametrize("knee", [-1, 1])
 def test_a_guessed_pose_stands_over_its_feet(tmp_path, knee):
     """Without a keyframe the feet are below the thighs' joints, the legs bent, whichever way the knees turn."""
