@@ -49,6 +49,7 @@ MULE = """
       <inertial mass="9" pos="0.01 0 0.02" quat="0.9 0.1 0.2 0.3" diaginertia="0.05 0.2 0.22"/>
       <geom class="looks" mesh="bone"/>
       <geom class="hit" name="barrel" type="ellipsoid" size="0.25 0.12 0.1"/>
+      <geom class="hit" name="saddle" type="mesh" mesh="bone" pos="0.05 0 0.1"/>
       <body name="neck" pos="0.3 0 0.05">
         <joint name="nod" axis="0 1 0" range="-1 1"/><geom size="0.05" mass="0.4"/>
       </body>
@@ -182,6 +183,23 @@ def test_what_collides_touches_the_terrain_alone(model):
     assert any(i not in hard for i in range(compiled.ngeom))
 
 
+def test_a_mesh_that_collides_is_filled_where_it_is(tmp_path):
+    """Capsules take the place of a mesh, in its place, whatever frame MuJoCo has turned it into."""
+    robot = robot_draft.draft(write_mule(tmp_path), ("nod",))[0].build(tmp_path)
+    compiled = robot.spec.compile()
+    data = mujoco.MjData(compiled)
+    data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0
+    mujoco.mj_kinematics(compiled, data)
+    pieces = [compiled.geom(name).id for name in robot.parts[0] if name.startswith("saddle")]
+    assert pieces
+    radius, half = compiled.geom_size[pieces, :2].T
+    reach = np.abs(data.geom_xmat[pieces].reshape(-1, 3, 3)[:, :, 2]) * half[:, None] + radius[:, None]
+    low, high = (data.geom_xpos[pieces] - reach).min(axis=0), (data.geom_xpos[pieces] + reach).max(axis=0)
+    # The mesh is a box of (50, 60, 200) mm; of its 60 mm the capsules leave out 5 mm on either side.
+    np.testing.assert_allclose(low, [0.025, -0.025, 0.0], atol=1e-6)
+    np.testing.assert_allclose(high, [0.075, 0.025, 0.2], atol=1e-6)
+
+
 def test_heights_are_those_of_the_legs(model):
     """The robot stands on its feet at the standing height, and whatever a reset draws, no leg is in the ground."""
     path, held = model
@@ -213,6 +231,16 @@ def test_a_draft_says_what_the_model_says(tmp_path):
     robot, notes = robot_draft.draft(write_scout(tmp_path))
     assert [note.split()[0] for note in notes] == ["pose", "stiffness", "damping"]
     assert robot.max_torque == (9.0,) * 3
+
+
+def test_what_has_no_name_is_named_after_its_joint(tmp_path):
+    """The draft of a model whose bodies and geoms have no names reads as the one with names, and builds."""
+    path = write_scout(tmp_path)
+    path.write_text(re.sub(r'<body name="\w+"', "<body", path.read_text()).replace('name="pad_fl"', ""))
+    robot = robot_draft.draft(path)[0]
+    assert robot.front_left.feet == ("knee_fl_geom1",)
+    assert robot.front_right.feet == ("pad_fr",)
+    assert robot.build(tmp_path).parts[1] == ("knee_fl_geom1",)
 
 
 @pytest.mark.parametrize("knee", [-1, 1])

@@ -157,9 +157,12 @@ def copy(source: Source, legs: Sequence[Sequence[int]]) -> "tuple[mujoco.MjSpec,
 
 
 def _name_all(spec: "mujoco.MjSpec") -> None:
-    """Name what has no name after the body that it is on."""
+    """Name what has no name after the body that it is on, and a body after its first joint."""
+    names = {body.name for body in spec.bodies}
     for number, body in enumerate(spec.bodies):
-        body.name = body.name or f"body{number}"
+        joint = body.joints[0].name if body.joints else ""
+        body.name = body.name or (joint if joint not in names else f"body{number}")
+        names.add(body.name)
         for things, kind in ((body.joints, "joint"), (body.geoms, "geom")):
             for i, thing in enumerate(things):
                 thing.name = thing.name or f"{body.name}_{kind}{i}"
