@@ -58,8 +58,9 @@ def percentile(score: Tensor, pick: Tensor) -> Tensor:
 
     Whatever the scores, a uniform pick has 50 on average.
     """
-    own = take(score, pick).unsqueeze(1)
-    return ((score < own).sum(1) + (score <= own).sum(1)).float() * (50.0 / score.shape[1])
+    # Above n of 100 and below m, it has 50 + (n - m) / 2. For few rows every operation costs what its call costs.
+    above = (take(score, pick).unsqueeze(1) - score).sign_().sum(1)
+    return above * (50.0 / score.shape[1]) + 50.0
 
 
 def in_proportion(weight: Tensor, draw: Tensor) -> Tensor:
