@@ -41,6 +41,7 @@ SELECTORS: dict[str, dict[str, SelectorConfig]] = {
     "q-fear": {f"beta {beta:g}": q_fear.Config(beta=beta) for beta in (0.5, 0.8, 0.9, 0.95)},
     "penalty": {f"size {size:g}": penalty.Config(size=size) for size in (3.0, 10.0, 30.0, 100.0)},
 }  # fmt: skip
+DEFAULTS = {"weighted": "mix 0.5, alpha 1", "fear-novelty": "eta 1", "q-fear": "beta 0.9"}  # before the pilots
 KEEPS, COSTS_NOTHING = 0.95, 0.97  # shares of Uniform's score; see the rules in docs/lab/pilots.md
 
 
@@ -110,27 +111,29 @@ def pilot(setting: str, selector: str, configuration: str, seed: int, rows: list
     )  # fmt: skip
 
 
-def means(pilots: list[Pilot], settings: list[str]) -> dict[tuple[str, str], tuple[np.ndarray, float]]:
-    """By selector and configuration: the mean worst rate in every setting, and the score as a share of Uniform's.
+Table = dict[tuple[str, str], tuple[np.ndarray, float]]
+"""By selector and configuration: the mean worst rate in every setting, and the score as a share of Uniform's."""
 
-    Only of configurations that are complete in all settings.
-    """
-    table = {}
-    for selector, configuration, _ in configurations():
-        own = [
-            [p for p in pilots if (p.setting, p.selector, p.configuration) == (setting, selector, configuration)]
-            for setting in settings
-        ]
-        if all(len(part) == len(SEEDS) for part in own):
-            rates = np.array([np.mean([p.worst for p in part]) for part in own])
-            table[selector, configuration] = rates, np.array([np.mean([p.score for p in part]) for part in own])
-    if (UNIFORM, "") not in table:
+
+def means(pilots: list[Pilot], settings: list[str]) -> Table:
+    """Means over the seeds that every configuration has in every setting; empty where there is no such seed."""
+    every = [(selector, configuration) for selector, configuration, _ in configurations()]
+    known = {(p.setting, p.selector, p.configuration, p.seed): p for p in pilots}
+    seeds = [seed for seed in SEEDS if all((s, *name, seed) in known for s in settings for name in every)]
+    if not seeds:
         return {}
-    base = table[UNIFORM, ""][1]
-    return {name: (rates, float(np.mean(score / base))) for name, (rates, score) in table.items()}
+    own = {name: [[known[s, *name, seed] for seed in seeds] for s in settings] for name in every}
+    base = [np.mean([p.score for p in part]) for part in own[UNIFORM, ""]]
+    return {
+        name: (
+            np.array([np.mean([p.worst for p in part]) for part in parts]),
+            float(np.mean([np.mean([p.score for p in part]) / usual for part, usual in zip(parts, base, strict=True)])),
+        )
+        for name, parts in own.items()
+    }
 
 
-def choose(table: dict[tuple[str, str], tuple[np.ndarray, float]], selector: str, default: str) -> str:
+def choose(table: Table, selector: str, default: str) -> str:
     """The configuration of a selector by the rule for defaults."""
     rates, score = table[selector, default]
     better = [
@@ -140,7 +143,7 @@ def choose(table: dict[tuple[str, str], tuple[np.ndarray, float]], selector: str
     return min(better, key=lambda pair: pair[1].mean(), default=(default, rates))[0]
 
 
-def sizes(table: dict[tuple[str, str], tuple[np.ndarray, float]]) -> tuple[str, str]:
+def sizes(table: Table) -> tuple[str, str]:
     """The small and the large penalty by the rules for them; both are configurations."""
     own = {name: found for (who, name), found in table.items() if who == "penalty"}
     ordered = list(own)  # ascending
@@ -175,6 +178,10 @@ def show(pilots: list[Pilot], file: Path | None) -> None:
     for (selector, configuration), (rates, score) in table.items():
         each = ", ".join(f"{100 * rate:.2f}" for rate in rates)
         print(f"| {selector} | {configuration} | {each} | {100 * rates.mean():.2f} | {score:.3f} |")
+    if table:
+        for selector, default in DEFAULTS.items():
+            print(f"\n{selector}: {choose(table, selector, default)} (the default was {default})", end="")
+        print("\npenalties: {} and {}".format(*sizes(table)))
     if file is not None:
         write(file, pilots)
 
