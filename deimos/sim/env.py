@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     import mujoco
 
 
+DRAW_COUNTS = ("episode_count", "goal_count")  # the addresses of a world's draws, among ``Env.tensors``
+
+
 @dataclass(frozen=True)
 class Step:
     """What a step gave back. All tensors are views that the next step overwrites."""
@@ -304,7 +307,7 @@ class Env(abc.ABC):
         Args:
             goal_scale: Share of the goal range that first goals come from; see ``reset``.
         """
-        for name in ("episode_count", "goal_count"):
+        for name in DRAW_COUNTS:
             self.tensors[name].zero_()
         self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device), goal_scale)
 
@@ -321,6 +324,23 @@ class Env(abc.ABC):
         origin = self if origin is None else origin
         for name, tensor in self.tensors.items():
             tensor[target] = origin.tensors[name][source]
+
+    def take_worlds(self, state: dict[str, Tensor]) -> None:
+        """Continue where the worlds of another environment are, with draws of this one's own.
+
+        Args:
+            state: Its ``state_dict()``. What only one of the two has, since another engine simulates it, is left out.
+
+        Raises:
+            ValueError: If it is that of another task or another number of worlds.
+        """
+        for name, tensor in self.tensors.items():
+            if name in state and name not in DRAW_COUNTS:
+                if state[name].shape != tensor.shape:
+                    raise ValueError(
+                        f"{name} must have the shape {tuple(tensor.shape)}, got {tuple(state[name].shape)}."
+                    )
+                tensor.copy_(state[name])
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of all tensors that a bit-exact resume needs."""
