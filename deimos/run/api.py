@@ -44,11 +44,15 @@ def train(
     config = config or TrainConfig()
     device = training.resolve_device(config.device)
     with on_threads(torch.get_num_threads()), one_stream(device):  # a run sets the number; the host gets its own back
-        trainer, folder = training.start(config, out and Path(out), branch_from=branch_from and Path(branch_from))
+        trainer, folder = training.start(config, _path(out), branch_from=_path(branch_from))
         training.train(trainer, folder)
         if config.evaluation:
             evaluate_run(folder, config.env, config.eval, device)
     return folder.path
+
+
+def _path(name: Path | str | None) -> Path | None:
+    return None if name is None else Path(name)
 
 
 def evaluate(

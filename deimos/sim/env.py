@@ -145,6 +145,8 @@ class Env(abc.ABC):
     """Components of a goal that are met or missed together."""
     goal_group_names: tuple[str, ...] = ("goal",)
     """What each of them is called."""
+    goal_group_weights: tuple[float, ...] = ()
+    """How much each of them counts in the score, at least 0; empty where all count alike."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
     """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
     shape (num_envs,). Empty where ``Step.tracking`` says enough."""
@@ -261,6 +263,14 @@ class Env(abc.ABC):
 
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
         """A scripted policy (obs -> action) that fixes 1 on the normalised score; ``None`` where there is none."""
+        return None
+
+    def tracking_at_rest(self) -> float | None:
+        """Weighted tracking of uniform goals by a robot that stands still, in [0, 1]: what fixes 0 on the score.
+
+        Perfect tracking is 1 then. The robots of this environment stand for a while to find out. ``None`` where scripts
+        fix the score (``reference_policy``), or nothing does.
+        """
         return None
 
     @property
