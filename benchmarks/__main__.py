@@ -10,9 +10,21 @@ import torch
 import tyro
 import warp as wp
 
-from benchmarks import commits, director, engines, learner, particle, quad, terrain, training
+from benchmarks import (
+    commits,
+    director,
+    engine_training,
+    engines,
+    learner,
+    particle,
+    quad,
+    stability,
+    terrain,
+    training,
+)
 from benchmarks.timing import wide_console
 from deimos.checks import RunError, check_at_least
+from deimos.nn.threads import torch_on_one
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import cores, provenance, resolve_device
 from deimos.sim.envs.particle import Config
@@ -25,7 +37,18 @@ class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
     what: tyro.conf.Positional[
-        Literal["particle", "quad", "quad-arm", "engines", "terrain", "director", "learner", "commits"]
+        Literal[
+            "particle",
+            "quad",
+            "quad-arm",
+            "engines",
+            "engine-training",
+            "stability",
+            "terrain",
+            "director",
+            "learner",
+            "commits",
+        ]
     ]
     """What to measure."""
     against: str = "HEAD"
@@ -59,7 +82,8 @@ def run(options: BenchOptions) -> dict[str, Any]:
     }  # fmt: skip
     measure = {
         "particle": measure_particle, "engines": measure_engines, "terrain": measure_terrain,
-        "director": measure_director,
+        "director": measure_director, "stability": measure_stability,
+        "engine-training": measure_engine_training,
     }  # fmt: skip
     if options.what == "commits":
         results["commits"] = commits.measure(options.against, options.rounds, options.threads or cores())
@@ -114,6 +138,21 @@ def measure_engines(rounds: int, device: torch.device) -> dict[str, Any]:
     results = engines.measure(device, rounds)
     engines.show(results)
     return results
+
+
+def measure_engine_training(rounds: int, device: torch.device) -> dict[str, Any]:
+    """Training on either engine."""
+    result = engine_training.measure(device, rounds)
+    engine_training.show(result)
+    return {"training": result}
+
+
+def measure_stability(rounds: int, device: torch.device) -> dict[str, Any]:
+    """Legged robots over ten million world-steps, whatever the rounds."""
+    with torch_on_one():
+        result = stability.measure(device)
+    stability.show(result)
+    return {"stability": result}
 
 
 def measure_terrain(rounds: int, device: torch.device) -> dict[str, Any]:
