@@ -11,9 +11,22 @@ import torch
 import tyro
 import warp as wp
 
-from benchmarks import commits, director, engines, learner, particle, quad, table41, terrain, training
+from benchmarks import (
+    commits,
+    director,
+    engine_training,
+    engines,
+    learner,
+    particle,
+    quad,
+    stability,
+    table41,
+    terrain,
+    training,
+)
 from benchmarks.timing import wide_console
 from deimos.checks import RunError, check_at_least, check_positive
+from deimos.nn.threads import torch_on_one
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import cores, provenance, resolve_device
 from deimos.sim.envs.particle import Config
@@ -28,7 +41,19 @@ class BenchOptions:
     """Measure speed; everything that is compared is measured in the same run."""
 
     what: tyro.conf.Positional[
-        Literal["particle", "quad", "quad-arm", "engines", "terrain", "director", "learner", "commits", "table41"]
+        Literal[
+            "particle",
+            "quad",
+            "quad-arm",
+            "engines",
+            "engine-training",
+            "stability",
+            "terrain",
+            "director",
+            "learner",
+            "commits",
+            "table41",
+        ]  # fmt: skip
     ]
     """What to measure."""
     against: str = "HEAD"
@@ -67,7 +92,8 @@ def run(options: BenchOptions) -> dict[str, Any]:
     }  # fmt: skip
     measure = {
         "particle": measure_particle, "engines": measure_engines, "terrain": measure_terrain,
-        "director": measure_director,
+        "director": measure_director, "stability": measure_stability,
+        "engine-training": measure_engine_training,
     }  # fmt: skip
     if options.what == "commits":
         results["commits"] = commits.measure(options.against, options.rounds, options.threads or cores())
@@ -126,6 +152,21 @@ def measure_engines(rounds: int, device: torch.device) -> dict[str, Any]:
     results = engines.measure(device, rounds)
     engines.show(results)
     return results
+
+
+def measure_engine_training(rounds: int, device: torch.device) -> dict[str, Any]:
+    """Training on either engine."""
+    result = engine_training.measure(device, rounds)
+    engine_training.show(result)
+    return {"training": result}
+
+
+def measure_stability(rounds: int, device: torch.device) -> dict[str, Any]:
+    """Legged robots over ten million world-steps, whatever the rounds."""
+    with torch_on_one():
+        result = stability.measure(device)
+    stability.show(result)
+    return {"stability": result}
 
 
 def measure_terrain(rounds: int, device: torch.device) -> dict[str, Any]:

@@ -59,6 +59,16 @@ class StructTable:
             setattr(struct, name, wp.zeros(self.shape(name, **sizes), self.dtype(name), device=device))
         return struct
 
+    def rows(self, struct: Any, rows: slice) -> Any:
+        """The struct of some of the worlds: arrays with an element for each are views of theirs, the rest is shared."""
+        part = self.struct()
+        for name in self.struct.vars:
+            value = getattr(struct, name)
+            if name in self.names and "num_envs" in (shape := self.shapes.get(name, ("num_envs",))):
+                value = value[tuple([*[slice(None)] * shape.index("num_envs"), rows])]
+            setattr(part, name, value)
+        return part
+
     def require(self, label: str, struct: Any, like: wp.array, **sizes: int) -> None:
         """Raise ``ValueError`` unless every array of ``struct`` is as the table says.
 

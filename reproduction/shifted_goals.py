@@ -10,7 +10,6 @@ draws them.
 """
 
 import argparse
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from deimos.goals.fear import Fear
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.learn.policy import load_policy
 from deimos.run.attack import learn_fear
-from deimos.run.evaluation import make_target, play, return_scale
+from deimos.run.evaluation import make_target, play, score_scale
 from deimos.run.oracle import Clones
 from deimos.sim.env import Env
 from deimos.study.folder import StudyFolder
@@ -100,7 +99,7 @@ def evaluate(cell: Cell, run: Path, device: torch.device) -> list[Row]:
     target = make_target(policy.scaled, config.env, config.eval, device)
     fear, _ = learn_fear(target, LONGER * target.steps, own_goals=True)
     clones = Clones(lambda count: target.build(count, target.seed), target.policy)
-    scale = return_scale(target.build, config.eval)
+    measure, low, high = score_scale(target.build, config.eval)
     ways: dict[str, tuple[Danger, int, int]] = {"exact": (exact(clones), EXACT_CANDIDATES, config.eval.oracle_worlds)}
     if fear.fitted:
         ways["learnt"] = learnt(fear), 100, config.eval.worlds
@@ -113,14 +112,9 @@ def evaluate(cell: Cell, run: Path, device: torch.device) -> list[Row]:
             rows.append({
                 "environment": cell.environment, "goal_period": env.goal_period, "seed": config.seed, "fear": name,
                 "rule": rule, "percentile": selector.delivered, "crash_rate": found["crash_rate"],
-                "interactions": found["interactions"], "score": _score(found["return_per_step"], scale),
+                "interactions": found["interactions"], "score": (found[measure] - low) / (high - low),
             })  # fmt: skip
     return rows
-
-
-def _score(gained: float, scale: tuple[float, float] | None) -> float:
-    """As ``deimos.run.evaluation.evaluate`` has it, also of goals that are not uniform; NaN without a scale."""
-    return (gained - scale[0]) / (scale[1] - scale[0]) if scale else math.nan
 
 
 def read(folder: Path) -> list[Row]:

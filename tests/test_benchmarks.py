@@ -1,6 +1,7 @@
 """The benchmarks, in tiny: every one runs, prints its table, and counts operations as its networks have them."""
 
 import json
+import types
 from dataclasses import replace
 
 import pytest
@@ -9,8 +10,22 @@ from deimos.terrain import presets
 from torch import nn
 
 from benchmarks import __main__ as benchmarks
-from benchmarks import commits, director, engines, flops, learner, particle, quad, table41, terrain, timing, training
-from deimos.checks import RunError
+from benchmarks import (
+    commits,
+    director,
+    engine_training,
+    engines,
+    flops,
+    learner,
+    particle,
+    quad,
+    stability,
+    table41,
+    terrain,
+    timing,
+    training,
+)
+from deimos.checks import RunError, SimulationError
 from deimos.goals.methods import method
 from deimos.goals.selectors import rnd, vds
 from deimos.learn.ppo import PPOConfig
@@ -110,6 +125,35 @@ def test_engines_are_measured(capsys):
     assert "2 robots that walk" in capsys.readouterr().out
     with pytest.raises(ValueError, match="device must be cpu for the native engine, got cuda"):
         engines.measure(torch.device("cuda"), 1)
+
+
+def test_training_on_engines_is_measured(capsys):
+    """Both engines train on both grounds, and with an update that costs nothing more their ratio would be the limit."""
+    result = engine_training.measure(CPU, 1, num_envs=4)
+    assert result["rows"].keys() == {f"{name}, {ground}" for name in ("native", "warp") for ground in ("flat", "rough")}
+    for ground in ("flat", "rough"):
+        fast, slow = (result["rows"][f"{name}, {ground}"]["fps"] for name in ("native", "warp"))
+        assert result[f"native / mujoco-warp, {ground}"] == pytest.approx(fast / slow)
+        assert result[f"limit, {ground}"] > 0
+    engine_training.show(result)
+    assert "Training, 4 robots" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="device must be cpu for the native engine, got cuda"):
+        engine_training.measure(torch.device("cuda"), 1)
+
+
+def test_stability_is_measured(capsys, monkeypatch):
+    """World-steps are simulated and counted, with the invalid ones, crashes, levels and memory, and NaN is an error."""
+    result = stability.measure(CPU, 1000, num_envs=20)
+    assert (result["world_steps"], result["engine"]) == (1000, "native")
+    assert result["invalid_share"] == result["invalid"] / 1000
+    assert len(result["memory"]) == len(result["mean_level"]) == 25
+    assert min(result["memory"]) > 100
+    stability.show(result)
+    assert "20 Go1s on rough ground, native" in capsys.readouterr().out
+    broken = types.SimpleNamespace(scaled=lambda obs: obs[:, :12] * 0.0 + torch.nan)
+    monkeypatch.setattr(stability, "load_policy", lambda *_: broken)
+    with pytest.raises(SimulationError, match="its action is not finite"):
+        stability.measure(CPU, 1000, num_envs=20)
 
 
 def test_quad_is_measured(capsys):

@@ -310,7 +310,7 @@ def test_rows_tell_tasks_apart():
     before = identities(config)
     assert identities(config.for_evaluation()) == identities(replace(config, crash_penalty=2.0)) == before
     assert identities(replace(config, terrain="/there/terrain.npz")) == before  # a run folder that was moved
-    for old, new in zip(before, identities(replace(config, episode_steps=1077)), strict=True):
+    for old, new in zip(before, identities(replace(config, air_time_target=0.77)), strict=True):
         assert old | {"environment": ""} == new | {"environment": ""}
         assert old != new
     for old, new in zip(before, identities(replace(config, engine="warp")), strict=True):

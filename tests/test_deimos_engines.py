@@ -149,15 +149,23 @@ def test_engines_agree_in_distribution_on_rough_ground():
 
 
 def test_threads_do_not_change_a_bit(threads):
-    """Robots on rough ground, some of which fall, move the same way on one, two and five threads."""
-    action = torch.tensor(np.random.default_rng(0).normal(size=(33, 12)), dtype=torch.float32)
-    found = []
+    """Robots with arms on rough ground, some of which fall, and one that breaks: on one, two and five threads."""
+    action = torch.tensor(np.random.default_rng(0).normal(size=(200, 17)), dtype=torch.float32)
+    found, parts = [], []
     for count in (1, 2, 5):
         threads(count)
-        env = quad.Config(engine="native", terrain="rough").build(33, CPU, seed=1)
+        env = quad_arm.Config(engine="native", terrain="rough").build(200, CPU, seed=1)
         threads(1)
         terminated = sum(env.step(action).terminated.clone() for _ in range(40))
-        found.append(env.state_dict() | {"terminated": terminated})
+        env.tensors["qvel"][[131, 190], 0] = 1e9
+        step = env.step(action)
+        assert step.invalid.nonzero().flatten().tolist() == [131, 190]
+        assert env._views["fault"].tolist() == [2, 131, 200]
+        names = ("obs", "reward", "tracking", "truncated", "goal_due")
+        seen = {f"step {name}": getattr(step, name).clone() for name in names}
+        found.append(env.state_dict() | {"terminated": terminated, "term": env.term.clone()} | seen)
+        parts.append([(rows.start, rows.stop) for rows in env.physics.parts])
+    assert parts == [[(0, 200)], [(0, 128), (128, 200)], [(0, 64), (64, 128), (128, 192), (192, 200)]]
     assert found[0]["terminated"].any()
     for other in found[1:]:
         assert all(torch.equal(value, other[name]) for name, value in found[0].items())

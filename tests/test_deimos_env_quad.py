@@ -370,8 +370,9 @@ def test_randomisation_is_drawn_per_world(simulator, uniform_reference):
     )
     quiet = Config().for_evaluation()
     assert quiet == replace(
-        Config(), levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
-    )
+        Config(), levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False,
+        episode_steps=0,
+    )  # fmt: skip
     assert "geom_friction" not in replace(quiet, engine=simulator.engine).build(2, simulator.device, 0).tensors
 
 
@@ -510,7 +511,7 @@ def test_goals_that_lead_nowhere_do_not_count(torch_device):
 
 def test_evaluation_puts_world_i_on_tile_i(torch_device, hills):
     """In evaluation the tile is a function of the world's number alone, and stays, whatever happens."""
-    config = Config(terrain=hills, episode_steps=6, goal_period=3).for_evaluation()
+    config = Config(terrain=hills, goal_period=3).for_evaluation()
     env = config.build(8, torch_device, 0)
     tiles = [("stairs-up", 0), ("stairs-down", 0), ("stairs-up", 1), ("stairs-down", 1), ("stairs-up", 2)]
     for _ in range(3):
@@ -519,7 +520,15 @@ def test_evaluation_puts_world_i_on_tile_i(torch_device, hills):
         loop = build_loop(env)
         for _ in range(7):
             loop.advance(env.step(actions(8, torch_device)))
+        loop.start()
     assert not env.tensors["goal_clock"].unique().numel() > 2
+
+
+def test_evaluation_has_no_time_limit(torch_device):
+    """However short the episodes of training are, those of an evaluation go on until something happens."""
+    env = Config(episode_steps=6, goal_period=3).for_evaluation().build(8, torch_device, 0)
+    assert env.time_limit == 0
+    assert not any(bool(env.step(torch.zeros(8, 12, device=torch_device)).truncated.any()) for _ in range(20))
 
 
 def test_episodes_end_at_their_limit_and_first_ones_are_staggered(torch_device):

@@ -223,12 +223,13 @@ def test_a_held_trunk_does_not_move(torch_device):
 
 
 def test_evaluation_is_quads(torch_device):
-    """Randomisations are off, the task of the arm stays as it is."""
+    """Randomisations and the time limit are off, the task of the arm stays as it is."""
     config = Config(speed=0.0, arm_rewards=ArmWeights(reach=0.7), goal_period=100)
     quiet = config.for_evaluation()
     assert quiet == dataclasses.replace(
-        config, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
-    )
+        config, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False,
+        episode_steps=0,
+    )  # fmt: skip
     assert quiet.with_goal_period(500).speed == 0.0
 
 

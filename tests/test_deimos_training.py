@@ -548,7 +548,7 @@ CONFIGS = {
         ppo=PPOConfig(
             num_steps=5, epochs=2, minibatches=3, learning_rate=1 / 3, desired_kl=0.0, discount=1.0, gae_lambda=0.0,
             clip=0.1, clip_value=False, value_coef=0.5, entropy_coef=0.0, max_grad_norm=7.0, reward_scale=2.0,
-            hidden=(3, 2, 1), activation="elu", init_std=0.7,
+            hidden=(3, 2, 1), activation="elu", init_std=0.7, normalize_observations=True,
         ),
         eval=EvalConfig(
             worlds=3, steps=99, seed=0, adversary_steps=4, attackers=("oracle",), oracle_worlds=2, pool=Path("pool.pt"),
@@ -557,7 +557,8 @@ CONFIGS = {
                 workspace=1,
             ),
         ),
-        evaluation=False, seed=2**32 - 1, num_envs=11, env_steps=13, device="cpu", threads=2,
+        evaluation=False, seed=2**32 - 1, num_envs=11, env_steps=13, critic_warmup=3, device="cpu",
+        threads=2,
     ),
 }  # fmt: skip
 

@@ -42,6 +42,18 @@ def test_what_was_allocated_passes_the_check(device):
         TABLE.require("bodies", bodies, bodies.mass, num_envs=5, num_joints=2)
 
 
+def test_rows_are_views_of_some_worlds(device):
+    """Arrays with an element for every world are views of those rows; others, and numbers, are shared as they are."""
+    bodies = TABLE.allocate(device, num_envs=5, num_joints=2)
+    bodies.gravity = 9.81
+    part = TABLE.rows(bodies, slice(1, 4))
+    TABLE.require("part", part, bodies.mass, num_envs=3, num_joints=2)
+    part.joint.fill_(7)
+    np.testing.assert_array_equal(bodies.joint.numpy(), [[0, 0], [7, 7], [7, 7], [7, 7], [0, 0]])
+    assert part.mass.ptr == bodies.mass.ptr
+    assert part.gravity == bodies.gravity
+
+
 def test_a_size_that_is_not_given_is_named(device):
     """A size that a shape needs and nobody gives is named with the shape."""
     with pytest.raises(ValueError, match=r"Bodies\.joint has the shape .*; num_joints must be given"):

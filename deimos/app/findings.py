@@ -10,7 +10,6 @@ from deimos.app.console import number, table
 from deimos.run.evaluation import worst
 
 _LINES = (
-    ("score (0: no action, 1: reference controller)", "score"),
     ("reward per step", "reward"),
     ("crashes per 1000 steps", "crashes_per_1000"),
     ("crashes per robot-minute", "crashes_per_minute"),
@@ -33,7 +32,9 @@ def describe(rows: list[dict], elsewhere: Sequence[dict] = ()) -> str:
     columns = [*rows, *elsewhere]
     lines = [("simulated by", [known(row.get("engine"), str) for row in columns])]
     lines += [("goals that ended in a crash", [percent(row["crash_rate"]) for row in columns])]
-    lines += [(label, [_cell(row, key) for row in columns]) for label, key in _LINES]
+    ends = "standing still, 1: perfect tracking" if "matching" in rows[0] else "no action, 1: reference controller"
+    named = ((f"score (0: {ends})", "score"), *_LINES)
+    lines += [(label, [_cell(row, key) for row in columns]) for label, key in named]
     lines += _per_part(columns)
     header, names = zip(("", ""), *[heading(row["goals"]) for row in columns], strict=True)
     shown = [[label, *values] for label, values in lines if any(value != "-" for value in values)]

@@ -16,6 +16,7 @@ from deimos.checks import RunError
 from deimos.goals import selectors
 from deimos.learn.policy import load_policy
 from deimos.run import presets, training
+from deimos.run.branch import branch_config
 from deimos.run.evaluation import weights_hash
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
@@ -43,6 +44,9 @@ class FirstOptions:
     """Name of a ready configuration to start from; the others change it."""
     resume: Path | None = None
     """Resume the run in this folder from its last checkpoint; takes only --env-steps and --device."""
+    branch_from: Path | None = None
+    """Start with networks, optimiser, worlds and levels of the run in this folder, and with its settings: method,
+    env.crash-penalty, env.goal-period, env.engine, seed and budget may differ."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +66,7 @@ def main(arguments: list[str], program: str) -> None:
         _resume(console.parse(ResumeOptions, arguments, program))
         return
     _check_names(arguments)
-    options, config = _train_options(), _preset(first.preset, arguments)
+    options, config = _train_options(), _start_from(first, arguments)
     default = options(**vars(config))
     _train(console.parse(options, arguments, program, default=default))
 
@@ -71,7 +75,7 @@ def _train(options: Any) -> None:
     config = TrainConfig(**{field.name: getattr(options, field.name) for field in fields(TrainConfig)})
     console.quiet_warp()
     with one_stream(training.resolve_device(config.device)):
-        _run(*training.start(config, options.out, options.init_from))
+        _run(*training.start(config, options.out, options.init_from, options.branch_from))
 
 
 def _resume(options: ResumeOptions) -> None:
@@ -131,6 +135,15 @@ def _subcommands(package: Any, *more: Any) -> Any:
         Annotated[module.Config, tyro.conf.subcommand(name)] for name, module in plugins.load_all(package).items()
     ]
     return Union[tuple([*more, *options])]  # noqa: UP007 (a union of a computed list)
+
+
+def _start_from(first: FirstOptions, arguments: list[str]) -> TrainConfig:
+    """What the options start from: a run that is branched off, or a preset."""
+    if first.branch_from is None:
+        return _preset(first.preset, arguments)
+    if first.preset is not None:
+        raise RunError("--preset and --branch-from cannot be combined; the run has settings of its own.")
+    return branch_config(training.read_config(RunFolder.open(first.branch_from)))
 
 
 def _preset(name: str | None, arguments: list[str]) -> TrainConfig:

@@ -155,6 +155,7 @@ class PPO(Stateful):
             for module, part in zip((self.actor, self.critic), memory.split(sizes, dim=1), strict=True)
         )
         self._parameters, self._grad = memory
+        self._critic_part = slice(sizes[0], None)
         self.learning_rate = torch.tensor(config.learning_rate, dtype=torch.float32, device=device)
         self.optimizer = Adam(self._parameters, self._grad, self.learning_rate)
         shape = obs_dim + 2 * action_dim + 5, rows
@@ -211,8 +212,9 @@ class PPO(Stateful):
 
     @torch.no_grad()
     def update(
-        self, rollout: Rollout, order: Tensor | None = None, critic: Callable[[Tensor], Tensor] | None = None
-    ) -> dict[str, float]:
+        self, rollout: Rollout, order: Tensor | None = None, critic: Callable[[Tensor], Tensor] | None = None, *,
+        learn_policy: bool = True,
+    ) -> dict[str, float]:  # fmt: skip
         """Learn from a rollout.
 
         Args:
@@ -222,6 +224,7 @@ class PPO(Stateful):
             critic: The value function to use as the baseline, from observations of shape (..., obs_dim) to values
                 in units of scaled rewards; ``None`` for PPO's own. Somebody else trains it, and PPO's own learns
                 nothing then.
+            learn_policy: Whether the policy learns, its normaliser included.
 
         Returns:
             Averages over all minibatches: ``value_loss``, ``surrogate_loss``, ``kl``; and, after the
@@ -234,15 +237,21 @@ class PPO(Stateful):
             order = torch.randperm(rows, generator=self.generator, device=batch.table.device)
         std = self.actor.std.clone()
         value_loss = surrogate_loss = kl = math.nan
-        if bool(mean_over_ranks(rollout.weight.sum()) >= self._size):
+        learns = learn_policy or critic is None
+        if learns and bool(mean_over_ranks(rollout.weight.sum()) >= self._size):
             minibatches = self._minibatches(batch, order)
             totals = torch.zeros(3, dtype=torch.float32, device=order.device)
             self._grad.zero_()
             for _ in range(self.config.epochs):
                 for minibatch in minibatches:
-                    totals += self._learn(minibatch, std, learn_value=critic is None)
+                    totals += (
+                        self._learn(minibatch, std, learn_value=critic is None)
+                        if learn_policy else self._learn_value(minibatch)
+                    )  # fmt: skip
             value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
-        if self.actor.normalizer is not None:  # only now: the policy that acted is the one that learning starts from
+        if (
+            learn_policy and self.actor.normalizer is not None
+        ):  # only now: the policy that acted is the one that learning starts from
             for obs, weight in zip(rollout.obs, rollout.weight, strict=False):
                 self.actor.normalizer.update(obs, (weight > 0).float())
         return {
@@ -298,8 +307,7 @@ class PPO(Stateful):
         work: list[tuple[MLPs, Tensor, Loss]]
         work = [(self._actor, minibatch.obs[:, self.actor.seen], Surrogate(minibatch.policy, config.clip))]
         if learn_value:
-            clip = config.clip if config.clip_value else math.inf
-            work.append((self._critic, minibatch.obs[:, self._critic_sees], ValueLoss(minibatch.value, clip)))
+            work.append(self._value_work(minibatch))
         surrogate, *value = gradients(*work)
         std.grad -= config.entropy_coef / std
         self._critic.grad *= config.value_coef
@@ -314,6 +322,20 @@ class PPO(Stateful):
         std.data.clamp_(min=1e-6)
         value_loss = value[0][0, 0] if value else torch.zeros_like(kl)
         return torch.stack([value_loss, surrogate[0, 0], kl])
+
+    def _value_work(self, minibatch: Batch) -> tuple[MLPs, Tensor, Loss]:
+        """What the critic learns from a minibatch."""
+        clip = self.config.clip if self.config.clip_value else math.inf
+        return self._critic, minibatch.obs[:, self._critic_sees], ValueLoss(minibatch.value, clip)
+
+    def _learn_value(self, minibatch: Batch) -> Tensor:
+        """``_learn`` for the critic alone; of a policy that stays there is neither a loss nor a divergence."""
+        (loss,) = gradients(self._value_work(minibatch))
+        self._critic.grad *= self.config.value_coef
+        mean_over_ranks(self._critic.grad)
+        self._critic.clip_gradient(self.config.max_grad_norm)
+        self.optimizer.step(self._critic_part)
+        return torch.stack([loss[0, 0], *torch.full((2,), math.nan, device=loss.device)])
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Divide by 1.5 above twice the desired divergence, multiply below half of it; no host round trip."""
@@ -331,6 +353,16 @@ class PPO(Stateful):
         """
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
+
+    def load_learnt(self, state: dict) -> None:
+        """Load what was learnt: networks, statistics of observations, and the optimiser's of gradients.
+
+        Raises:
+            KeyError: If something is missing.
+            RuntimeError, ValueError: If the networks have other sizes.
+        """
+        self.load_weights(state)
+        self.optimizer.load_state_dict(state["optimizer"])
 
     def check(self) -> None:
         """Raise ``SimulationError`` if a weight or a statistic is not finite; reads the device once."""

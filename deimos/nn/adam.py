@@ -33,11 +33,18 @@ class Adam(Stateful):
         self._mean = torch.zeros_like(self._grad)
         self._square = torch.zeros_like(self._grad)
 
-    def step(self) -> None:
-        """Move the parameters against their gradient."""
+    def step(self, part: slice = slice(None)) -> None:
+        """Move the parameters against their gradient.
+
+        Args:
+            part: Which of them, along the first axis; the others, and what is known of their gradients, stay.
+        """
         self.steps += 1
-        self._mean.lerp_(self._grad, 1 - self.BETA_1)
-        self._square.mul_(self.BETA_2).addcmul_(self._grad, self._grad, value=1 - self.BETA_2)
+        parameters, grad, mean, square = (
+            vector[part] for vector in (self._parameters, self._grad, self._mean, self._square)
+        )
+        mean.lerp_(grad, 1 - self.BETA_1)
+        square.mul_(self.BETA_2).addcmul_(grad, grad, value=1 - self.BETA_2)
         mean_bias, square_bias = 1 - self._betas**self.steps
-        scale = self._square.div(square_bias).sqrt_().add_(self.EPSILON)
-        self._parameters.sub_(self._mean.div(scale).mul_(self.learning_rate / mean_bias))
+        scale = square.div(square_bias).sqrt_().add_(self.EPSILON)
+        parameters.sub_(mean.div(scale).mul_(self.learning_rate / mean_bias))

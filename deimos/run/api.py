@@ -9,6 +9,7 @@ import torch
 from deimos.checks import RunError
 from deimos.nn.threads import on_threads
 from deimos.run import training
+from deimos.run.branch import branch_config
 from deimos.run.config import from_dict, to_dict
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
@@ -17,7 +18,9 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
 
-def train(config: TrainConfig | None = None, out: Path | str | None = None) -> Path:
+def train(
+    config: TrainConfig | None = None, out: Path | str | None = None, *, branch_from: Path | str | None = None
+) -> Path:  # fmt: skip
     """Train a policy and evaluate it.
 
     The environment of the process is left alone. Where other programs use the cores too, set OMP_WAIT_POLICY=passive
@@ -26,6 +29,8 @@ def train(config: TrainConfig | None = None, out: Path | str | None = None) -> P
     Args:
         config: What to train; ``None`` for the main job, Particle Gym under the Director.
         out: Folder of the run, which must not exist; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
+        branch_from: Folder of a run whose networks, optimiser, worlds and levels it starts with; ``config`` is
+            by default ``deimos.run.branch.branch_config`` of its own.
 
     Returns:
         The run's folder, for ``evaluate`` and ``load_policy``.
@@ -34,14 +39,20 @@ def train(config: TrainConfig | None = None, out: Path | str | None = None) -> P
         RunError: If the folder exists, the worlds do not fit into memory, or a file cannot be written.
         SimulationError: If a number is not finite; the last checkpoint is intact.
     """
+    if config is None and branch_from is not None:
+        config = branch_config(training.read_config(RunFolder.open(Path(branch_from))))
     config = config or TrainConfig()
     device = training.resolve_device(config.device)
     with on_threads(torch.get_num_threads()), one_stream(device):  # a run sets the number; the host gets its own back
-        trainer, folder = training.start(config, Path(out) if out is not None else None, init_from=None)
+        trainer, folder = training.start(config, _path(out), branch_from=_path(branch_from))
         training.train(trainer, folder)
         if config.evaluation:
             evaluate_run(folder, config.env, config.eval, device)
     return folder.path
+
+
+def _path(name: Path | str | None) -> Path | None:
+    return None if name is None else Path(name)
 
 
 def evaluate(

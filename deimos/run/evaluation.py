@@ -178,9 +178,10 @@ def evaluate(
         known: Rows of this policy that there are: they are given back and not made again.
 
     Returns:
-        A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` gives, and ``score``: the
-        place of its ``return_per_step`` between that of the policy that does nothing (0) and that of the environment's
-        reference policy (1), both under Naive goals; NaN where there is none. For an attacker also its facts, see
+        A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` gives, and ``score``: for
+        robots the place of its ``matching`` between standing still (0) and perfect tracking (1); else that of its
+        ``return_per_step`` between the policy that does nothing (0) and the environment's reference policy (1), both
+        under Naive goals; NaN where there is none. Who crashes may be below 0. For an attacker also its facts, see
         ``deimos.run.attack``, and ``adversary_setting``, a hash of all that fixed how it was made but the policy. In
         ``environment`` each has a hash of the task.
 
@@ -191,7 +192,7 @@ def evaluate(
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
     target = make_target(policy, env_config, config, device)
-    scale = return_scale(target.build, config, progress)
+    measure, low, high = score_scale(target.build, config, progress)
     rows = []
     for identity in _identities(env_config, config):
         goals = identity["goals"]
@@ -203,7 +204,7 @@ def evaluate(
             attack = attacker(goals).prepare(replace(target, progress=partial(progress, f"{goals} learns")))
         env = target.build(identity["worlds"], config.seed)
         row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals)) | attack.facts
-        row["score"] = (row["return_per_step"] - scale[0]) / (scale[1] - scale[0]) if scale else math.nan
+        row["score"] = (row[measure] - low) / (high - low)
         rows.append({"goals": goals} | row | identity)
     return rows
 
@@ -253,19 +254,22 @@ def _halves(row: dict) -> tuple[float, float, int] | None:
     return crashed / even, (row["interaction_crashes"] - crashed) / odd, odd
 
 
-def return_scale(
+def score_scale(
     build: Callable[[int, int], Env], config: EvalConfig, progress: Progress = lambda stage, share: None
-) -> tuple[float, float] | None:
-    """Return per step of the zero-action policy and of the reference policy, if there is one: scores of 0 and 1."""
+) -> tuple[str, float, float]:
+    """What the score is made of, and its values that make 0 and 1; see ``evaluate``."""
     env = build(config.worlds, config.seed)
+    rest = env.tracking_at_rest()
+    if rest is not None:
+        return "matching", rest, 1.0
     nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
     reference = env.reference_policy()
     if reference is None:
-        return None
+        return "return_per_step", math.nan, math.nan
     low = play(env, lambda obs: nothing, uniform_goals(env), config.steps, partial(progress, "zero action"))
     env = build(config.worlds, config.seed)
     high = play(env, reference, uniform_goals(env), config.steps, partial(progress, "reference"))
-    return low["return_per_step"], high["return_per_step"]
+    return "return_per_step", low["return_per_step"], high["return_per_step"]
 
 
 @torch.no_grad()
@@ -280,9 +284,10 @@ def play(
         steps and crashes under first goals.
         ``return_per_step``, the mean over interactions of (sum of the rewards over the T steps, 0 from a crash on) / T,
         cannot be raised by crashing, unlike the reward per transition: a crash puts a particle back to the origin, far
-        from every wall. ``tracking`` has the mean of every group of goal components, ``strata`` the same and more by
-        kind of world, where there are kinds, and ``errors`` the median of each of ``Env.errors`` over all goals that
-        were survived, at the end of their period.
+        from every wall. ``matching``, where goals have several groups of components, is the same of their tracking,
+        weighted by ``Env.goal_group_weights``. ``tracking`` has the mean of every group over transitions, ``strata``
+        the same and more by kind of world, where there are kinds, and ``errors`` the median of each of ``Env.errors``
+        over all goals that were survived, at the end of their period.
     """
     loop = GoalLoop(env, selector, window=steps)
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
@@ -320,12 +325,20 @@ def play(
         "first_goal_steps": int(first_count),
         "first_goal_crashes": int(first_crash_count),
         "return_per_step": done.reward.double().mean().item() / env.goal_period,
+        **({} if len(env.goal_groups) == 1 else {"matching": _matching(env, done)}),
         "goal_groups": list(env.goal_group_names),
         "tracking": (tracking.mean(0) / steps).tolist(),
         "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
         "strata": _by_stratum(env.strata(), crashes, tracking / steps, done),
         "errors": {name: values.nanmedian().item() for name, values in errors.items()},
     }
+
+
+def _matching(env: Env, done: Resolved) -> float:
+    """Mean tracking over interactions, 0 from a crash on, in [0, 1]; NaN where nothing has a weight."""
+    counts = env.goal_group_weights or [1.0] * len(env.goal_groups)
+    weights = torch.tensor(counts, dtype=torch.float64, device=done.tracking.device)
+    return (done.tracking.double().mean(0) @ weights / weights.sum()).item()
 
 
 def _by_stratum(strata: list[str], crashes: Tensor, tracking: Tensor, done: Resolved) -> dict[str, dict]:

@@ -46,6 +46,8 @@ class TrainConfig:
     """Parallel worlds, at least 1."""
     env_steps: int = 2000
     """Steps of every world, at least 1; rounded up to whole rollouts."""
+    critic_warmup: int = 0
+    """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate and learn; auto takes the GPU where there is one."""
     threads: int = 0
@@ -54,6 +56,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_at_least("num_envs", self.num_envs, 1)
         check_at_least("env_steps", self.env_steps, 1)
+        check_at_least("critic_warmup", self.critic_warmup, 0)
         check_range("threads", self.threads, 0, MOST_THREADS)
         check_choice("device", self.device, ["auto", "cpu", "cuda"])
         if not 0 <= self.seed < 2**32:
@@ -152,7 +155,10 @@ class Trainer:
             _check_obs(self.rollout.obs[-1])
             self.rollout.reward -= self._penalty * self.rollout.terminated
             clock = _Clock(self)
-            learner = self.ppo.update(self.rollout, critic=self.loop.selector.critic())
+            learner = self.ppo.update(
+                self.rollout, critic=self.loop.selector.critic(),
+                learn_policy=self.iteration > self.config.critic_warmup,
+            )  # fmt: skip
             self.ppo.check()
             clock.lap("update")
             selector = self.loop.core.learn(self.rollout)

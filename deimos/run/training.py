@@ -18,6 +18,7 @@ from deimos import __version__
 from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
+from deimos.run.branch import check_branch
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.cores import cores
 from deimos.run.folder import RunFolder
@@ -66,12 +67,22 @@ def _commit() -> str:
         return "unknown"
 
 
-def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tuple[Trainer, RunFolder]:
-    """Begin a run, in ``path`` or in ``runs/ENV-METHOD-sSEED-TIME``, with the networks of ``init_from`` if it is given.
+def start(
+    config: TrainConfig, path: Path | None, init_from: Path | None = None, branch_from: Path | None = None
+) -> tuple[Trainer, RunFolder]:  # fmt: skip
+    """Begin a run.
+
+    Args:
+        config: What is trained.
+        path: Its folder; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
+        init_from: Folder of a run whose networks it starts with.
+        branch_from: Folder of a run that it branches off, see ``branch``.
 
     Raises:
-        RunError: If the folder exists, or the networks do not fit.
+        RunError: If the folder exists, or the other run does not fit.
     """
+    if init_from is not None and branch_from is not None:
+        raise RunError("--init-from and --branch-from cannot be combined; the latter takes over the networks too.")
     device = resolve_device(config.device)
     config = replace(
         config, env=config.env.resolved(device), threads=config.threads or cores(),
@@ -81,11 +92,14 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
     trainer = build(config, device)
     if init_from is not None:
         _load_weights(trainer, RunFolder.open(init_from))
+    if branch_from is not None:
+        _take_over(trainer, RunFolder.open(branch_from))
     folder = RunFolder.create(path) if path else _new_folder(config)
     try:
         folder.write_json("config.json", {
             "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
             "init_from": str(init_from) if init_from else None,
+            "branch_from": str(branch_from) if branch_from else None,
             "files": {name: folder.keep(name, partial(config.env.read_file, name)) for name in config.env.files},
         })  # fmt: skip
         save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
@@ -152,6 +166,17 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
         trainer.ppo.load_weights(state["ppo"])
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise RunError(f"The networks of {origin.path} do not fit this run: {one_line(error)}") from error
+
+
+def _take_over(trainer: Trainer, origin: RunFolder) -> None:
+    """Continue with networks, optimiser, worlds and levels of a run's last checkpoint."""
+    state = load_checkpoint(origin)
+    try:
+        check_branch(trainer.config, read_config(origin))
+        trainer.ppo.load_learnt(state["ppo"])
+        trainer.env.take_worlds(state["loop"]["env"])
+    except (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
+        raise RunError(f"A run cannot branch off {origin.path}: {one_line(error)}") from error
 
 
 def load_checkpoint(folder: RunFolder) -> dict:

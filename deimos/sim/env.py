@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     import mujoco
 
 
+DRAW_COUNTS = ("episode_count", "goal_count")  # the addresses of a world's draws, among ``Env.tensors``
+
+
 @dataclass(frozen=True)
 class Step:
     """What a step gave back. All tensors are views that the next step overwrites."""
@@ -146,6 +149,8 @@ class Env(abc.ABC):
     """Components of a goal that are met or missed together."""
     goal_group_names: tuple[str, ...] = ("goal",)
     """What each of them is called."""
+    goal_group_weights: tuple[float, ...] = ()
+    """How much each of them counts in the score, at least 0; empty where all count alike."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
     """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
     shape (num_envs,). Empty where ``Step.tracking`` says enough."""
@@ -284,6 +289,14 @@ class Env(abc.ABC):
         """A scripted policy (obs -> action) that fixes 1 on the normalised score; ``None`` where there is none."""
         return None
 
+    def tracking_at_rest(self) -> float | None:
+        """Weighted tracking of uniform goals by a robot that stands still, in [0, 1]: what fixes 0 on the score.
+
+        Perfect tracking is 1 then. The robots of this environment stand for a while to find out. ``None`` where scripts
+        fix the score (``reference_policy``), or nothing does.
+        """
+        return None
+
     @property
     def action_range(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest value of every component of an action, beyond which it is clipped, on the CPU."""
@@ -328,7 +341,7 @@ class Env(abc.ABC):
         Args:
             goal_scale: Share of the goal range that first goals come from; see ``reset``.
         """
-        for name in ("episode_count", "goal_count"):
+        for name in DRAW_COUNTS:
             self.tensors[name].zero_()
         self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device), goal_scale)
 
@@ -345,6 +358,23 @@ class Env(abc.ABC):
         origin = self if origin is None else origin
         for name, tensor in self.tensors.items():
             tensor[target] = origin.tensors[name][source]
+
+    def take_worlds(self, state: dict[str, Tensor]) -> None:
+        """Continue where the worlds of another environment are, with draws of this one's own.
+
+        Args:
+            state: Its ``state_dict()``. What only one of the two has, since another engine simulates it, is left out.
+
+        Raises:
+            ValueError: If it is that of another task or another number of worlds.
+        """
+        for name, tensor in self.tensors.items():
+            if name in state and name not in DRAW_COUNTS:
+                if state[name].shape != tensor.shape:
+                    raise ValueError(
+                        f"{name} must have the shape {tuple(tensor.shape)}, got {tuple(state[name].shape)}."
+                    )
+                tensor.copy_(state[name])
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of all tensors that a bit-exact resume needs."""

@@ -239,6 +239,19 @@ class LeggedWorlds:
         for name, table in TABLES.items():
             table.require(name, getattr(self, name), self.worlds.goal, **self.sizes)
 
+    def rows(self, rows: slice, fault: wp.array) -> "LeggedWorlds":
+        """Some of these worlds, for a thread of their own; draws stay those of the worlds' global numbers.
+
+        Args:
+            rows: Which, from a start to a stop.
+            fault: What the kernels write in place of ``worlds.fault``, int32, shape (3,); it counts from the first row.
+        """
+        parts = {name: table.rows(getattr(self, name), rows) for name, table in TABLES.items()}
+        worlds = parts["worlds"]
+        worlds.num_envs, worlds.fault = rows.stop - rows.start, fault
+        worlds.world_offset += rows.start
+        return LeggedWorlds(sizes=self.sizes | {"num_envs": worlds.num_envs}, params=self.params, **parts)
+
     def launch(self, kernel: wp.Kernel, dim: Any, *inputs: Any) -> None:
         """Launch a kernel of these worlds; its first arguments are ``worlds`` and ``params``, then come ``inputs``."""
         wp.launch(kernel, dim, inputs=[self.worlds, self.params, *inputs], device=self.worlds.goal.device)

@@ -15,7 +15,7 @@ class Config(LocomotionConfig):
 
     def build(self, num_envs: int, device: torch.device, seed: int, env_offset: int = 0) -> Locomotion:
         """See ``EnvConfig.build``."""
-        return Locomotion(self, self.make_robot(), (velocity_goal(),), num_envs, device, seed, env_offset)
+        return Locomotion(self, self.make_robot(), (velocity_goal(self.rewards),), num_envs, device, seed, env_offset)
 
 
 PRESETS = {

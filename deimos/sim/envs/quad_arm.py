@@ -42,7 +42,7 @@ class Config(LocomotionConfig):
         config, robot = self, self.make_robot()
         if self.hold_trunk:
             config, robot = replace(self, push_interval=0.0, payload=0.0), hold_base(robot)
-        parts = (velocity_goal(self.speed), end_effector_goal(robot, self.arm_rewards))
+        parts = (velocity_goal(self.rewards, self.speed), end_effector_goal(robot, self.arm_rewards))
         return Locomotion(config, robot, parts, num_envs, device, seed, env_offset)
 
 

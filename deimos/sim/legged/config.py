@@ -32,7 +32,7 @@ class LocomotionConfig(EnvConfig):
     goal_period: int = 500
     """T: steps that a goal is active, at least 1 and at most an episode."""
     episode_steps: int = 1000
-    """Steps after which an episode is truncated, at least 1."""
+    """Steps after which an episode is truncated, at least 0; 0 for never, as in evaluations."""
     levels: Literal["reward", "displacement", "frozen"] = "reward"
     """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far its goals led it
     beside how far they should have (an arc where they ask for yaw; less than 0.3 m does not count), or nothing."""
@@ -66,9 +66,9 @@ class LocomotionConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("episode_steps", "start_levels"):
-            check_at_least(name, getattr(self, name), 1)
-        if self.goal_period > self.episode_steps:
+        check_at_least("episode_steps", self.episode_steps, 0)
+        check_at_least("start_levels", self.start_levels, 1)
+        if 0 < self.episode_steps < self.goal_period:
             raise ValueError(
                 f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
             )
@@ -109,10 +109,11 @@ class LocomotionConfig(EnvConfig):
         return replace(self, engine=engines.resolve(self.engine, device))
 
     def without_randomness(self) -> "LocomotionConfig":
-        """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns."""
+        """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns, for good."""
         return replace(
-            self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False
-        )
+            self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False,
+            episode_steps=0,
+        )  # fmt: skip
 
     def make_robot(self) -> Robot:
         """The robot, in free space.

@@ -4,12 +4,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, field
 
 import numpy as np
+import torch
 import warp as wp
 from torch import Tensor
 
 from deimos.kernels.legged.arm import evaluate_arms, reset_arms
 from deimos.kernels.legged.arm_goals import ARM, Arm, check_arm, locate_goals, redraw_candidates
 from deimos.kernels.legged.arm_rewards import ARM_TERMS, ArmWeights, vecA
+from deimos.kernels.legged.rewards import TRACKING_VARIANCE, RewardWeights
 from deimos.kernels.legged.state import RATE_SCALE, VELOCITY_SCALE, LeggedWorlds
 from deimos.sim.env import ObsField
 from deimos.sim.legged.robots import Robot
@@ -19,8 +21,9 @@ from deimos.sim.legged.robots import Robot
 class Launches:
     """What a part does in the worlds that it was bound to."""
 
-    evaluate: Callable[[], None] = lambda: None
-    """Evaluates a step: writes the part's terms, tracking and observation; before the step as a whole is evaluated."""
+    evaluate: Callable[[LeggedWorlds, slice], None] = lambda worlds, rows: None
+    """Evaluates a step in some of the worlds, with their rows: writes the part's terms, tracking and observation. The
+    step as a whole is evaluated afterwards."""
     reset: Callable[[], None] = lambda: None
     """Finishes the reset of the worlds of the mask: their first goals and observations."""
     validate: Callable[[wp.array, wp.array, wp.array], wp.Launch] | None = None
@@ -45,6 +48,11 @@ class GoalPart:
     """How many components, one after another, are met or missed together."""
     group_names: tuple[str, ...]
     """What each of these groups is called."""
+    weights: tuple[float, ...]
+    """How much each of them counts in the score."""
+    at_rest: Callable[[Tensor, Tensor], Tensor]
+    """Tracking of each group by robots that stand still, in [0, 1], shape (num_envs, n, groups): of goals in physical
+    units, shape (num_envs, n, components), and what the observation has in ``fields``, shape (num_envs, size)."""
     fields: tuple[ObsField, ...] = ()
     """What the observation has of them, between the last action and the heights."""
     noise: Mapping[str, float] = field(default_factory=dict)
@@ -55,14 +63,21 @@ class GoalPart:
     """Makes the launches for worlds, once."""
 
 
-def velocity_goal(speed: float = 1.0) -> GoalPart:
+def velocity_goal(weights: RewardWeights, speed: float = 1.0) -> GoalPart:
     """v_x, v_y and yaw rate in the base's frame, uniform in [-1, 1]^3 times ``speed`` (thesis, 4.1.2)."""
+
+    def at_rest(goal: Tensor, seen: Tensor) -> Tensor:
+        missed = torch.stack([goal[..., :2].square().sum(-1), goal[..., 2].square()], dim=-1)
+        return torch.exp(-missed / TRACKING_VARIANCE)
+
     return GoalPart(
         range=(speed,) * 3,
         units=("m/s", "m/s", "rad/s"),
         scale=(VELOCITY_SCALE, VELOCITY_SCALE, RATE_SCALE),
         groups=(2, 1),
         group_names=("velocity", "yaw rate"),
+        weights=(weights.linear_tracking, weights.yaw_tracking),
+        at_rest=at_rest,
     )
 
 
@@ -78,7 +93,7 @@ def end_effector_goal(robot: Robot, weights: ArmWeights) -> GoalPart:
     def bind(worlds: LeggedWorlds) -> Launches:
         arm = _build_arm(robot, weights, worlds)
         return Launches(
-            evaluate=lambda: evaluate_arms(worlds, arm),
+            evaluate=lambda worlds, rows: evaluate_arms(worlds, ARM.rows(arm, rows)),
             reset=lambda: reset_arms(worlds, arm),
             validate=lambda row, scale, candidates: redraw_candidates(worlds, arm, row, scale, candidates),
             errors={"end effector [m]": wp.to_torch(arm.error)},
@@ -91,6 +106,8 @@ def end_effector_goal(robot: Robot, weights: ArmWeights) -> GoalPart:
         scale=(1.0,) * 3,
         groups=(3,),
         group_names=("end effector",),
+        weights=(weights.reach,),
+        at_rest=lambda goal, seen: torch.exp(-0.5 * (seen.unsqueeze(1) - goal).abs().sum(-1, keepdim=True)),
         fields=(ObsField("end_effector", 3, "1", 1.0),),
         noise={"end_effector": 0.01},  # what that of the joints' angles makes of it
         columns=ARM_TERMS,

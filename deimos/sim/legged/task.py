@@ -4,7 +4,7 @@ The task is Legged Gym's (Rudin et al. 2021) as Gauthier's thesis uses it (4.1.2
 rise and fall with the reward.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from itertools import accumulate, pairwise
@@ -40,7 +40,7 @@ from deimos.sim.legged import engines
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.engines import Physics
 from deimos.sim.legged.engines.captured import Captured
-from deimos.sim.legged.goal_parts import GoalPart, velocity_goal
+from deimos.sim.legged.goal_parts import GoalPart
 from deimos.sim.legged.robots import Robot
 from deimos.sim.shared import warp_device
 from deimos.sim.warp_env import WarpEnv
@@ -54,6 +54,8 @@ MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a 
 SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
 EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
 NOWHERE = 1e9  # [m]; a plane has no edge
+SETTLED = 2.0  # [s] after which a robot that stands is at rest
+GOALS_AT_REST = 2**18  # mean tracking by a robot at rest is then known to 0.001
 NOISE = {
     "linear_velocity": 0.1, "angular_velocity": 0.2, "gravity": 0.05, "joint_position": 0.01, "joint_velocity": 1.5,
     "heights": 0.1,
@@ -85,6 +87,7 @@ class Locomotion(WarpEnv):
         ends = accumulate((size for part in parts for size in part.groups), initial=0)
         self.goal_groups = tuple(slice(start, stop) for start, stop in pairwise(ends))
         self.goal_group_names = tuple(name for part in parts for name in part.group_names)
+        self.goal_group_weights = tuple(max(weight, 0.0) for part in parts for weight in part.weights)
         self.columns = (*COLUMNS, *(name for part in parts for name in part.columns))
         """What the reward is the sum of: the legs' terms, what clipping adds, and the terms of the goal's parts."""
         super().__init__(
@@ -178,10 +181,15 @@ class Locomotion(WarpEnv):
 
     def _begin(self) -> None:
         """Record step and reset, each as one graph, and begin every world's first episode."""
-        run_step = self.physics.record_step(partial(apply_actions, self.legged), self._finish_step)
+        rows = self.physics.parts
+        faults = wp.zeros((len(rows), 3), dtype=wp.int32, device=self.worlds.fault.device)
+        evaluate = [partial(self._finish_step, self.legged.rows(part, faults[i]), part) for i, part in enumerate(rows)]
+        run_step = self.physics.record_step(partial(apply_actions, self.legged), evaluate)
+        gather_faults = self._gather(wp.to_torch(faults))
 
         def step() -> None:
             run_step()
+            gather_faults()
             self._sums += self.term.sum(0)
             self._steps_reported += 1
 
@@ -192,11 +200,25 @@ class Locomotion(WarpEnv):
         self.begin(step, Captured(self._run_reset, self.device), valid_goals=valid_goals)
         self.physics.report()  # what the recording needed says nothing about these worlds
 
-    def _finish_step(self) -> None:
+    def _finish_step(self, worlds: LeggedWorlds, rows: slice) -> None:
         for part in self._launches:
-            part.evaluate()
-        evaluate_step(self.legged)
-        finish_obs(self.legged, self.worlds.invalid, wanted=False)
+            part.evaluate(worlds, rows)
+        evaluate_step(worlds)
+        finish_obs(worlds, worlds.worlds.invalid, wanted=False)
+
+    def _gather(self, faults: Tensor) -> Callable[[], None]:
+        """What joins the faults of parts, shape (parts, 3), to those of all worlds."""
+        known, nothing = self._views["fault"], self._no_fault
+        first = torch.tensor([[0, rows.start, rows.start] for rows in self.physics.parts]).to(faults)
+        faults.copy_(nothing)
+
+        def gather() -> None:
+            found = faults + first
+            known[0] += found[:, 0].sum()
+            torch.minimum(known[1:], found[:, 1:].amin(0), out=known[1:])
+            faults.copy_(nothing)
+
+        return gather
 
     def _run_reset(self) -> None:
         update_levels(self.legged)
@@ -246,7 +268,7 @@ class Locomotion(WarpEnv):
 
     def scripted_goals(self, rows: Tensor, goal: Tensor) -> Tensor:
         """See ``Env.scripted_goals``: the reverse of the active velocity at its limits; the rest is left to chance."""
-        count = len(velocity_goal().range)
+        count = len(self.parts[0].range)
         reverse = torch.where(self.goal[rows, :count] < 0, 1.0, -1.0) * self._seen_range[:count]
         return torch.cat([reverse, goal[:, count:]], dim=1)
 
@@ -258,6 +280,34 @@ class Locomotion(WarpEnv):
             for kind in ("stairs", "flat")
         )
         return (risky, safe) if len(risky) and len(safe) else None
+
+    def tracking_at_rest(self) -> float | None:
+        """See ``Env.tracking_at_rest``: of ``GOALS_AT_REST`` goals and more, by the robots once they stand.
+
+        ``None`` where no part of the goal has a weight.
+        """
+        if not sum(self.goal_group_weights) > 0.0:
+            return None
+        nothing = torch.zeros(self.num_envs, self.action_dim, device=self.device)
+        for _ in range(round(SETTLED / self.dt)):
+            self.step(nothing)
+        everyone, count = torch.arange(self.num_envs, device=self.device), -(-GOALS_AT_REST // self.num_envs)
+        goals = self.sample_goals(everyone, count) / self._views["goal_scale"]
+        tracking = torch.cat(self.at_rest(goals), dim=2).double().mean((0, 1)).tolist()
+        return float(np.average(tracking, weights=self.goal_group_weights))
+
+    def at_rest(self, goals: Tensor) -> list[Tensor]:
+        """Tracking of goals by robots that stand as these do, part by part, shape (num_envs, n, groups).
+
+        Args:
+            goals: In physical units, shape (num_envs, n, goal_dim).
+        """
+        places = dict(
+            zip((field.name for field in self.layout), self.obs.split([f.size for f in self.layout], 1), strict=True)
+        )
+        components = goals.split([len(part.range) for part in self.parts], dim=2)
+        seen = [torch.cat([self.obs[:, :0], *(places[f.name] for f in part.fields)], dim=1) for part in self.parts]
+        return [part.at_rest(*own) for part, *own in zip(self.parts, components, seen, strict=True)]
 
     def strata(self) -> list[str]:
         """See ``Env.strata``: shape and level of the tile; empty on flat ground."""

@@ -7,7 +7,7 @@ uses them need not know which of the two is at work.
 
 import abc
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -71,6 +71,8 @@ class Physics(abc.ABC):
     """The model with its visual geoms, for rendering and viewers."""
     arrays: Simulation
     """What the simulator has for the kernels; torques are those of the last substep."""
+    parts: tuple[slice, ...]
+    """Worlds that are evaluated on a thread of their own, from the first to the last."""
     lost_contacts: int
     """The bits of ``arrays.overflow`` that mean that a contact or a constraint was left out."""
     tensors: dict[str, torch.Tensor]
@@ -84,12 +86,12 @@ class Physics(abc.ABC):
         """
 
     @abc.abstractmethod
-    def record_step(self, before: Callable[[], None], after: Callable[[], None]) -> Callable[[], None]:
+    def record_step(self, before: Callable[[], None], after: Sequence[Callable[[], None]]) -> Callable[[], None]:
         """Record one control step between launches that belong to it.
 
         Args:
             before: Launches what the step begins with, such as new target angles.
-            after: Launches what follows from it.
+            after: Launches what follows from it, in the worlds of each of ``parts``.
 
         Returns:
             Replays all of it. Recording has run all of it once, or more often: what that changes is to be set anew.

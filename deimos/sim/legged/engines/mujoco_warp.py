@@ -1,7 +1,7 @@
 """The engine of GPUs: mujoco-warp, which runs on Warp's CPU backend too. This is the only file that knows it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +31,7 @@ class Engine(Physics):
         import mujoco_warp as mjw
 
         self.config, self.num_envs, self.device = config, num_envs, device
+        self.parts = (slice(0, num_envs),)
         self.model, spec = build_model(robot, terrain, config)
         model = spec.compile()
         self.max_contacts, self.max_rows = _buffer_sizes(model, num_envs, config, plane=terrain is None)
@@ -114,13 +115,14 @@ class Engine(Physics):
                 self._mjw.step(self._model, self._data)
                 gather_contacts(self._contacts, substep=substep)
 
-    def record_step(self, before: Callable[[], None], after: Callable[[], None]) -> Captured:
+    def record_step(self, before: Callable[[], None], after: Sequence[Callable[[], None]]) -> Captured:
         """See ``Physics.record_step``: all of it is one graph."""
 
         def launch() -> None:
             before()
             self.step()
-            after()
+            for part in after:
+                part()
 
         return Captured(launch, self.device)
 

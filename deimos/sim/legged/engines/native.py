@@ -4,7 +4,8 @@ The bits are the same for any number of threads. Between control steps the state
 mujoco-warp's; MuJoCo computes in double precision from there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import warp as wp
 from deimos.checks import SimulationError
 from deimos.kernels.legged.rows import ROWS, Rows, narrow, reset_rows, widen
 from deimos.kernels.legged.state import SIMULATION
-from deimos.nn.threads import available
+from deimos.nn.threads import POOL, available
 from deimos.sim.legged.engines import Physics, PhysicsConfig
 from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.engines.model import build_model
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     import mujoco
     from mujoco.batch import Batch
 
+GRAIN = 64  # worlds that are worth waking a thread for; no two threads write to the same cache line then
 SLOTS = 4  # contacts of a geom with the ground that are kept, those with the largest forces; mujoco-warp keeps as many
 LARGEST_FORCES = 2  # how a contact sensor chooses; MuJoCo has a number for it and no name
 WARNINGS = (
@@ -55,6 +57,7 @@ class Engine(Physics):
         if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(lambda message: None)
         self.config, self.num_envs, self.device = config, num_envs, device
+        self.parts = _divide(num_envs, available())
         self.model, spec = build_model(robot, terrain, config)
         part = _watch_contacts(spec, robot, plane=terrain is None)
         model = spec.compile()
@@ -110,23 +113,28 @@ class Engine(Physics):
         self._simulate()
         narrow(self._rows, self.arrays)
 
-    def record_step(self, before: Callable[[], None], after: Callable[[], None]) -> Callable[[], None]:
-        """See ``Physics.record_step``: what comes before MuJoCo's pool is one graph, what follows another."""
+    def record_step(self, before: Callable[[], None], after: Sequence[Callable[[], None]]) -> Callable[[], None]:
+        """See ``Physics.record_step``: what comes before MuJoCo's pool is one graph, what follows is one per thread."""
 
         def enter() -> None:
             before()
             widen(self.arrays, self._rows)
 
-        def leave() -> None:
-            narrow(self._rows, self.arrays)
-            after()
+        def leave(rows: slice, evaluate: Callable[[], None]) -> None:
+            narrow(ROWS.rows(self._rows, rows), SIMULATION.rows(self.arrays, rows))
+            evaluate()
 
-        entered, left = Captured(enter, self.device), Captured(leave, self.device)
+        entered = Captured(enter, self.device)
+        left = [
+            Captured(partial(leave, rows, evaluate), self.device)
+            for rows, evaluate in zip(self.parts, after, strict=True)
+        ]
 
         def step() -> None:
             entered()
             self._simulate()
-            left()
+            with POOL.lock:
+                POOL.run(lambda part: left[part](), len(left))
 
         return step
 
@@ -156,6 +164,12 @@ class Engine(Physics):
     def explain_loss(self, bits: int) -> str:
         """See ``Physics.explain_loss``."""
         return "; ".join(f"{name}: {text}" for i, (name, text) in enumerate(WARNINGS) if bits & 1 << i)
+
+
+def _divide(num_envs: int, threads: int) -> tuple[slice, ...]:
+    """Worlds in as many parts as there are threads, of ``GRAIN`` or a multiple each, the last one apart."""
+    size = -(-num_envs // (threads * GRAIN)) * GRAIN
+    return tuple(slice(start, min(start + size, num_envs)) for start in range(0, num_envs, size))
 
 
 def _watch_contacts(spec: "mujoco.MjSpec", robot: Robot, *, plane: bool) -> list[int]:
