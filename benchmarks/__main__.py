@@ -53,7 +53,7 @@ class BenchOptions:
             "learner",
             "commits",
             "table41",
-        ]  # fmt: skip
+        ]
     ]
     """What to measure."""
     against: str = "HEAD"
