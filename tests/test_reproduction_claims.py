@@ -290,6 +290,22 @@ def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, known):
     assert [each.finding.interval.estimate for each in outcome.results] == [0.5] * known
 
 
+@pytest.mark.parametrize("worlds", [505, 2000])
+def test_policies_at_the_limit_are_not_nearly_without_crashes(worlds):
+    """Of policies with one crash in 10^6 steps at most half count as having fewer, of those with a thirtieth most do."""
+    limit = worlds * 2000 * measures.NEARLY_NONE
+
+    def share(mean):
+        rows = [{"environment": "relative", "goal_period": 100, "goals": "naive", "method": "vds", "seed": seed,
+                 "worlds": worlds, "steps": 2000, "crashes": crashes}
+                for seed, crashes in enumerate(np.random.default_rng(0).poisson(mean, 2000))]  # fmt: skip
+        numbers = measures.FEW_CRASHES(Evidence(rows), Place("relative", 100), "vds")
+        return np.mean(np.array([*numbers.values()]) > 0)
+
+    assert share(limit) <= 0.5 + 4 * math.sqrt(0.25 / 2000)
+    assert share(limit / 30) > 0.9
+
+
 def test_safe_and_unsafe_policies_are_told_apart():
     """C12 looks at policies that crash in less than 1 % of their interactions, and at the others."""
     rates = {"naive": [0.001, 0.002, 0.003, 0.2, 0.3, 0.4], "argmax": [0.1, 0.1, 0.1, 0.1, 0.1, 0.1]}
