@@ -292,7 +292,7 @@ def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, known):
 
 @pytest.mark.parametrize("worlds", [505, 2000])
 def test_policies_at_the_limit_are_not_nearly_without_crashes(worlds):
-    """Of policies with one crash in 10^6 steps at most half count as having fewer, of those with a thirtieth most do."""
+    """Of policies with one crash in 10^6 steps at most half count as having fewer, with a thirtieth most do."""
     limit = worlds * 2000 * measures.NEARLY_NONE
 
     def share(mean):
