@@ -315,6 +315,13 @@ def test_safe_and_unsafe_policies_are_told_apart():
     assert [(each.finding.n, each.finding.interval.estimate) for each in outcome.results] == [({"p25": 3}, 1.0)] * 2
 
 
+def test_training_counts_once(alike):
+    """What is said of training has one result in an environment that was evaluated at two T, and else there are two."""
+    found = {claim: [str(each.place) for each in claims.test(BY_ID[claim], alike).results if each.clause.line in
+                     (505, 662) and each.place.environment == "quad"] for claim in ("C24", "C29")}  # fmt: skip
+    assert found == {"C24": ["quad, T = 100", "quad, T = 500"], "C29": ["quad, T = 100"]}
+
+
 def test_lines_are_checked(tmp_path, monkeypatch, capsys):
     """The command names the clauses whose words are not in their line, and only those."""
     text = [""] * 800
