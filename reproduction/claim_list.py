@@ -24,6 +24,7 @@ from reproduction.measures import (
     LOSS,
     MOTION,
     NAIVE,
+    OF_TRAINING,
     PENALTIES,
     RISK,
     SAFE_GAIN,
@@ -44,7 +45,12 @@ def _say(
 ) -> list[Clause]:
     """Clauses that one sentence makes."""
     flat = [test for each in tests for test in (each if isinstance(each, Sequence) else [each])]
-    return [Clause(line, words, test, tuple(environments), tuple(periods)) for test in flat]
+    return [
+        Clause(
+            line, words, test, tuple(environments), tuple(periods), once=getattr(test, "measure", None) in OF_TRAINING
+        )
+        for test in flat
+    ]
 
 
 def _more(measure: Measure, first: str, second: str) -> Ordered:

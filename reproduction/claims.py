@@ -78,6 +78,8 @@ class Clause:
     """Where it is said to hold."""
     periods: tuple[int, ...] = ()
     """The T [steps] at which it is; empty for every one."""
+    once: bool = False
+    """Whether it is about training, which all T of an environment share: one of them is enough."""
 
     @property
     def text(self) -> str:
@@ -86,7 +88,8 @@ class Clause:
 
     def places(self, evidence: Evidence) -> list[Place]:
         """Where it can be tested."""
-        found = [place for name in self.environments for place in evidence.places(name)]
+        own = [evidence.places(name)[: 1 if self.once else None] for name in self.environments]
+        found = [place for places in own for place in places]
         return [place for place in found if not self.periods or place.period in self.periods]
 
 

@@ -265,3 +265,5 @@ SAFE_GAIN = Measure("crashes that the attack adds to safe policies", _where(GAIN
 UNSAFE_RELIEF = Measure("crashes that the attack takes from unsafe policies",
                         _where(Measure("", _less(NAIVE, ATTACKED)), NAIVE, lambda rate: rate >= SAFE))  # fmt: skip
 STANDING = Measure("rank among all policies, by crashes per interaction", _standing)
+OF_TRAINING = (LATE, FALL, LATE_FALL, HALFWAY, CHOSEN, DIVERSITY, DOSE, MOTION, RISK, FPS)
+"""Those that hang on no T of an evaluation."""

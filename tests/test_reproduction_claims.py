@@ -290,6 +290,22 @@ def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, known):
     assert [each.finding.interval.estimate for each in outcome.results] == [0.5] * known
 
 
+@pytest.mark.parametrize("worlds", [505, 2000])
+def test_policies_at_the_limit_are_not_nearly_without_crashes(worlds):
+    """Of policies with one crash in 10^6 steps at most half count as having fewer, with a thirtieth most do."""
+    limit = worlds * 2000 * measures.NEARLY_NONE
+
+    def share(mean):
+        rows = [{"environment": "relative", "goal_period": 100, "goals": "naive", "method": "vds", "seed": seed,
+                 "worlds": worlds, "steps": 2000, "crashes": crashes}
+                for seed, crashes in enumerate(np.random.default_rng(0).poisson(mean, 2000))]  # fmt: skip
+        numbers = measures.FEW_CRASHES(Evidence(rows), Place("relative", 100), "vds")
+        return np.mean(np.array([*numbers.values()]) > 0)
+
+    assert share(limit) <= 0.5 + 4 * math.sqrt(0.25 / 2000)
+    assert share(limit / 30) > 0.9
+
+
 def test_safe_and_unsafe_policies_are_told_apart():
     """C12 looks at policies that crash in less than 1 % of their interactions, and at the others."""
     rates = {"naive": [0.001, 0.002, 0.003, 0.2, 0.3, 0.4], "argmax": [0.1, 0.1, 0.1, 0.1, 0.1, 0.1]}
@@ -297,6 +313,13 @@ def test_safe_and_unsafe_policies_are_told_apart():
              "crash_rate": rate} for goals, own in rates.items() for seed, rate in enumerate(own)]  # fmt: skip
     outcome = claims.test(BY_ID["C12"], Evidence(rows))
     assert [(each.finding.n, each.finding.interval.estimate) for each in outcome.results] == [({"p25": 3}, 1.0)] * 2
+
+
+def test_training_counts_once(alike):
+    """What is said of training has one result in an environment that was evaluated at two T, and else there are two."""
+    found = {claim: [str(each.place) for each in claims.test(BY_ID[claim], alike).results if each.clause.line in
+                     (505, 662) and each.place.environment == "quad"] for claim in ("C24", "C29")}  # fmt: skip
+    assert found == {"C24": ["quad, T = 100", "quad, T = 500"], "C29": ["quad, T = 100"]}
 
 
 def test_lines_are_checked(tmp_path, monkeypatch, capsys):
