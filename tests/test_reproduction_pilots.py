@@ -218,6 +218,13 @@ def test_table_of_attackers_has_all_of_them_and_planted_policies(tmp_path, monke
     assert sum(int(line.split("|")[5].split()[0]) for line in lines[4:]) == len(attackers_table.SEEDS)
 
 
+def test_the_newest_row_of_an_attacker_is_shown():
+    """A folder keeps the rows of an earlier pool, which another row of the same name replaces in the table."""
+    rows = [{"goals": "scripted", "n": 0}, {"goals": "pooled", "n": 1}, {"goals": "naive", "n": 2}]
+    newest = attackers_table._newest([*rows, {"goals": "pooled", "n": 3}])
+    assert [(row["goals"], row["n"]) for row in newest] == [("naive", 2), ("pooled", 3), ("scripted", 0)]
+
+
 def test_intervals_of_rates():
     """Wilson's interval holds the rate, and none of 400 is at most 1 %."""
     assert attackers_table.interval({"interaction_crashes": 0, "interactions": 400, "crash_rate": 0.0}) == "0 (0-0.951)"
