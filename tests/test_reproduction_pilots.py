@@ -38,11 +38,11 @@ def test_a_finished_run_is_not_made_again(tmp_path):
     config = tiny(particle.Config(goal_period=20))
     (tmp_path / "run").mkdir()  # killed before its first checkpoint
     folder, rows = finished(config, tmp_path / "run")
-    before = {path.name: path.stat().st_mtime_ns for path in folder.path.iterdir()}
+    before = {path.name: path.read_bytes() for path in folder.path.iterdir()}
     assert [row["goals"] for row in rows] == ["naive", "scripted"]
     again = finished(config, tmp_path / "run")[1]
     assert [row["crash_rate"] for row in again] == pytest.approx([row["crash_rate"] for row in rows], nan_ok=True)
-    assert before == {path.name: path.stat().st_mtime_ns for path in folder.path.iterdir()}
+    assert before == {path.name: path.read_bytes() for path in folder.path.iterdir()}
     assert finished(replace(config, evaluation=False), tmp_path / "other")[1] == []
 
 
