@@ -59,9 +59,17 @@ def _file(variant: str, name: str) -> str:
 def read(root: Path, variant: str) -> tuple[list[list[dict]], dict[str, list[dict]]]:
     """Rows of the Uniform policies, and of the planted ones by name, as far as they are there."""
     folders = [RunFolder(root / f"{variant}-s{seed}") for seed in SEEDS]
-    policies = [each.read_json("evaluation.json") for each in folders if (each.path / "evaluation.json").exists()]
+    policies = [
+        _newest(each.read_json("evaluation.json")) for each in folders if (each.path / "evaluation.json").exists()
+    ]
     own = {name: _file(variant, name) for name in planted(variant)}
     return policies, {name: RunFolder(root).read_json(file) for name, file in own.items() if (root / file).exists()}
+
+
+def _newest(rows: list[dict]) -> list[dict]:
+    """The last row of every attacker, Naive first: a folder keeps those of an earlier pool as well."""
+    ordered = sorted(rows, key=lambda row: (row["goals"] != "naive", row["goals"]))
+    return list({row["goals"]: row for row in ordered}.values())
 
 
 def show(variant: str, policies: list[list[dict]], known: dict[str, list[dict]]) -> None:

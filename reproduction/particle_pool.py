@@ -23,9 +23,10 @@ from deimos.sim.envs import particle
 from reproduction.runs import finished
 
 POOL = Path(__file__).parent / "pool"
-VARIANTS = {
-    variant: TrainConfig(env=particle.Config(variant=variant), env_steps=steps, device="cpu", threads=1)
-    for variant, steps in (("directional", 2000), ("absolute", 5000), ("relative", 2000))  # as in the thesis
+VARIANTS = {  # with the budgets of the thesis
+    "directional": TrainConfig(env=particle.Config(variant="directional"), env_steps=2000, device="cpu", threads=1),
+    "absolute": TrainConfig(env=particle.Config(variant="absolute"), env_steps=5000, device="cpu", threads=1),
+    "relative": TrainConfig(env=particle.Config(variant="relative"), env_steps=2000, device="cpu", threads=1),
 }
 METHODS = ("uniform", "coop", "p25", "antagonist", "rnd")
 SEEDS = (9001, 9002)

@@ -38,11 +38,11 @@ def test_a_finished_run_is_not_made_again(tmp_path):
     config = tiny(particle.Config(goal_period=20))
     (tmp_path / "run").mkdir()  # killed before its first checkpoint
     folder, rows = finished(config, tmp_path / "run")
-    before = {path.name: path.stat().st_mtime_ns for path in folder.path.iterdir()}
+    before = {path.name: path.read_bytes() for path in folder.path.iterdir()}
     assert [row["goals"] for row in rows] == ["naive", "scripted"]
     again = finished(config, tmp_path / "run")[1]
     assert [row["crash_rate"] for row in again] == pytest.approx([row["crash_rate"] for row in rows], nan_ok=True)
-    assert before == {path.name: path.stat().st_mtime_ns for path in folder.path.iterdir()}
+    assert before == {path.name: path.read_bytes() for path in folder.path.iterdir()}
     assert finished(replace(config, evaluation=False), tmp_path / "other")[1] == []
 
 
@@ -216,6 +216,13 @@ def test_table_of_attackers_has_all_of_them_and_planted_policies(tmp_path, monke
         assert cells[-3] == "0"
         assert float(cells[-2]) > 90
     assert sum(int(line.split("|")[5].split()[0]) for line in lines[4:]) == len(attackers_table.SEEDS)
+
+
+def test_the_newest_row_of_an_attacker_is_shown():
+    """A folder keeps the rows of an earlier pool, which another row of the same name replaces in the table."""
+    rows = [{"goals": "scripted", "n": 0}, {"goals": "pooled", "n": 1}, {"goals": "naive", "n": 2}]
+    newest = attackers_table._newest([*rows, {"goals": "pooled", "n": 3}])
+    assert [(row["goals"], row["n"]) for row in newest] == [("naive", 2), ("pooled", 3), ("scripted", 0)]
 
 
 def test_intervals_of_rates():
