@@ -74,7 +74,8 @@ def train(config: TrainConfig, path: Path, minutes: float) -> float:
 def evaluate(path: Path, engine: str) -> dict:
     """The row of uniform goals at T2 on an engine."""
     folder = RunFolder.open(path)
-    env = replace(training.read_config(folder).env.with_goal_period(GOAL_PERIOD), engine=engine)
+    env = cast(LocomotionConfig, training.read_config(folder).env.with_goal_period(GOAL_PERIOD))
+    env = replace(env, engine=cast(Any, engine))
     return evaluate_run(folder, env, EVALUATION, torch.device("cpu"), again=False)[0]
 
 

@@ -40,7 +40,7 @@ PRESETS = {
         },
         "method": "uniform",
         "num_envs": 512,
-        "env_steps": 8000,
+        "env_steps": 6000,
         "ppo": {
             "hidden": (128, 64, 32), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0,
             "desired_kl": 0.02, "discount": 0.97, "entropy_coef": 0.002,
