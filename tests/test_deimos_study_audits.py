@@ -39,6 +39,7 @@ class Follower:
         self.act = env.reference_policy(brake=False)
 
     def __call__(self, obs):
+        """Actions for observations."""
         return self.act(obs)
 
 
