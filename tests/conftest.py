@@ -27,16 +27,14 @@ if find_spec("warp"):  # a base install, which .ci/nightly tests, has none
 
 @pytest.fixture
 def new_plugins(monkeypatch):
-    """Forgets afterwards what was registered and imported meanwhile, so that no other test finds it."""
+    """What a test registers it registers for itself alone, and modules register themselves anew."""
+    own = ("reproduction.oracle", "my_selector")
     monkeypatch.setattr(plugins, "_registered", {})
-    before = dict(sys.modules)
-    for name in [name for name in before if name.startswith("reproduction.")]:
-        del sys.modules[name]  # whoever imports it registers it
+    for name in own:
+        monkeypatch.delitem(sys.modules, name, raising=False)
     yield
-    for name in set(sys.modules) - set(before):
-        if not name.startswith(("deimos", "torch", "scipy", "numpy", "warp")):
-            del sys.modules[name]
-    sys.modules.update({name: module for name, module in before.items() if name.startswith("reproduction.")})
+    for name in own:
+        sys.modules.pop(name, None)
 
 
 @pytest.fixture(params=DEVICES)

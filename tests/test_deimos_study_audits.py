@@ -39,7 +39,7 @@ class Follower:
         self.act = env.reference_policy(brake=False)
 
     def __call__(self, obs):
-        """The action."""
+        """Actions for observations."""
         return self.act(obs)
 
 

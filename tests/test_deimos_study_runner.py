@@ -101,6 +101,10 @@ def test_study_leaves_its_tables(whole):
             name: twin[name] for name in ("reward", "crashes", "weights")
         }
         assert (row["seed"], row["eval_seed"]) == (0, twin["seed"])
+        assert (row["environment"], row["base_environment"], row["levels"]) == ("directional", "directional", {})
+        assert row["code"] == cell.sources["code"]
+        assert 0.0 <= row["worst"] <= 1.0
+        assert row["worst_attacker"] in ("argmax", "scripted")
         assert (row["setting"], row["selector"]) == (cell.setting, cell.selector)
         assert "torch=" in row["versions"]
         assert (row["tracking"], row["errors"]) == ((), {})  # a particle's goal is all of a piece

@@ -166,7 +166,9 @@ def evaluated(cell: Cell, run: RunFolder, rows: Iterable[Row], code: str | None)
         "device": stored["config"]["device"],
         "versions": " ".join(f"{name}={stored['versions'][name]}" for name in names),
     }
-    full = [shared | row | {"eval_seed": row["seed"], "seed": cell.config.seed} for row in rows]
+    # Evaluations call their own seed and a hash of their task by names that mean the cell's here.
+    own = {"seed": cell.config.seed, "environment": cell.environment}
+    full = [shared | row | {"eval_seed": row["seed"]} | own for row in rows]
     # Where a goal has one group of components, its tracking is the reward.
     return [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in full]
 
