@@ -35,6 +35,11 @@ def names(package: ModuleType) -> list[str]:
     return sorted(_own(package) | set(entry_points(group=_group(package)).names) | set(_here(package)))
 
 
+def has(package: ModuleType, name: str) -> bool:
+    """Whether ``package`` has a plug-in of this name; its own come first, for entry points take long to read."""
+    return name in _own(package) or name in _here(package) or name in names(package)
+
+
 def _group(package: ModuleType) -> str:
     return "deimos." + package.__name__.rpartition(".")[2]
 

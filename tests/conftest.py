@@ -1,12 +1,15 @@
 """Fixtures of all tests: the devices that they run on, and the reference of every random draw."""
 
 import contextlib
+import sys
 from collections import namedtuple
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import torch
+
+from deimos import plugins
 
 torch.set_num_threads(1)
 
@@ -20,6 +23,18 @@ if find_spec("warp"):  # a base install, which .ci/nightly tests, has none
     wp.config.log_level = wp.LOG_WARNING
     if wp.get_cuda_device_count() > 0 and torch.cuda.is_available():  # a torch without CUDA cannot share its memory
         DEVICES.append("cuda:0")
+
+
+@pytest.fixture
+def new_plugins(monkeypatch):
+    """What a test registers it registers for itself alone, and modules register themselves anew."""
+    own = ("reproduction.oracle", "my_selector")
+    monkeypatch.setattr(plugins, "_registered", {})
+    for name in own:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    yield
+    for name in own:
+        sys.modules.pop(name, None)
 
 
 @pytest.fixture(params=DEVICES)

@@ -252,7 +252,7 @@ def test_cells_of_another_commit_are_refused(whole, file, tmp_path):
     assert len(study.cells()) == 1
 
 
-def test_study_imports_its_plugins(tmp_path, monkeypatch):
+def test_study_imports_its_plugins(tmp_path, monkeypatch, new_plugins):
     """A selector of a module that the study names trains in its workers; with another source it is another cell."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my_selector.py").write_text(PLUGIN)

@@ -17,14 +17,20 @@ CONFIG = TrainConfig(
 CELL = plan.Cell(environment="directional", config=CONFIG, goal_periods=(100,))
 
 
-def test_cost_counts_every_world_step():
+def test_cost_counts_every_world_step(tmp_path):
     """Training, both ends of the score, Naive and every attacker with what it learns from, and audits are counted."""
-    transitions, steps = estimate.cost(CELL)
+    study = StudyFolder(tmp_path)
+    transitions, steps = estimate.cost(study, CELL)
     assert transitions == 84 * 24 * 2000
     evaluated = (2 + 3) * 2000 * 2000 + 2000 * 1500  # two ends, Naive, argmax and scripted; what argmax learns from
     assert steps == evaluated + 5 * 100 * (2000 + 100 * 50)
     bare = dataclasses.replace(CELL, audit_worlds=0, goal_periods=(50, 100))
-    assert estimate.cost(bare) == (transitions, 2 * evaluated)
+    assert estimate.cost(study, bare) == (transitions, 2 * evaluated)
+    study.add_rounds([plan.AttackRound(attackers=("argmax-long",), seeds=(0, 1))])
+    added = 3 * 2000 * 2000 + 2000 * 6000
+    assert estimate.cost(study, CELL) == (transitions, steps + added)
+    other = dataclasses.replace(CELL, config=dataclasses.replace(CONFIG, seed=2))
+    assert estimate.cost(study, other) == (transitions, steps)
 
 
 def test_dear_attackers_count_what_they_try():
@@ -40,7 +46,7 @@ def test_estimate_is_of_finished_cells_where_there_are_any(tmp_path, monkeypatch
     study = StudyFolder(tmp_path)
     cells = [dataclasses.replace(CELL, config=dataclasses.replace(CONFIG, seed=seed)) for seed in range(3)]
     monkeypatch.setattr(estimate, "_measure", lambda cell: estimate.Speed(training=1000.0, acting=1e6))
-    transitions, steps = estimate.cost(CELL)
+    transitions, steps = estimate.cost(study, CELL)
     hours = 3 * (transitions / 1000.0 + steps / 1e6) / 3600
     said = estimate.estimate(study, cells)
     assert said.startswith(

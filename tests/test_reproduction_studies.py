@@ -20,7 +20,7 @@ BLOCKS = {f"particle_{letter}": count for letter, count in zip("abcdef", (330, 9
 
 
 @pytest.fixture
-def pools(tmp_path, monkeypatch):
+def pools(tmp_path, monkeypatch, new_plugins):
     """A working directory with the files that cells are made from."""
     folder = tmp_path / "reproduction" / "pool"
     folder.mkdir(parents=True)

@@ -67,7 +67,7 @@ def method(name: str) -> SelectorConfig:
         ValueError: If there is no such method; the message lists those that there are.
     """
     kind, options = _spelled_out(name)
-    if kind not in plugins.names(selectors):
+    if not plugins.has(selectors, kind):
         others = ", ".join(other for other in plugins.names(selectors) if other not in METHODS)
         raise ValueError(
             f"There is no method '{name}'; there are: {', '.join(METHODS)}; any pNN from p0 to p100; "

@@ -24,7 +24,6 @@ from deimos.nn.random import Purpose, normals, uniforms
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones
 from deimos.run.trainer import Trainer
-from deimos.sim.env import Env
 
 CANDIDATES = 50  # goals tried in every context
 BATCH = 256  # contexts cloned at a time
@@ -195,16 +194,10 @@ def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Te
         trainer.loop.advance(step)
     draw = uniforms(trainer.config.seed, Purpose.AUDIT_CONTEXT, rows, rows.new_tensor(act.steps))[:, 0]
     rows = rows[draw.argsort()[:BATCH]]
-    tried = _tried(env, rows, clones)
-    trainer.loop.advance(step)
-    return tried
-
-
-def _tried(env: Env, rows: Tensor, clones: Clones) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What candidates would do in worlds whose goals are due; see ``_next_contexts``."""
     obs = env.obs[rows]
     candidates = env.sample_goals(rows, CANDIDATES).clone()
     survived = clones.try_out(env, rows, candidates)
+    trainer.loop.advance(step)
     return rows, env.state(obs), obs[:, env.goal_slice], candidates, survived
 
 
@@ -246,21 +239,18 @@ def audit_choices(trainer: Trainer, worlds: int, clones: Clones) -> Choices:
     draw = uniforms(trainer.config.seed, Purpose.AUDIT_CONTEXT, every, every.new_tensor(act.steps))[:, 0]
     wanted = torch.zeros_like(draw, dtype=torch.bool)
     wanted[draw.argsort()[:worlds]] = True
-    parts = []
+    decisions = []
     for _ in range(env.goal_period):
         step = env.step(act(env.obs))
         rows = (step.goal_due & ~step.terminated & ~step.truncated & wanted).nonzero().squeeze(1)
         if len(rows):
-            parts.append(_choices(trainer, rows, clones))
+            decisions.append(_decide(trainer, rows))
             wanted[rows] = False
         loop.advance(step)
-    nothing = torch.zeros(0, env.goal_dim, device=env.device)
-    return Choices(
-        percentile=[value for part in parts for value in part.percentile],
-        auroc=[value for part in parts for value in part.auroc],
-        place=torch.cat([nothing, *(part.place for part in parts)]),
-        chosen=torch.cat([nothing, *(part.chosen for part in parts)]),
-    )
+    if not decisions:
+        nothing = torch.zeros(0, env.goal_dim, device=env.device)
+        return Choices([], [], nothing, nothing)
+    return _judge(trainer, clones, decisions)
 
 
 def audit_clones(trainer: Trainer) -> Clones:
@@ -268,21 +258,49 @@ def audit_clones(trainer: Trainer) -> Clones:
     return _explorers(trainer)[1]
 
 
-def _choices(trainer: Trainer, rows: Tensor, clones: Clones) -> Choices:
+@dataclass(frozen=True)
+class _Decision:
+    """A selector's choice in some worlds, and these worlds at the time."""
+
+    worlds: dict[str, Tensor]
+    candidates: Tensor
+    chosen: Tensor
+    score: Tensor | None
+    place: Tensor
+    at: Tensor
+
+
+def _decide(trainer: Trainer, rows: Tensor) -> _Decision:
     env, selector = trainer.env, trainer.loop.selector
-    rows, state, goal, candidates, survived = _tried(env, rows, clones)
+    obs = env.obs[rows]
+    state, goal = env.state(obs), obs[:, env.goal_slice]
+    candidates = env.sample_goals(rows, CANDIDATES).clone()
+    worlds = {name: tensor[rows] for name, tensor in env.tensors.items()}
     chosen = selector.propose(rows, state, goal, candidates, env.draw(rows)).goal
-    pick = (candidates == chosen.unsqueeze(1)).all(2).int().argmax(1)
-    percentile = picks.percentile(-survived, pick)[survived.amin(1) < survived.amax(1)].tolist()
-    afraid, ranks = fear_selector(selector), []
-    if afraid is not None and afraid.fear.fitted:
-        crashed = survived < env.goal_period
-        pairs = zip(afraid.score(state, goal, candidates), crashed, strict=True)
-        ranks = [auroc(score, label) for score, label in pairs if 0 < int(label.sum()) < CANDIDATES]
+    afraid = fear_selector(selector)
+    score = afraid.score(state, goal, candidates) if afraid is not None and afraid.fear.fitted else None
     bounds = env.goal_bounds(rows)
     if bounds is None:
-        return Choices(percentile, ranks, chosen[:0], chosen[:0])
+        return _Decision(worlds, candidates, chosen, score, chosen[:0], chosen[:0])
     middle, half = (bounds[0] + bounds[1]) / 2, (bounds[1] - bounds[0]) / 2
     position = env.place(rows)
-    where = (goal - middle) / half if position is None else position
-    return Choices(percentile, ranks, where, (chosen - middle) / half)
+    place = (goal - middle) / half if position is None else position
+    return _Decision(worlds, candidates, chosen, score, place, (chosen - middle) / half)
+
+
+def _judge(trainer: Trainer, clones: Clones, decisions: list[_Decision]) -> Choices:
+    """Try the candidates of all decisions together: clones are stepped as a whole, however few decide at once."""
+    candidates, chosen = (torch.cat([getattr(each, name) for each in decisions]) for name in ("candidates", "chosen"))
+    every = torch.arange(len(candidates), device=candidates.device)
+    held = trainer.config.env.build(len(candidates), trainer.env.device, trainer.config.seed)
+    for name, tensor in held.tensors.items():
+        tensor[:] = torch.cat([each.worlds[name] for each in decisions])
+    survived = clones.try_out(held, every, candidates)
+    pick = (candidates == chosen.unsqueeze(1)).all(2).int().argmax(1)
+    percentile = picks.percentile(-survived, pick)[survived.amin(1) < survived.amax(1)].tolist()
+    crashed = survived < trainer.env.goal_period
+    scores = [each.score for each in decisions if each.score is not None]
+    pairs = zip(torch.cat(scores), crashed, strict=True) if scores else ()
+    ranks = [auroc(score, label) for score, label in pairs if 0 < int(label.sum()) < CANDIDATES]
+    place, at = (torch.cat([getattr(each, name) for each in decisions]) for name in ("place", "at"))
+    return Choices(percentile, ranks, place, at)

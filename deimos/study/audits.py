@@ -114,8 +114,8 @@ def goal_map(place: Tensor, chosen: Tensor) -> list[int]:
     """
     if not len(place):
         return []
-    values = (axis.flatten().double().cpu().numpy().clip(-1.0, 1.0) for axis in (place, chosen))
-    counts, _, _ = np.histogram2d(*values, bins=BINS, range=[[-1, 1], [-1, 1]])
+    x, y = (axis.flatten().double().cpu().numpy().clip(-1.0, 1.0) for axis in (place, chosen))
+    counts, _, _ = np.histogram2d(x, y, bins=BINS, range=[[-1.0, 1.0], [-1.0, 1.0]])
     return counts.astype(int).flatten().tolist()
 
 

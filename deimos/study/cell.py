@@ -18,6 +18,7 @@ import torch
 from deimos.checks import RunError, SimulationError, one_line
 from deimos.goals.fear_selector import fear_selector
 from deimos.run import training
+from deimos.run.attack import attacker
 from deimos.run.attackers.pooled import save_fear
 from deimos.run.evaluation import evaluate_run
 from deimos.run.folder import RunFolder
@@ -109,6 +110,9 @@ def _attack(study: StudyFolder, cell: Cell, device: torch.device, watch: Callabl
     """Evaluate a finished cell under the study's further attackers that it has not met, and add the rows."""
     home, made_by = RunFolder(study.cell_path(cell)), code().name
     for period, attackers in study.missing(cell).items():
+        if any(attacker(name).needs_pool for name in attackers):
+            pool = {name: value for name, value in cell.sources.items() if name == "pool"}
+            check_sources(f"Cell {cell.name}", pool | {"code": made_by}, (), cell.config.eval.pool)
         folder = RunFolder.open(home.path / "run")
         config = replace(cell.config.eval, attackers=attackers)
         rows = evaluate_run(folder, cell.config.env.with_goal_period(period), config, device, watch, again=False)

@@ -53,7 +53,7 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
         for cell in own:
             known = [fps for fps in ran[cell.setting, cell.config.label] if fps > 0]
             measured |= not known
-            transitions, steps = cost(cell)
+            transitions, steps = cost(study, cell)
             trained, acted = trained + transitions, acted + steps
             hours += (transitions / (median(known) if known else speed.training) + steps / speed.acting) / 3600
     source = "measured on a short run of each kind" if measured else "of the finished cells"
@@ -63,11 +63,14 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
     )
 
 
-def cost(cell: Cell) -> tuple[int, int]:
-    """Transitions of a cell's training, and world-steps of its evaluations, attacks and audits."""
+def cost(study: StudyFolder, cell: Cell) -> tuple[int, int]:
+    """Transitions that a cell still has to be trained for at most, and world-steps of all else that it lacks."""
     config = cell.config
+    if (study.cell_path(cell) / "result.json").exists():
+        return 0, sum(evaluation_steps(config.eval, names) for names in study.missing(cell).values())
     transitions = config.iterations * config.ppo.num_steps * config.num_envs
-    evaluated = len(cell.goal_periods) * evaluation_steps(config.eval, ("naive", *config.eval.attackers))
+    parts = [("naive", *config.eval.attackers)] + ([added] if (added := study.added(cell)) else [])
+    evaluated = len(cell.goal_periods) * sum(evaluation_steps(config.eval, part) for part in parts)
     period = config.env.goal_period
     audited = len(points(config.iterations)) * period * (config.num_envs + cell.audit_worlds * CANDIDATES)
     return transitions, evaluated + (audited if cell.audit_worlds else 0)
@@ -92,14 +95,15 @@ def _measure(cell: Cell) -> Speed:
     with on_threads(config.threads or 1), one_stream(device):
         trainer = training.build(config, device)
         trainer.iterate()  # compiles
-        begin, done = time.monotonic(), 0
-        while not done or (done * config.ppo.num_steps < config.env.goal_period and time.monotonic() - begin < SECONDS):
+        clock = time.monotonic if device.type == "cuda" else time.process_time  # others may use the cores too
+        begin, done = clock(), 0
+        while not done or (done * config.ppo.num_steps < config.env.goal_period and clock() - begin < SECONDS):
             trainer.iterate()
             done += 1
-        rate = done * config.ppo.num_steps * config.num_envs / (time.monotonic() - begin)
+        rate = done * config.ppo.num_steps * config.num_envs / (clock() - begin)
         env = config.env.for_evaluation().resolved(device).build(config.eval.worlds, device, 0)
-        begin = time.monotonic()
+        begin = clock()
         play(env, trainer.ppo.actor, uniform_goals(env), PLAYED)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        return Speed(rate, PLAYED * config.eval.worlds / (time.monotonic() - begin))
+        return Speed(rate, PLAYED * config.eval.worlds / (clock() - begin))

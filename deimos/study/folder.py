@@ -68,11 +68,14 @@ class StudyFolder:
         if fresh := [each for each in dict.fromkeys(rounds) if each not in known]:
             RunFolder(self.path).write_json(ATTACK, [to_dict(each) for each in [*known, *fresh]])
 
+    def added(self, cell: Cell) -> tuple[str, ...]:
+        """The added attackers that a cell is to meet."""
+        wanted = [each for each in self.rounds() if not each.seeds or cell.config.seed in each.seeds]
+        return tuple(dict.fromkeys(name for each in wanted for name in each.attackers))
+
     def missing(self, cell: Cell) -> dict[int, tuple[str, ...]]:
         """The added attackers that a finished cell has not met yet, by T; none where it has met all."""
-        wanted = [each for each in self.rounds() if not each.seeds or cell.config.seed in each.seeds]
-        names = dict.fromkeys(name for each in wanted for name in each.attackers)
-        if not names:
+        if not (names := self.added(cell)):
             return {}
         rows = Results.of_cell(self.cell_path(cell)).rows or [
             row for row in self.results().rows if row["hash"] == cell.digest

@@ -148,9 +148,11 @@ class Particle(WarpEnv):
         """See ``Env.risk_contrast``: at rest, 1 u from a wall and at the origin (thesis, 4.2)."""
         rows = torch.arange(self.num_envs, device=self.device)
         risky, safe = rows[::2], rows[1::2]
-        for name in ("position", "velocity"):
-            self.tensors[name].zero_()
-        self.tensors["position"][risky, 0] = 1.0 - HALF_SIDE
+        velocity, position = self.tensors["velocity"], self.tensors["position"]
+        velocity.zero_()
+        position.zero_()
+        position[risky, 0] = 1.0 - HALF_SIDE
+        self.obs[:, 0:3], self.obs[:, 3:6] = velocity, position * self.layout[1].scale
         self.set_goals(rows, self.sample_goals(rows, 1).squeeze(1).clone())
         return risky, safe
 
