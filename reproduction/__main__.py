@@ -53,10 +53,11 @@ def report_claims(options: ClaimOptions) -> None:
 def print_coverage(options: CoverageOptions) -> None:
     """Print the table of coverages."""
     table = Table(title=f"Coverage of 95 % intervals, n = {options.seeds}", title_justify="left")
-    for name in ("statistic", "interval", "normal", "lognormal"):
+    for name in ("statistic", "interval", *coverage.POPULATIONS):
         table.add_column(name, justify="left" if name in ("statistic", "interval") else "right")
     for row in coverage.simulate(options.seeds, options.populations, options.resamples, options.seed):
-        table.add_row(row.statistic, row.interval, f"{100 * row.normal:.1f} %", f"{100 * row.lognormal:.1f} %")
+        shares = (f"{100 * getattr(row, name):.1f} %" for name in coverage.POPULATIONS)
+        table.add_row(row.statistic, row.interval, *shares)
     Console().print(table)
 
 

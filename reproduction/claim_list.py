@@ -24,13 +24,15 @@ from reproduction.measures import (
     LOSS,
     MOTION,
     NAIVE,
+    OF_TRAINING,
+    PENALTIES,
     RISK,
     SAFE_GAIN,
     SCORE,
     STANDING,
     UNSAFE_RELIEF,
     Measure,
-)  # fmt: skip
+)
 from reproduction.thesis import DIRECTORS, ENVIRONMENTS, LEGGED, LEGGED_METHODS, PARTICLE, PARTICLE_METHODS
 
 BASELINES = ("uniform", "rnd", "vds", "cl")
@@ -43,7 +45,12 @@ def _say(
 ) -> list[Clause]:
     """Clauses that one sentence makes."""
     flat = [test for each in tests for test in (each if isinstance(each, Sequence) else [each])]
-    return [Clause(line, words, test, tuple(environments), tuple(periods)) for test in flat]
+    return [
+        Clause(
+            line, words, test, tuple(environments), tuple(periods), once=getattr(test, "measure", None) in OF_TRAINING
+        )
+        for test in flat
+    ]
 
 
 def _more(measure: Measure, first: str, second: str) -> Ordered:
@@ -339,7 +346,7 @@ DISCUSSION = (
         *_say(395, "in a stairway than if the robot is on flat terrain", LEGGED, _mostly(RISK, DIRECTORS)),
     )),
     Claim("C36", "Penalties for crashing are detrimental.", (
-        *_say(284, "often detrimental to the policy", ENVIRONMENTS, _each(SCORE, "uniform", "penalty-10 penalty-100")),
+        *_say(284, "often detrimental to the policy", ENVIRONMENTS, _each(SCORE, "uniform", " ".join(PENALTIES))),
     )),
     Claim("C37", "The signs of the workshop paper's tables: on the bare robot Uniform and RND beat DEIMOS, which beats "
           "CL; with the arm DEIMOS beats Uniform, CL and RND in this order; argmax is the worst.", (

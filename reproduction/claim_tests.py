@@ -41,8 +41,9 @@ class Ordered:
         return tuple(dict.fromkeys(name for pair in self.pairs for name in pair))
 
     def __str__(self) -> str:
-        first, second = (", ".join(dict.fromkeys(names)) for names in zip(*self.pairs, strict=True))
-        return f"{'spread of ' if self.spread else ''}{self.measure.name}: {first} > {second}"
+        first, second = (dict.fromkeys(names) for names in zip(*self.pairs, strict=True))
+        order = self.methods if first.keys() & second.keys() else (", ".join(first), ", ".join(second))
+        return f"{'spread of ' if self.spread else ''}{self.measure.name}: {' > '.join(order)}"
 
     def find(self, evidence: Evidence, place: Place) -> Finding | None:
         """See ``Test``."""
@@ -175,12 +176,11 @@ class Mostly:
         n = len(x)
         if n < LEAST:
             return None
-        share = float((np.sign(x) + 1).mean() / 2)
-        interval = scipy_stats.binomtest(round(share * n), n).proportion_ci(stats.LEVEL)
+        positive = round(n * (np.sign(x) + 1).mean() / 2)
         p_for, p_against = (min(1.0, 2 * float(p)) for p in self.p_values(x))
         return Finding(
-            effect="share of policies", interval=Interval(share, float(interval.low), float(interval.high)),
-            no_difference=0.5, p_for=p_for, p_against=p_against, detectable=detectable_share(n),
+            effect="share of policies", interval=stats.share(np.arange(n) < positive), no_difference=0.5,
+            p_for=p_for, p_against=p_against, detectable=detectable_share(n),
             n={name: len(own) for name, own in numbers.items()},
         )  # fmt: skip
 

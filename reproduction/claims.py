@@ -78,6 +78,8 @@ class Clause:
     """Where it is said to hold."""
     periods: tuple[int, ...] = ()
     """The T [steps] at which it is; empty for every one."""
+    once: bool = False
+    """Whether it is about training, which all T of an environment share: one of them is enough."""
 
     @property
     def text(self) -> str:
@@ -86,7 +88,8 @@ class Clause:
 
     def places(self, evidence: Evidence) -> list[Place]:
         """Where it can be tested."""
-        found = [place for name in self.environments for place in evidence.places(name)]
+        own = [evidence.places(name)[: 1 if self.once else None] for name in self.environments]
+        found = [place for places in own for place in places]
         return [place for place in found if not self.periods or place.period in self.periods]
 
 
@@ -151,11 +154,13 @@ class Outcome:
         """How many of its clauses hold, in words."""
         if not self.results:
             return "no data"
-        rest = ", ".join(f"{self.counts[name]} {name}" for name in VERDICTS[1:] if self.counts[name])
-        enough = " (one is enough)" if self.claim.one_is_enough else ""
-        number = len(self.results)
-        told = f"{self.counts['holds']} of {number} clause{'s' * (number > 1)} hold{'s' * (self.counts['holds'] == 1)}"
-        return f"{told}{enough}" + (f"; {rest}" if rest else "")
+        holds, does_not, undecided = (self.counts[name] for name in VERDICTS)
+        number, enough = len(self.results), " (one is enough)" if self.claim.one_is_enough else ""
+        told = f"{holds} of {number} clause{'s' * (number > 1)} hold{'s' * (holds == 1)}{enough}"
+        rest = [f"{does_not} do{'es' * (does_not == 1)} not"] * bool(does_not) + [f"{undecided} undecided"] * bool(
+            undecided
+        )
+        return told + (f"; {', '.join(rest)}" if rest else "")
 
     def within(self, environment: str) -> "Outcome":
         """Its results in one environment."""

@@ -16,18 +16,16 @@ from pathlib import Path
 import numpy as np
 from scipy import stats as scipy_stats
 
-from deimos.goals.methods import METHODS
 from deimos.study import stats
 from deimos.study.data import Data
 from deimos.study.stats import POWER, Array, Interval
 from reproduction.claims import ALPHA, LEAST, holm
-from reproduction.measures import ATTACKED, DOSE, LITERAL, SCORE, Evidence, Measure
+from reproduction.measures import ATTACKED, DOSE, LITERAL, PENALTIES, SCORE, Evidence, Measure
 from reproduction.thesis import DIRECTOR_METHODS, DIRECTORS
 
 VARIANTS = ("directional", "absolute")
 CHOOSING, TESTING = range(10), range(10, 30)
 CANDIDATES = tuple(name + ending for name in DIRECTORS for ending in ("", LITERAL))
-PENALTIES = tuple(name for name, (selector, _) in METHODS.items() if selector == "penalty")
 DOSED = ("uniform", *[name + ending for name in DIRECTOR_METHODS for ending in ("", LITERAL)])
 LEAST_SCORE = 0.95  # of the penalised policies' score
 PERMUTATIONS = 9999

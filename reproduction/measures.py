@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats as scipy_stats
 
+from deimos.goals.methods import METHODS
 from deimos.study.audits import diversity
 from deimos.study.data import Data
 from deimos.study.results import Row
@@ -15,6 +16,8 @@ from deimos.study.stats import Array
 from reproduction.thesis import PARTICLE
 
 LITERAL = "-literal"  # the ending of methods that learn fear as the thesis does, without a crash memory
+PENALTIES = tuple(name for name in METHODS if name.startswith("penalty-"))
+"""Uniform goals with a crash penalty, by its sizes."""
 NEARLY_NONE = 1e-6  # crashes per step
 SAFE = 0.01  # crashes per interaction, below which a policy counts as safe
 
@@ -255,3 +258,5 @@ SAFE_GAIN = Measure("crashes that the attack adds to safe policies", _where(GAIN
 UNSAFE_RELIEF = Measure("crashes that the attack takes from unsafe policies",
                         _where(Measure("", _less(NAIVE, ATTACKED)), NAIVE, lambda rate: rate >= SAFE))  # fmt: skip
 STANDING = Measure("rank among all policies, by crashes per interaction", _standing)
+OF_TRAINING = (LATE, FALL, LATE_FALL, HALFWAY, CHOSEN, DIVERSITY, DOSE, MOTION, RISK, FPS)
+"""Those that hang on no T of an evaluation."""

@@ -13,7 +13,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats as scipy_stats
 
-from deimos.files import write_whole
+from deimos.run.folder import RunFolder
 from deimos.study.results import Results
 from deimos.study.stats import Array
 from reproduction.claim_list import CLAIMS
@@ -142,7 +142,7 @@ def _ordered(pairs: Sequence[tuple[int, int]]) -> list[Scene]:
     mixed = [LARGE ** (1 - 2 * (half.index(i) % 2)) if i in half else 1.0 for i in range(len(places))]
     for one in POPULATIONS if len(pairs) == 1 else ("normal", "rows"):
         found.append(Scene(f"all alike, {one}", None, [Policies(one)] * len(places)))
-        if half and set(places) == {0.0, 1.0}:  # of the larger side one half is better and one as much worse
+        if one == "normal" and half and set(places) == {0.0, 1.0}:  # of the larger side one half is better, one worse
             found.append(Scene(f"better and worse ones, {one}", None, [Policies(one, odds) for odds in mixed]))
         for holds, odds in ((True, LARGE), (False, 1 / LARGE)):
             found.append(Scene(f"P = 0.75, {one}", holds, [Policies(one, odds**x) for x in places]))
@@ -221,16 +221,22 @@ def judged(test: Test, samples: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def kinds() -> dict[str, tuple[Test, list[str]]]:
-    """The kinds of tests that clauses have, by their names: one of each, and the claims that it is in."""
+    """The kinds of tests that clauses have, by their names: one of each, and the claims that it is in.
+
+    A test of one group against a larger one is that of the larger against the one, the other way round.
+    """
     found: dict[str, tuple[Test, list[str]]] = {}
     for claim, test in [(each, clause.test) for each in CLAIMS for clause in each.clauses]:
         halved = isinstance(test, Best)
         own = test.then("a", "b") if isinstance(test, Best) else test
         match own:
             case Ordered():
-                sides = [len({*side}) for side in zip(*own.pairs, strict=True)]
-                order = ", an order" if {a for a, _ in own.pairs} & {b for _, b in own.pairs} else ""
-                name = f"{'spread' if own.spread else 'more'}: {sides[0]} against {sides[1]}{order}"
+                first, second = ({*side} for side in zip(*own.pairs, strict=True))
+                if len(first) > len(second):
+                    first, second = second, first
+                    own = replace(own, pairs=tuple((b, a) for a, b in own.pairs))
+                order = ", an order" if first & second else ""
+                name = f"{'spread' if own.spread else 'more'}: {len(first)} against {len(second)}{order}"
             case Alike():
                 name = ("at most" if own.at_most else "alike") + f", {'ratio' if own.measure.ratio else 'difference'}"
             case Highest():
@@ -258,27 +264,33 @@ def measure(test: Test, scene: Scene, n: int, studies: int, seed: int) -> tuple[
 def run(path: Path, studies: int) -> dict[str, list]:
     """Measure every scene that a file does not hold; of each the shares of both verdicts."""
     known: dict[str, list] = json.loads(path.read_text()) if path.exists() else {}
-    for (name, (test, _)), n in product(kinds().items(), SIZES):
+    for n, (name, (test, _)) in product(SIZES, kinds().items()):
         for seed, scene in enumerate(scenes(test)):
-            key = f"{name}; {n}; {scene.name}; {scene.holds}; {studies}"
+            key = _key(name, n, scene, studies)
             if key not in known:
                 size = n // 2 if name.endswith("half of the seeds") else n
                 known[key] = [*measure(test, scene, size, studies, seed)]
-                text = json.dumps(known, indent=0)
-                write_whole(path, lambda file, text=text: file.write(text.encode()))
+                RunFolder(path.parent).write_json(path.name, known)
     return known
 
 
+def _key(name: str, n: int, scene: Scene, studies: int) -> str:
+    return f"{name}; {n}; {scene.name}; {scene.holds}; {studies}"
+
+
 def table(known: dict[str, list], studies: int) -> list[str]:
-    """Lines of Markdown: a row for every kind of test and number of policies, of its scenes the worst."""
+    """Lines of Markdown: a row for every kind of test and number of policies that is complete, its worst scenes."""
     lines = [
         "| test | in | n | holds, wrongly | does not hold, wrongly | worst case | holds, rightly | does not, rightly |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for (name, (test, ids)), n in product(kinds().items(), SIZES):
         rates: dict[bool | None, list[tuple[float, float, str]]] = defaultdict(list)
-        for scene in scenes(test):
-            rates[scene.holds].append((*known[f"{name}; {n}; {scene.name}; {scene.holds}; {studies}"], scene.name))
+        keys = {_key(name, n, scene, studies): scene for scene in scenes(test)}
+        if not keys.keys() <= known.keys():
+            continue
+        for key, scene in keys.items():
+            rates[scene.holds].append((*known[key], scene.name))
         border, true, false = rates[None], rates[True], rates[False]
         yes, no = max(border + false, key=lambda x: x[0]), max(border + true, key=lambda x: x[1])
         where = yes[2] if yes[0] >= no[1] else no[2]

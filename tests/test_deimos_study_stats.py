@@ -64,6 +64,14 @@ def test_bootstrap_of_the_mean_has_its_known_spread():
     assert one != other
 
 
+def test_share_has_an_exact_interval():
+    """None of ten is at most 31 % with 97.5 % certainty, and 9 of 10 has SciPy's interval of Clopper and Pearson."""
+    none = stats.share(np.zeros(10, bool))
+    assert (none.estimate, none.low, none.high) == (0.0, 0.0, pytest.approx(1 - 0.025**0.1))
+    most = stats.share(np.arange(10) > 0)
+    assert (most.estimate, most.low, most.high) == (0.9, *scipy_stats.binomtest(9, 10).proportion_ci())
+
+
 def test_bootstrap_resamples_within_strata():
     """Every resample keeps the size of each stratum, and takes values from that stratum alone."""
     draws = resample([X, Y + 100], 50, 3)

@@ -15,12 +15,11 @@ from reproduction import claim_tests, claims, lines, measures
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import Matters, Ordered
 from reproduction.claims import Claim, Clause, Finding, holm
-from reproduction.measures import ATTACKED, GAIN, NAIVE, Evidence, Place
+from reproduction.measures import ATTACKED, GAIN, NAIVE, PENALTIES, Evidence, Place
 from reproduction.thesis import ENVIRONMENTS, LEGGED_METHODS, PARTICLE_METHODS
 
 POINTS = 40
 BY_ID = {claim.id: claim for claim in CLAIMS}
-PENALTIES = ("penalty-10", "penalty-100")
 HERE = Place("directional", 100)
 
 
@@ -161,7 +160,7 @@ def test_verdict_goes_either_way(p_for, p_against, verdict):
 def test_line_of_a_claim_counts_clauses(alike):
     """It says how many of them hold, how many do not and how many are undecided; those without data do not count."""
     outcome = claims.test(claim_of((0.01, 1), (0.01, 1), (1, 0.01), (0.5, 1), None), alike)
-    assert outcome.line == "2 of 4 clauses hold; 1 does not hold, 1 undecided"
+    assert outcome.line == "2 of 4 clauses hold; 1 does not, 1 undecided"
     assert outcome.results[0].missing == ("p25",)
     assert len(outcome.without_data) == 1
     assert outcome.within("absolute").line == "no data"
@@ -172,9 +171,9 @@ def test_line_of_a_claim_counts_clauses(alike):
 def test_what_one_clause_decides_is_corrected(alike):
     """Where one clause is enough, p-values for it are those of Holm's rule; those against it stay as they are."""
     pair = [(0.03, 1), (1, 0.03)]
-    assert claims.test(claim_of(*pair), alike).line == "1 of 2 clauses holds; 1 does not hold"
+    assert claims.test(claim_of(*pair), alike).line == "1 of 2 clauses holds; 1 does not"
     outcome = claims.test(claim_of(*pair, one_is_enough=True), alike)
-    assert outcome.line == "0 of 2 clauses hold (one is enough); 1 does not hold, 1 undecided"
+    assert outcome.line == "0 of 2 clauses hold (one is enough); 1 does not, 1 undecided"
     assert [each.finding.p_for for each in outcome.results] == [0.06, 1.0]
 
 
@@ -291,6 +290,22 @@ def test_short_evaluation_does_not_show_nearly_no_crashes(worlds, known):
     assert [each.finding.interval.estimate for each in outcome.results] == [0.5] * known
 
 
+@pytest.mark.parametrize("worlds", [505, 2000])
+def test_policies_at_the_limit_are_not_nearly_without_crashes(worlds):
+    """Of policies with one crash in 10^6 steps at most half count as having fewer, with a thirtieth most do."""
+    limit = worlds * 2000 * measures.NEARLY_NONE
+
+    def share(mean):
+        rows = [{"environment": "relative", "goal_period": 100, "goals": "naive", "method": "vds", "seed": seed,
+                 "worlds": worlds, "steps": 2000, "crashes": crashes}
+                for seed, crashes in enumerate(np.random.default_rng(0).poisson(mean, 2000))]  # fmt: skip
+        numbers = measures.FEW_CRASHES(Evidence(rows), Place("relative", 100), "vds")
+        return np.mean(np.array([*numbers.values()]) > 0)
+
+    assert share(limit) <= 0.5 + 4 * math.sqrt(0.25 / 2000)
+    assert share(limit / 30) > 0.9
+
+
 def test_safe_and_unsafe_policies_are_told_apart():
     """C12 looks at policies that crash in less than 1 % of their interactions, and at the others."""
     rates = {"naive": [0.001, 0.002, 0.003, 0.2, 0.3, 0.4], "argmax": [0.1, 0.1, 0.1, 0.1, 0.1, 0.1]}
@@ -298,6 +313,13 @@ def test_safe_and_unsafe_policies_are_told_apart():
              "crash_rate": rate} for goals, own in rates.items() for seed, rate in enumerate(own)]  # fmt: skip
     outcome = claims.test(BY_ID["C12"], Evidence(rows))
     assert [(each.finding.n, each.finding.interval.estimate) for each in outcome.results] == [({"p25": 3}, 1.0)] * 2
+
+
+def test_training_counts_once(alike):
+    """What is said of training has one result in an environment that was evaluated at two T, and else there are two."""
+    found = {claim: [str(each.place) for each in claims.test(BY_ID[claim], alike).results if each.clause.line in
+                     (505, 662) and each.place.environment == "quad"] for claim in ("C24", "C29")}  # fmt: skip
+    assert found == {"C24": ["quad, T = 100", "quad, T = 500"], "C29": ["quad, T = 100"]}
 
 
 def test_lines_are_checked(tmp_path, monkeypatch, capsys):

@@ -7,7 +7,7 @@ import pytest
 
 from reproduction import hypotheses
 from reproduction.hypotheses import VARIANTS
-from reproduction.measures import Evidence
+from reproduction.measures import PENALTIES, Evidence
 
 DOSES = {"coop": 2, "p10": 54, "uniform": 50, "p25": 62, "p50": 74, "p75": 86, "p90": 94, "antagonist": 98}
 
@@ -23,7 +23,7 @@ def study(rate, score=lambda method, rng: 1.0, seeds=range(30), seed=0):
     """Rows and curves of all methods in both variants; ``rate(method, rng, seed)`` under the worst attacker."""
     rng, rows, curves = np.random.default_rng(seed), [], []
     for variant in VARIANTS:
-        for method in (*DOSES, "penalty-10", "penalty-100"):
+        for method in (*DOSES, *PENALTIES):
             for number in seeds:
                 key = {"environment": variant, "method": method, "seed": number}
                 worst = float(np.clip(rate(method, rng, number), 0, 1))

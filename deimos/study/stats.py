@@ -113,6 +113,22 @@ def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Int
     return Interval(mean, mean - high * error, mean - low * error)
 
 
+def share(holds: NDArray[np.bool_]) -> Interval:
+    """Share of the policies that something holds for, with its exact interval [1]_.
+
+    The bootstrap has none where it holds for all or for none.
+
+    Args:
+        holds: One truth value per policy, shape (n,), n at least 1.
+
+    References:
+        .. [1] Clopper and Pearson, *The Use of Confidence or Fiducial Limits*, Biometrika 26, 1934.
+    """
+    found = stats.binomtest(int(holds.sum()), len(holds))
+    interval = found.proportion_ci(LEVEL)
+    return Interval(float(found.statistic), float(interval.low), float(interval.high))
+
+
 def probability_of_improvement(
     pairs: Sequence[tuple[Array, Array]], *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
