@@ -2,10 +2,10 @@
 
     python -m reproduction.braking
 
-Particles follow a velocity, from the same states: those in which a particle that does not mind the wall crashes within T
-steps. One brakes, one brakes for these T steps and never again, one does not brake. What counts in training is the
-discounted return, which a crash ends. The mean reward per step over all steps counts what comes after a crash too, when
-the particle is back at the origin, far from every wall.
+Particles follow a velocity, from the same states: those in which a particle that does not mind the wall crashes within
+T steps. One brakes, one brakes for these T steps and never again, one does not brake. What counts in training is the
+discounted return, which a crash ends. The mean reward per step over all steps counts what comes after a crash too,
+when the particle is back at the origin, far from every wall.
 """
 
 import argparse
