@@ -32,7 +32,7 @@ TITLES = {"p25": "DEIMOS (p25)", "rnd": "RND", "uniform": "Uniform", "vds": "VDS
 """The table's methods, in the thesis's order."""
 ROBOTS = 256
 PERIOD = 100  # T of the robots: a fifth of the presets', so that selectors choose five times as often
-WARM_UP = 2  # goals of every world before anything is timed, and as many more as a fear network needs to learn at all
+WARM_UP = 2  # iterations before anything is timed, and as many more as a fear network needs to learn at all
 MOST = 20  # goals of every world that it may take to
 
 Round = dict[str, Any]
@@ -121,11 +121,10 @@ def measure(
 
 
 def _warm_up(trainer: Trainer) -> None:
-    """Train until goals have fallen due in all worlds and fear, if there is any, has learnt."""
-    goal = trainer.config.env.goal_period / trainer.config.ppo.num_steps  # iterations
+    """Train until memory has been found and fear, if there is any, has learnt."""
     afraid = fear_selector(trainer.loop.selector)
-    while trainer.iteration < WARM_UP * goal or (afraid and not afraid.fear.fitted):
-        if trainer.iteration > MOST * goal:
+    while trainer.iteration < WARM_UP or (afraid and not afraid.fear.fitted):
+        if trainer.iteration * trainer.config.ppo.num_steps > MOST * trainer.config.env.goal_period:
             raise RunError(f"After {MOST} goals the fear network of {trainer.config.label} has learnt nothing.")
         trainer.iterate()
 

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import tyro
 from rich.console import Console
@@ -12,6 +13,14 @@ from deimos.checks import RunError, check_at_least
 from deimos.study.cli import ReportOptions
 from reproduction import coverage
 from reproduction.report import write
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClaimOptions(ReportOptions):
+    """Write the report of a study with the thesis's claims."""
+
+    speeds: Path | None = None
+    """File of ``python -m benchmarks table41 --json``, which the claim on speed rests on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,13 +41,13 @@ class CoverageOptions:
             check_at_least(name, getattr(self, name), least)
 
 
-def report_claims(options: ReportOptions) -> None:
+def report_claims(options: ClaimOptions) -> None:
     """Write the report of a study with the thesis's claims.
 
     Raises:
         RunError: If there are no results, or the folder cannot be written.
     """
-    print(write(options.folder, options.out or options.folder))
+    print(write(options.folder, options.out or options.folder, options.speeds))
 
 
 def print_coverage(options: CoverageOptions) -> None:
@@ -53,7 +62,7 @@ def print_coverage(options: CoverageOptions) -> None:
 
 
 COMMANDS: dict[str, tuple[type, Callable[..., None]]] = {
-    "report": (ReportOptions, report_claims),
+    "report": (ClaimOptions, report_claims),
     "coverage": (CoverageOptions, print_coverage),
 }
 """Options and function of every command."""

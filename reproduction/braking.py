@@ -2,10 +2,10 @@
 
     python -m reproduction.braking
 
-Particles follow a velocity, from the same states at the moment of a new goal: those in which a particle that does not
-mind the wall crashes before the next goal. One brakes, one brakes this once and never again, one does not brake. What
-counts in training is the discounted return, which a crash ends. The mean reward per step over all steps counts what
-comes after a crash too, when the particle is back at the origin, far from every wall.
+Particles follow a velocity, from the same states: those in which a particle that does not mind the wall crashes within
+T steps. One brakes, one brakes for these T steps and never again, one does not brake. What counts in training is the
+discounted return, which a crash ends. The mean reward per step over all steps counts what comes after a crash too,
+when the particle is back at the origin, far from every wall.
 """
 
 import argparse
@@ -33,7 +33,7 @@ LONG = 1000  # steps that a discounted return is summed over; later ones weigh l
 
 
 BRAKES = {"brakes": (True, True), "brakes once": (True, False), "never brakes": (False, False)}
-"""The controllers: whether they brake under this goal, and under later ones."""
+"""The controllers: whether they brake in the first T steps, and later."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Gain:
 
 
 def gains(task: Config, worlds: int = WORLDS, discount: float = TrainConfig().ppo.discount) -> dict[str, Gain]:
-    """What each controller gains, from the states in which not braking crashes before the next goal.
+    """What each controller gains, from the states in which not braking crashes within T steps.
 
     Args:
         task: A task with velocity goals.
@@ -72,7 +72,7 @@ def gains(task: Config, worlds: int = WORLDS, discount: float = TrainConfig().pp
 
 
 def _follow(env: Particle, start: dict, brakes: tuple[bool, bool], discount: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Discounted returns, mean rewards, and which worlds crash before the next goal, each of shape (worlds,)."""
+    """Discounted returns, mean rewards, and which worlds crash within T steps, each of shape (worlds,)."""
     env.load_state_dict(start)
     loop = GoalLoop(env, uniform_goals(env))
     now, later = (env.reference_policy(brake) for brake in brakes)

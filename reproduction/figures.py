@@ -7,7 +7,7 @@ import numpy as np
 
 from deimos.study import outcomes
 from deimos.study.data import Data, Style, Where
-from deimos.study.figures import WIDTH, Figures, as_rates, legend, not_recorded, subplots
+from deimos.study.figures import WIDTH, Figures, as_rates, instead, legend, subplots
 from deimos.study.outcomes import DOSE, of_environment
 from deimos.study.results import Row
 from reproduction.thesis import DIRECTOR_METHODS, ENVIRONMENTS
@@ -61,7 +61,7 @@ def dose_response(data: Data, environment: str, period: int, shifted: Sequence[R
         for name in names:
             outcomes.over_dose(left, data, where, name, metric)
         if not names:
-            not_recorded(left, "delivered dose")
+            instead(left, "delivered dose:\nnot recorded")
         _over_shift(right, shifted, "score" if metric == "score" else "crash_rate")
         for panel in (left, right):
             panel.grid(alpha=0.3)
@@ -79,7 +79,7 @@ def dose_response(data: Data, environment: str, period: int, shifted: Sequence[R
 def _over_shift(axes: "Axes", rows: Sequence[Row], metric: str) -> None:
     """A line for each policy, through the rules by rising percentile, by learnt fear and by exact fear."""
     if not rows:
-        not_recorded(axes, "shifted goals")
+        instead(axes, "shifted goals:\nnot recorded")
         return
     unit = 1 if metric == "score" else 100
     for fear, colour, marker in (("learnt", "#000000", "o"), ("exact", "#D55E00", "^")):

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import stats as scipy_stats
 
 from deimos.goals.methods import METHODS
+from deimos.study.audits import diversity
 from deimos.study.data import Data
 from deimos.study.results import Row
 from deimos.study.stats import Array
@@ -194,14 +195,6 @@ def _rare_halfway(crashes: Array) -> float:
     return float(log[:tenth].mean() - log[4 * tenth : max(6 * tenth, 4 * tenth + 1)].mean()) - math.log(10)
 
 
-def _diversity(counts: Array) -> float:
-    """Entropy of goals given the place, of a square table of counts: 1 where they are uniform, 0 where it says them."""
-    table = counts.reshape(math.isqrt(counts.size), -1)
-    weight = table.sum(axis=1)
-    entropy = np.nan_to_num(scipy_stats.entropy(table, axis=1)) / math.log(table.shape[1])
-    return float(np.average(entropy, weights=weight)) if weight.sum() else math.nan
-
-
 def _nearly_none(evidence: Evidence, place: Place, method: str) -> Numbers:
     """How far a policy is on the safe side of one crash in 10^6 steps.
 
@@ -253,7 +246,7 @@ FALL = Measure("fall of log crashes over training", _curve("crashes_per_1000", _
 LATE_FALL = Measure("fall of log crashes in the last fifth of training", _curve("crashes_per_1000", _late_fall))
 HALFWAY = Measure("crashes halfway below a tenth of the first", _curve("crashes_per_1000", _rare_halfway))
 CHOSEN = Measure("share of goals that the Director chose", _curve("selected_fraction", lambda x: float(x.mean())))
-DIVERSITY = Measure("diversity of goals", _curve("goal_map", _diversity))
+DIVERSITY = Measure("diversity of goals", _curve("goal_map", diversity))
 DOSE = Measure("delivered dose: mean percentile of fear of the goals in training",
                _curve("goal_percentile", _known_mean))  # fmt: skip
 MOTION = Measure("speed of the policy", _curve("speed", lambda x: float(x)))

@@ -59,16 +59,18 @@ def print_populations(rows: list[Row]) -> None:
     """One row per cell: medians over seeds, with the range."""
     groups: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
     for row in sorted(rows, key=lambda row: row["seed"]):
-        groups[row["environment"], row["method"], row["goals"]].append(row)
+        goals = "adversary" if row["goals"] == "argmax" else row["goals"]  # its name in version 0.1.0
+        groups[row["environment"], row["method"], goals].append(row)
     print("| variant | method | goals | crashes / 1000 (min-max) | crashes per interaction | score (min-max) "
           "| reward | Adversary's AUROC |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
     for (variant, method, goals), own in groups.items():
         names = ("crashes_per_1000", "crash_rate", "score", "reward", "adversary_auroc")
         rate, crashed, score, reward, aurocs = (np.array([row[name] for row in own]) for name in names)
-        weak = sum(bool(row["weak_adversary"]) for row in own)
+        weak = sum(bool(row["weak_adversary"] or row.get("uninformed")) for row in own)
         known = aurocs[~np.isnan(aurocs)]
-        auroc = (f"{np.median(known):.3f}" if len(known) else "") + (f" ({weak} of {len(own)} weak)" if weak else "")
+        auroc = f"{np.median(known):.3f}" if len(known) else ""
+        auroc += f" ({weak} of {len(own)} uninformed)" if weak else ""
         print(f"| {variant} | {method} | {goals} | {np.median(rate):.3f} ({rate.min():.3f}-{rate.max():.3f}) "
               f"| {np.median(crashed):.4f} | {np.median(score):.3f} ({score.min():.3f}-{score.max():.3f}) "
               f"| {np.median(reward):.4f} | {auroc} |")  # fmt: skip

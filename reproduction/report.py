@@ -1,71 +1,110 @@
-"""The report of a study of the thesis: the generic one, with the thesis's claims and its Table 4.1."""
+"""The report of a study of the thesis: first its claims on one page, then the generic one, then every clause."""
 
+import json
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from deimos.checks import RunError
+from deimos.study import figures as drawing
 from deimos.study import report
 from deimos.study.data import Data
 from deimos.study.document import Block
-from reproduction import claims, deviations, shifted_goals
+from reproduction import claims, deviations, overview, shifted_goals
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import SETTLED_RATIO, SETTLED_SHARE
-from reproduction.claims import LEAST, Outcome
+from reproduction.claims import LEAST, Outcome, Result
 from reproduction.figures import STYLE, figures
 from reproduction.measures import Evidence
-from reproduction.thesis import RATIOS_4_1
+
+CLAUSES = "clauses"
+"""Name of the figure on the first page."""
 
 
-def write(folder: Path, out: Path) -> Path:
-    """Write the report; see ``deimos.study.report.write``."""
+def write(folder: Path, out: Path, speeds: Path | None = None) -> Path:
+    """Write the report; see ``deimos.study.report.write``.
+
+    Args:
+        folder: A study's folder, or one of exported tables; ``shifted_goals.csv`` in it is drawn too.
+        out: Where to write; made if it is not there.
+        speeds: File of ``python -m benchmarks table41 --json``, which the claim on speed rests on; ``None`` for none.
+
+    Raises:
+        RunError: If there are no results, or a file cannot be read.
+    """
+    rounds = _rounds(speeds)
     shifted = shifted_goals.read(folder)
-    return report.write(folder, out, STYLE, page, partial(figures, shifted=shifted))
+    return report.write(folder, out, STYLE, partial(page, out=out, speeds=rounds), partial(figures, shifted=shifted))
 
 
-def page(data: Data, pictures: report.Pictures) -> list[Block]:
-    """The sections of every study, the claims after what was run, and their tests at the end."""
-    evidence = Evidence.of(data)
+def _rounds(path: Path | None) -> list[dict]:
+    try:
+        return json.loads(path.read_text())["table41"] if path else []
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise RunError(f"{path} is no file of `python -m benchmarks table41 --json` ({error}).") from error
+
+
+def page(data: Data, pictures: report.Pictures, out: Path, speeds: Sequence[Mapping] = ()) -> list[Block]:
+    """The claims on one page, the sections of every study, our choices, and the tests of all clauses."""
+    evidence = Evidence.of(data, speeds)
     outcomes = [claims.test(claim, evidence) for claim in CLAIMS]
+    figure = overview.draw(outcomes, data.environments)
+    first = drawing.write({CLAUSES: (overview.CAPTION, figure)}, out / report.FIGURES)
     return [
-        "# A study of goal selection", *_verdicts(outcomes), *report.environments(data, pictures),
-        *report.over_all(data), *report.what_was_run(data), *deviations.blocks(),
-        *_speed(data), *report.distributions(data), *[block for outcome in outcomes for block in _details(outcome)],
+        "# What the thesis claims, clause by clause", _summary(outcomes, data), *first,
+        "# The study", *_lines(outcomes), *report.environments(data, pictures), *report.over_all(data),
+        *report.what_was_run(data), *deviations.blocks(), *report.speed(data), *report.distributions(data),
+        "## Every clause", *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
 
 
-def _verdicts(outcomes: Sequence[Outcome]) -> list[Block]:
+def _summary(outcomes: Sequence[Outcome], data: Data) -> str:
+    """One sentence for all environments and one for each."""
+    parts = [f"{_counted(outcomes)} over all environments"]
+    for name in data.environments:
+        own = [outcome.within(name) for outcome in outcomes]
+        parts += [f"{_counted(own)} in {name}"] if any(each.results for each in own) else []
+    without = ", ".join(each.claim.id for each in outcomes if not each.results)
+    text = f"Clauses: {'; '.join(parts)}."
+    return text + (f" There are no data for {without}." if without else "")
+
+
+def _counted(outcomes: Sequence[Outcome]) -> str:
+    counts: Counter[str] = Counter(each.verdict for outcome in outcomes for each in outcome.results)
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in claims.VERDICTS)
+
+
+def _lines(outcomes: Sequence[Outcome]) -> list[Block]:
     rows = [{"claim": each.claim.id, "what the thesis says": each.claim.text, "clauses": each.line}
             for each in outcomes]  # fmt: skip
-    counts = sum((each.counts for each in outcomes), Counter())
-    summary = ", ".join(f"{counts[verdict]} {verdict}" for verdict in claims.VERDICTS)
-    return ["## Claims", f"Clauses of the thesis's {len(outcomes)} claims: {summary}. The test of each is below.", rows]
-
-
-def _speed(data: Data) -> list[Block]:
-    """That of every study, beside the thesis's Table 4.1."""
-    blocks = report.speed(data)
-    for row in (row for block in blocks if isinstance(block, list) for row in block):
-        theirs = RATIOS_4_1.get(row["environment"], {}).get(row["method"])
-        row["published ratio"] = "-" if theirs is None else f"{theirs:.2f}"
-    return blocks
+    return ["## Claims", rows]
 
 
 def _details(outcome: Outcome) -> list[Block]:
     claim = outcome.claim
-    rows = [
-        {
-            "where": str(each.place), "clause": each.clause.text, "line": str(each.clause.line or "-"),
-            "n": " + ".join(map(str, each.finding.n.values())), "effect": each.finding.effect,
-            "size [95 %]": f"{each.finding.interval:.3g}",
-            "equivalent within": "-" if each.finding.equivalent_within is None
-            else f"{each.finding.equivalent_within:.3g}",
-            "minimum detectable effect": f"{each.finding.detectable:.2g}", "verdict": each.verdict,
-        }
-        for each in outcome.results
+    rows = [_row(each) for each in outcome.results]
+    without = "; ".join(clause.text for clause in outcome.without_data)
+    return [
+        f"### {claim.id}: {outcome.line}", f"{claim.text} {claim.note}".strip(),
+        *([rows] if rows else []), *([f"Without data: {without}."] if without else []),
     ]  # fmt: skip
-    return [f"### {claim.id}: {outcome.line}", f"{claim.text} {claim.note}".strip(), rows or "There are no data."]
+
+
+def _row(each: Result) -> dict[str, str]:
+    finding = each.finding
+    within, smallest = finding.equivalent_within, finding.detectable
+    return {
+        "where": str(each.place), "clause": each.clause.text, "line": str(each.clause.line or "-"),
+        "n": " + ".join(map(str, finding.n.values())), "without": ", ".join(each.missing) or "-",
+        "effect": finding.effect + (f" ({finding.chosen})" if finding.chosen else ""),
+        "size [95 %]": f"{finding.interval:.3g}", "no difference": f"{finding.no_difference:g}",
+        "equivalent within": "-" if within is None else f"{within:.3g}",
+        "minimum detectable effect": "none" if math.isinf(smallest) else f"{smallest:.2g}",
+        "verdict": each.verdict,
+    }  # fmt: skip
 
 
 def _limits(data: Data) -> list[str]:
@@ -79,5 +118,6 @@ def _limits(data: Data) -> list[str]:
         f"clauses. An equivalence is settled within a ratio of {SETTLED_RATIO:g}, or {SETTLED_SHARE:g} of the score.",
         *rest,
         "`python -m reproduction coverage` measures again how often these intervals contain the truth.",
-        "What the thesis measured its Table 4.1 on is not known.",
+        "What the thesis measured its Table 4.1 on is not known; its claim on speed rests on `python -m benchmarks "
+        "table41`, never on the clocks of a study.",
     ]

@@ -8,13 +8,13 @@ import pytest
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs.particle import Config
 from deimos.study import figures, outcomes, report
+from deimos.study.audits import BINS
 from deimos.study.data import Data
 from deimos.study.plan import Cell
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results
 from reproduction import figures as thesis
 
 EMPTY = {str: "v", int: 100, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
-BINS = 4
 
 
 def study(*, environments=("directional",), methods=("uniform", "p25", "p75"), seeds=3, curve=True, **columns):
@@ -27,7 +27,11 @@ def study(*, environments=("directional",), methods=("uniform", "p25", "p75"), s
                        "selector": method, "hash": f"{environment}{method}{seed}"}  # fmt: skip
                 for goals in ("naive", "adversary"):
                     row = {name: EMPTY[kind] for name, kind in RESULT_COLUMNS.items()} | key
-                    values = {"crash_rate": (i + 1) * 0.01 * (goals != "naive"), "score": 0.9 - 0.1 * i - 0.01 * seed}
+                    values = {
+                        "worst": math.nan,
+                        "crash_rate": (i + 1) * 0.01 * (goals != "naive"),
+                        "score": 0.9 - 0.1 * i - 0.01 * seed,
+                    }
                     rows.append(row | {"goals": goals} | values | columns.get(environment, {}))
                 line = {name: EMPTY[kind] for name, kind in CURVE_COLUMNS.items()} | key
                 line |= {
@@ -118,14 +122,10 @@ def test_shifted_goals_stand_beside_the_dose():
 
 
 def test_maps_have_the_share_of_goals_at_a_place():
-    """Uniform goals have a diversity of 1, goals that follow from the place of 0, and each method has its map."""
-    assert outcomes.diversity(np.full((3, 3), 7.0)) == pytest.approx(1.0)
-    assert outcomes.diversity(np.eye(4)) == 0.0
-    assert outcomes.diversity(np.array([[8.0, 8.0], [16.0, 0.0]])) == pytest.approx(0.5)
-    assert math.isnan(outcomes.diversity(np.zeros((2, 2))))
+    """Each method has a map of the goals given the place, and their diversity, which is 1 of uniform ones."""
     figure = outcomes.goal_maps(study(), "directional")
     titles = [axes.get_title() for axes in figure.axes if axes.images]
-    assert titles == ["p25: 1.00", "p75: 1.00", "uniform: 1.00"]
+    assert titles == ["p25\n1.00", "p75\n1.00", "uniform\n1.00"]
     assert np.asarray(figure.axes[0].images[0].get_array()) == pytest.approx(np.full((BINS, BINS), 1 / BINS))
     assert outcomes.goal_maps(study(curve=False), "directional") is None
 
@@ -169,6 +169,14 @@ def test_levels_are_drawn_by_factor(tmp_path, monkeypatch):
     text = (tmp_path / "report.md").read_text()
     assert "directional with env.max_force inf, reward sharp." in text
     assert "## By level\n\n![directional, T = 100: crashes under attack and score by the level" in text
+
+
+def test_many_levels_are_quarters():
+    """A sample of a range is drawn by quarters, and levels keep their order, numbers before names."""
+    assert outcomes._grouped(["inf", 2, 1, 2.5, 1]) == {"1": [1], "2": [2], "2.5": [2.5], "inf": ["inf"]}
+    assert outcomes._grouped([[64, 64], [32]]) == {"[32]": [[32]], "[64, 64]": [[64, 64]]}
+    quarters = outcomes._grouped([0.5, *range(1, 8)])
+    assert quarters == {"0.5\nto 1": [0.5, 1], "2\nto 3": [2, 3], "4\nto 5": [4, 5], "6\nto 7": [6, 7]}
 
 
 def test_hyper_parameters_stand_in_one_table():

@@ -44,7 +44,10 @@ def fill(folder, seeds=4, points=20):
                                        "crash_rate": min(1.0, crashes / 1000) if goals == "adversary" else 0.5,
                                        "reward": rng.normal(0.8, 0.01), "fps": rng.normal(1e5, 1e3),
                                        "weak_adversary": weak})  # fmt: skip
-                line = dict.fromkeys(CURVE_COLUMNS, tuple(rng.uniform(0.1, 1, points))) | key
+                line = {name: values[kind] for name, kind in CURVE_COLUMNS.items()} | key
+                line |= dict.fromkeys(
+                    ("reward", "crashes_per_1000", "selected_fraction"), tuple(rng.uniform(0.1, 1, points))
+                )
                 lines.append(line | {"num_envs": 100, "env_steps": tuple(24.0 * np.arange(1, points + 1))})
     folder.mkdir(exist_ok=True)
     Results(rows, lines).write(folder)
@@ -97,8 +100,8 @@ def test_page_needs_no_other_file(folder):
 
 
 def test_every_figure_is_there_twice(folder):
-    """Each environment has its training curves, boxes, profiles and its score against safety, as PNG and as SVG."""
-    names = {f"training-{name}" for name in ("directional", "quad")}
+    """The page of clauses, and each environment's training, boxes, profiles and score against safety, are there."""
+    names = {"clauses"} | {f"training-{name}" for name in ("directional", "quad")}
     names |= {f"{kind}-{e}-T100" for kind in ("evaluation", "profile", "pareto") for e in ("directional", "quad")}
     for ending in ("png", "svg"):
         assert {path.stem for path in (folder / "figures").glob(f"*.{ending}")} == names
@@ -116,7 +119,8 @@ def test_markdown_says_the_same(folder):
         assert heading is not None
         assert f"<h3>{claim.id}: {heading[1]}</h3>" in page
     links = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
-    assert len(links) == 8
+    assert len(links) == 9
+    assert links[0] == "figures/clauses.png"  # the report leads with them
     assert all((folder / link).is_file() for link in links)
 
 

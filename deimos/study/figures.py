@@ -70,9 +70,9 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) ->
     return figure, figure.subplots(rows, columns, squeeze=False, **more)
 
 
-def not_recorded(axes: "Axes", what: str) -> None:
-    """Say in the place of a panel what its rows do not hold."""
-    axes.text(0.5, 0.5, f"{what}:\nnot recorded", ha="center", va="center", transform=axes.transAxes, color="#555555")
+def instead(axes: "Axes", text: str) -> None:
+    """Say in the place of a panel why it is empty."""
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, color="#555555")
     axes.set_yticks([])
 
 
@@ -94,6 +94,7 @@ def training(data: Data, environment: str) -> "Figure | None":
     titles = [*data.style.panels]
     own = {title: [name for name in found if data.style.panel(name) == title] for title in titles}
     most = max(map(len, own.values()))
+    known = any(unfitted(data, environment, name) is not None for name in found)
     figure, axes = subplots(
         3, len(titles), (WIDTH, 4.4 + 0.13 * most), sharex=True, sharey="row", height_ratios=[1, 1, 0.12 + 0.07 * most]
     )
@@ -108,7 +109,7 @@ def training(data: Data, environment: str) -> "Figure | None":
         top.set_yscale("symlog", linthresh=0.1)
         top.set_ylim(bottom=0)
         top.yaxis.set_major_formatter("{x:g}")
-        _strips(strip, data, environment, own[title])
+        _strips(strip, data, environment, own[title], known)
     axes[0, 0].set_ylabel("crashes per 1000\ntransitions")
     axes[1, 0].set_ylabel("mean reward\nper transition")
     legend(figure, data.style, found, "below")
@@ -125,11 +126,14 @@ def unfitted(data: Data, environment: str, method: str) -> Array | None:
     return 1.0 - np.mean([curve[:length] for curve in curves], axis=0) if length else None
 
 
-def _strips(axes: "Axes", data: Data, environment: str, names: Sequence[str]) -> None:
-    """A strip for each method with a fear network, dark where the networks of its policies did not learn."""
+def _strips(axes: "Axes", data: Data, environment: str, names: Sequence[str], known: bool) -> None:
+    """A strip for each method with a fear network, dark where the networks of its policies did not learn.
+
+    ``known`` says whether that was recorded of any method.
+    """
     found = {name: shares for name in names if (shares := unfitted(data, environment, name)) is not None}
     if not found:
-        not_recorded(axes, "where fear did not learn")
+        instead(axes, "no fear network here" if known else "where fear did not learn:\nnot recorded")
         return
     for row, (name, shares) in enumerate(found.items()):
         steps = data.curves(environment, name, "env_steps")[0][: len(shares)]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import entropy
 
 from deimos.study import figures, stats
+from deimos.study.audits import diversity
 from deimos.study.data import Data, Style, Where
 from deimos.study.figures import WIDTH, Figures, as_rates, legend, line, subplots
 from deimos.study.stats import Array
@@ -36,9 +36,10 @@ MAPS = (
     "-1 and 1 being the walls. The number is the diversity of goals: their entropy given the place, 1 where they are "
     "uniform, 0 where the place says the goal."
 )
+MOST_LEVELS = 6
 LEVELS = (
     "crashes under attack and score by the level of every factor: medians over policies and the levels of the other "
-    "factors, with quartiles."
+    "factors, with quartiles. Many levels of a number are put into quarters."
 )
 
 
@@ -222,16 +223,15 @@ def levels(data: Data, base: str, period: int) -> "Figure | None":
     figure, axes = subplots(2, len(factors), (WIDTH, 4.4), sharex="col", sharey="row")
     methods = [*dict.fromkeys(name for each in settings for name in data.methods(each))]
     for column, factor in zip(axes.T, factors, strict=True):
-        found = {own[factor] for own in settings.values() if factor in own}
-        ordered = sorted(found, key=lambda level: (isinstance(level, str), level))
+        groups = _grouped([own[factor] for own in settings.values() if factor in own])
         for i, name in enumerate(methods):
             shift = 0.5 * ((i + 0.5) / len(methods) - 0.5)
-            both = [[pairs(data, each, period, name) for each, own in settings.items() if own.get(factor) == level]
-                    for level in ordered]  # fmt: skip
+            both = [[pairs(data, each, period, name) for each, own in settings.items() if own.get(factor) in group]
+                    for group in groups.values()]  # fmt: skip
             for panel, which in zip(column, (0, 1), strict=True):
                 samples = [np.concatenate([part[which] for part in parts]) for parts in both]
                 _over_levels(panel, data.style, name, shift, samples)
-        column[1].set_xticks(range(len(ordered)), map(str, ordered))
+        column[1].set_xticks(range(len(groups)), groups)
         column[1].set_xlabel(factor)
     for panel in axes.flat:
         panel.grid(alpha=0.3)
@@ -239,6 +239,17 @@ def levels(data: Data, base: str, period: int) -> "Figure | None":
     axes[1, 0].set_ylabel("score under uniform goals")
     legend(figure, data.style, methods, "beside")
     return figure
+
+
+def _grouped(levels: list[Any]) -> dict[str, list[Any]]:
+    """Levels in order, by their labels; more numbers than can be told apart in a figure are put into quarters."""
+    ordered: list[Any] = []
+    for level in sorted(levels, key=lambda level: (not isinstance(level, int | float), level)):
+        ordered += [level] if level not in ordered else []
+    if len(ordered) <= MOST_LEVELS or not all(isinstance(level, int | float) for level in ordered):
+        return {str(level): [level] for level in ordered}
+    quarters = [ordered[len(ordered) * i // 4 : len(ordered) * (i + 1) // 4] for i in range(4)]
+    return {f"{part[0]:.3g}\nto {part[-1]:.3g}": part for part in quarters}
 
 
 def settings_of(data: Data) -> dict[str, dict[str, Any]]:
@@ -311,7 +322,7 @@ def goal_maps(data: Data, environment: str) -> "Figure | None":
         return None
     columns = min(6, len(counts))
     rows = -(-len(counts) // columns)
-    figure, axes = subplots(rows, columns, (WIDTH, 0.5 + 1.45 * rows), sharex=True, sharey=True)
+    figure, axes = subplots(rows, columns, (WIDTH, 0.4 + 1.3 * rows), sharex=True, sharey=True)
     for panel in axes.flat[len(counts) :]:
         panel.set_axis_off()
     for panel, (name, flat) in zip(axes.flat, counts.items(), strict=False):
@@ -319,7 +330,7 @@ def goal_maps(data: Data, environment: str) -> "Figure | None":
         table = flat.reshape(bins, bins)
         share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)  # of the goals at a place
         drawn = panel.imshow(share.T, origin="lower", extent=(-1, 1, -1, 1), cmap="cividis", vmin=0, vmax=4 / bins)
-        panel.set_title(f"{name}: {diversity(table):.2f}")
+        panel.set_title(f"{name}\n{diversity(flat):.2f}")
         panel.set_xticks([-1, 0, 1])
         panel.set_yticks([-1, 0, 1])
     for panel in axes[-1]:
@@ -329,19 +340,6 @@ def goal_maps(data: Data, environment: str) -> "Figure | None":
     bar = figure.colorbar(drawn, ax=axes, shrink=0.8, ticks=[0, 1 / bins, 4 / bins])
     bar.set_ticklabels(["none", "as uniform", "4 times"])
     return figure
-
-
-def diversity(table: Array) -> float:
-    """How diverse goals are, given the place of the world, by counts of shape (places, goals).
-
-    Returns:
-        The conditional entropy H(goal | place) / log(bins), in [0, 1]: 1 where goals are uniform, 0 where the place
-        says the goal; NaN of an empty table.
-    """
-    if not table.sum():
-        return math.nan
-    each = entropy(table, axis=1)
-    return float(np.average(np.nan_to_num(each), weights=table.sum(axis=1)) / math.log(table.shape[1]))
 
 
 def _is_dark(code: str) -> bool:

@@ -30,11 +30,10 @@ Pictures = Mapping[str, Sequence[Block]]
 FIGURES = "figures"
 FACTORS = ""
 COVERAGE = (  # python -m reproduction coverage, its defaults
-    "The intervals of IQMs and medians are percentile bootstraps: they cover 93 to 94 % at n = 10, on normal and on "
-    "lognormal data. Means have bootstrap-t intervals (94 % and 91 %); the percentile bootstrap would cover 90 % and "
-    "81 %, BCa 90 % and 83 %; of few seeds, or many equal values, a mean has none. Intervals of ratios of spread cover "
-    "more than 99 %: they are too wide, they only "
-    "describe, and no difference is called on them."
+    "All intervals are percentile bootstraps over policies, but for the means under Distributions. Those of IQMs and "
+    "medians cover 93 to 94 % at n = 10, on normal and on lognormal data; those of means 90 % and 81 %, so read the "
+    "mean rates of skewed populations with care. The means under Distributions have bootstrap-t intervals (94 % and "
+    "91 %); of few seeds, or many equal values, a mean has none there."
 )
 _median = partial(np.median, axis=-1)
 _mean = partial(np.mean, axis=-1)
