@@ -152,7 +152,7 @@ class Particle(WarpEnv):
         velocity.zero_()
         position.zero_()
         position[risky, 0] = 1.0 - HALF_SIDE
-        self.obs[:, 0:3], self.obs[:, 3:6] = velocity, position * self.layout[1].scale
+        self.obs[:, 0:3], self.obs[:, 3:6] = velocity, position * self.config.params().position_scale
         self.set_goals(rows, self.sample_goals(rows, 1).squeeze(1).clone())
         return risky, safe
 
