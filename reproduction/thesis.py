@@ -10,11 +10,6 @@ LEGGED = ("quad", "quad_arm")
 ENVIRONMENTS = PARTICLE + LEGGED
 """In the thesis's order."""
 
-ACHIEVED = {
-    "coop": 0.5, "uniform": 50.0, **{f"p{p}": (100 + p) / 2 for p in (10, 25, 50, 75, 90)}, "antagonist": 99.5,
-}  # fmt: skip
-"""Percentile of fear that a method's goals have on average among the candidates: p25 draws from the upper 75 %."""
-
 TABLE_4_1 = {  # thousands of frames per second of training; p25 stands for its Director
     "absolute": {"uniform": 331, "p25": 276, "rnd": 284, "vds": 125},
     "directional": {"uniform": 329, "p25": 274, "rnd": 270, "vds": 119},
