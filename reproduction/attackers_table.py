@@ -77,9 +77,12 @@ def show(variant: str, policies: list[list[dict]], known: dict[str, list[dict]])
     if not policies:
         return
     chosen = Counter(found["attacker"] for found in worst(policies))
-    print(f"\n| {variant} | crashes per interaction [%], by policy (95 %) | mean | ratio to Naive | worst of | AUROC "
-          f"| crashes seen | {' | '.join(known)} |")  # fmt: skip
-    print("|" + "---|" * (7 + len(known)))
+    header = [
+        variant, "crashes per interaction [%], by policy (95 %)", "mean", "ratio to Naive", "worst of", "AUROC",
+        "crashes seen", *known,
+    ]  # fmt: skip
+    print(f"\n| {' | '.join(header)} |")
+    print("|" + "---|" * len(header))
     naive = [rows[0]["crash_rate"] for rows in policies]
     for goals in [row["goals"] for row in policies[0]]:
         own = [next(row for row in rows if row["goals"] == goals) for rows in policies]

@@ -300,19 +300,25 @@ def test_setting_tells_attackers_apart():
         assert settings(attackers=("argmax",), **change)[1] != both[1]
 
 
-def test_rows_tell_tasks_apart():
+def test_rows_tell_tasks_apart(tmp_path):
     """Every row is another's where the evaluated task is another; what evaluation switches off changes nothing."""
+    ground, moved, other = (tmp_path / name for name in ("ground.npz", "terrain.npz", "other.npz"))
+    for path, data in ((ground, b"slopes"), (moved, b"slopes"), (other, b"stairs")):
+        path.write_bytes(data)
 
     def identities(config):
         return _identities(config, replace(SMALL, attackers=("argmax",)))
 
-    config = quad.Config(engine="native", terrain="/here/ground.npz")
+    config = quad.Config(engine="native", terrain=str(ground))
     before = identities(config)
     assert identities(config.for_evaluation()) == identities(replace(config, crash_penalty=2.0)) == before
-    assert identities(replace(config, terrain="/there/terrain.npz")) == before  # a run folder that was moved
-    for old, new in zip(before, identities(replace(config, air_time_target=0.77)), strict=True):
-        assert old | {"environment": ""} == new | {"environment": ""}
-        assert old != new
+    assert identities(replace(config, terrain=str(moved))) == before  # a run folder that was moved
+    for change in ({"air_time_target": 0.77}, {"terrain": str(other)}):
+        for old, new in zip(before, identities(replace(config, **change)), strict=True):
+            assert old | {"environment": ""} == new | {"environment": ""}
+            assert old != new
+    with pytest.raises(RunError, match=r"none\.npz cannot be read"):
+        identities(replace(config, terrain="none.npz"))
     for old, new in zip(before, identities(replace(config, engine="warp")), strict=True):
         assert old | {"engine": "warp"} == new
 

@@ -18,7 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from deimos import terrain
 from deimos.app import cli
+from deimos.run.branch import check_branch
 from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import quad
 from deimos.sim.legged import engines, mjcf, robot_draft, robot_file
 from deimos.sim.legged.capsules import fill
@@ -433,7 +435,10 @@ def test_pieces_lose_no_contact_on_stairs(tmp_path, torch_device):
 
 
 def test_a_run_keeps_its_robot(tmp_path, capsys):
-    """Data file, MJCF, includes and meshes are kept in one file; the run goes on from it, bit for bit, without them."""
+    """Data file, MJCF, includes and meshes are kept in one file; the run goes on from it, bit for bit, without them.
+
+    A branch may name either.
+    """
     home = tmp_path / "home"
     home.mkdir()
     path = write_mule(home)
@@ -444,6 +449,7 @@ def test_a_run_keeps_its_robot(tmp_path, capsys):
     assert cli.main([*flags, "--out", str(tmp_path / "run")]) == 0
     flags[flags.index("--env-steps") + 1] = "96"
     assert cli.main([*flags, "--out", str(tmp_path / "straight")]) == 0
+    check_branch(*[TrainConfig(env=quad.Config(robot=str(each))) for each in (file, tmp_path / "run" / "robot.zip")])
     shutil.rmtree(home)
     with zipfile.ZipFile(tmp_path / "run" / "robot.zip") as archive:
         assert sorted(archive.namelist()) == ["assets/bone.stl", "legs.xml", "mule.xml", "robot.toml"]

@@ -4,7 +4,6 @@ A branch tells methods apart that start from the same policy in the same worlds.
 chooses the goals, is new: seed, draws, pending interactions, selector and budget.
 """
 
-import hashlib
 from dataclasses import replace
 from typing import Any
 
@@ -40,8 +39,7 @@ def check_branch(config: TrainConfig, origin: TrainConfig) -> None:
 
 def _fields(config: TrainConfig) -> dict[str, Any]:
     """All that must be the same, by the names of the command line; of files, a hash of what is in them."""
-    files = {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in config.env.files.items()}
-    fields = _flat(to_dict(config) | {"env": to_dict(config.env) | files})
+    fields = _flat(to_dict(config) | {"env": to_dict(config.env) | config.env.file_hashes()})
     free = tuple(f"{name}." for name in MAY_DIFFER)
     return {name: value for name, value in fields.items() if not f"{name}.".startswith(free)}
 

@@ -137,10 +137,13 @@ def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
 
 
 def _environment(env_config: EnvConfig) -> str:
-    """A hash of a task as it is evaluated, but for what rows say apart and for the places of its files."""
-    left_out = {"goal_period", "engine", *env_config.files}
-    task = {name: value for name, value in asdict(env_config.for_evaluation()).items() if name not in left_out}
-    return _digest(task)
+    """A hash of a task as it is evaluated, but for what rows say apart; of its files, of what is in them."""
+    try:
+        files = env_config.file_hashes()
+    except OSError as error:
+        raise RunError(f"{error.filename} cannot be read ({error.strerror}).") from error
+    task = asdict(env_config.for_evaluation()) | files
+    return _digest({name: value for name, value in task.items() if name not in ("goal_period", "engine")})
 
 
 def _digest(data: dict) -> str:

@@ -6,6 +6,7 @@ resets a world and never changes a goal: ``deimos.run.loop`` does both, between 
 """
 
 import abc
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -97,6 +98,16 @@ class EnvConfig(abc.ABC):
     def read_file(self, name: str) -> tuple[bytes, str]:
         """What a run keeps of one of ``files``, whole in itself, and the ending of its copy."""
         return self.files[name].read_bytes(), self.files[name].suffix
+
+    @final
+    def file_hashes(self) -> dict[str, str]:
+        """First 16 hexadecimal digits of the SHA-256 of what a run keeps of each of ``files``.
+
+        Raises:
+            OSError: If one cannot be read.
+            ValueError: If one is not what it should be.
+        """
+        return {name: hashlib.sha256(self.read_file(name)[0]).hexdigest()[:16] for name in self.files}
 
     @property
     def largest_reward(self) -> float:
