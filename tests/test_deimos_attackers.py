@@ -139,7 +139,7 @@ def test_q_fear_sees_beyond_a_goal():
     arguments = (rows, still, still[:, :3], env.sample_goals(rows, 100).clone(), env.draw(rows))
     far, near = (q_fear.Config(beta=beta).prepare(target).selector(env).propose(*arguments) for beta in (0.9, 0.0))
     assert far.goal[:, 0].mean() > 0.7
-    assert far.score.mean() > near.score.mean() + 5.0  # in log odds
+    assert far.score.mean() > near.score.mean() + 3.0  # in log odds: twenty times the odds
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

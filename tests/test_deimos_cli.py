@@ -112,7 +112,7 @@ OTHER_ERRORS = {
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
     "evaluate there": "there is not a run folder: it holds no config.json",
     "bench": "There is no command 'bench'",
-    "study walk": "There is no command 'study walk'; there are: run, show, merge, export, report",
+    "study walk": "There is no command 'study walk'; there are: run, show, attack, pack, unpack, merge, export, report",
     "terrain walk": "There is no command 'terrain walk'; there are: list, shape, grid",
 }
 
@@ -348,14 +348,14 @@ def test_evaluation_of_a_run_without_policy_is_refused(copied, capfd):
 
 def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(copied, capfd, monkeypatch):
     """An evaluation that could not be kept is not begun."""
-    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args, **options: pytest.fail("evaluated in vain"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert refused(["evaluate", copied], capfd) == f"deimos: {copied} cannot be written to; evaluate a copy of it.\n"
 
 
 def test_broken_evaluation_is_refused_before_the_work(copied, capfd, monkeypatch):
     """An evaluation.json that cannot be added to is refused before anything is computed, and stays as it is."""
-    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated in vain"))
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args, **options: pytest.fail("evaluated in vain"))
     (copied / "evaluation.json").write_text("{")
     assert "evaluation.json cannot be read" in refused(["evaluate", copied], capfd)
     assert (copied / "evaluation.json").read_text() == "{"
@@ -598,7 +598,7 @@ def test_default_folder_is_named_after_the_run(here, capsys):
 def test_interrupt_during_the_evaluation_is_one_line(copied, monkeypatch, capfd):
     """Ctrl-C in the evaluation ends with one line and exit code 130; the run is whole."""
 
-    def interrupt(*args):
+    def interrupt(*args, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("deimos.run.evaluation.evaluate", interrupt)
@@ -620,7 +620,7 @@ def test_interrupt_at_the_last_iteration_skips_the_evaluation(here, monkeypatch,
         return row
 
     monkeypatch.setattr(training.Trainer, "iterate", interrupted)
-    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args: pytest.fail("evaluated"))
+    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args, **options: pytest.fail("evaluated"))
     once = [argument if argument != "48" else "24" for argument in TINY]
     assert cli.main(["train", *once, "--out", "run"]) == 130
     assert "resume with --resume run" in capsys.readouterr().err

@@ -204,7 +204,7 @@ def test_identical_worlds_stay_identical(simulator):
 def test_capture_replays_the_step(simulator):
     """A captured step does what the launches do, and the launches are made once."""
     physics, twin = (make(2, simulator) for _ in range(2))
-    step = physics.record_step(lambda: None, lambda: None)
+    step = physics.record_step(lambda: None, [lambda: None] * len(physics.parts))
     for both in (physics, twin):
         for tensor in both.tensors.values():
             tensor.zero_()

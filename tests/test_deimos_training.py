@@ -593,7 +593,7 @@ def test_config_differs_from_the_default_in_every_field():
 @pytest.mark.parametrize(
     ("cls", "data", "message"),
     [
-        (TrainConfig, {"sed": 1}, "deimos.run.trainer.TrainConfig has no sed; it has: device, env"),
+        (TrainConfig, {"sed": 1}, "deimos.run.trainer.TrainConfig has no sed; it has: critic_warmup, device, env"),
         (TrainConfig, {"env": {"kind": "moon"}}, "deimos.sim.envs has no 'moon'; it has: .*particle"),
         (EnvConfig, {"variant": "relative"}, "deimos.sim.envs must name its 'kind'"),
         (SelectorConfig, {"kind": "director", "percentile": 101}, r"percentile must be in \[0, 100\], got 101"),

@@ -40,7 +40,7 @@ def population(seeds=10, environments=ENVIRONMENTS, level=level, spread=0.5, met
             for seed in range(seeds):
                 key = {
                     "environment": environment, "method": method, "seed": seed, "setting": environment,
-                    "selector": method,
+                    "selector": method, "code": "a",
                 }  # fmt: skip
                 for period in (100, 500) if legged else (100,):
                     for goals in ("naive", "adversary"):
@@ -260,7 +260,7 @@ def test_measures_of_curves():
     """A curve's last tenth, its fall over training and in its last fifth are those of a known one."""
     crashes = tuple(np.concatenate([np.full(20, 5.0), np.full(60, 1.0), np.linspace(2.0, 1.0, 20)]))
     curve = {"environment": "directional", "method": "p25", "seed": 0, "crashes_per_1000": crashes,
-             "goal_map": tuple(np.eye(4).flatten()), "risk": (math.nan, 0.9, 0.7), "speed": 3.0}  # fmt: skip
+             "goal_map": tuple(np.eye(12).flatten()), "risk": (math.nan, 0.9, 0.7), "speed": 3.0}  # fmt: skip
     data = Evidence([], [curve])
     value = {name: getattr(measures, name)(data, HERE, "p25") for name in
              ("LATE", "FALL", "LATE_FALL", "HALFWAY", "DIVERSITY", "RISK", "MOTION")}  # fmt: skip
@@ -270,7 +270,7 @@ def test_measures_of_curves():
     assert value["HALFWAY"][0] == pytest.approx(math.log1p(5000) - math.log1p(1000) - math.log(10))
     assert (value["DIVERSITY"][0], value["MOTION"][0]) == (0.0, 3.0)
     assert value["RISK"][0] == pytest.approx(0.3)
-    uniform = Evidence([], [curve | {"goal_map": (1,) * 16}])
+    uniform = Evidence([], [curve | {"goal_map": (1,) * 144}])
     assert measures.DIVERSITY(uniform, HERE, "p25")[0] == pytest.approx(1.0)
     assert measures.DIVERSITY(Evidence([], [replace_map(curve)]), HERE, "p25") == {}
 

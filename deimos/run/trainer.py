@@ -46,12 +46,12 @@ class TrainConfig:
     """Parallel worlds, at least 1."""
     env_steps: int = 2000
     """Steps of every world, at least 1; rounded up to whole rollouts."""
-    critic_warmup: int = 0
-    """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to simulate and learn; auto takes the GPU where there is one."""
     threads: int = 0
     """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
+    critic_warmup: int = 0
+    """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 
     def __post_init__(self) -> None:
         check_at_least("num_envs", self.num_envs, 1)
