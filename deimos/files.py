@@ -187,5 +187,10 @@ def file_name(text: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says in its first line, without the full stop; the name of its class where it says nothing."""
+    """What an error says in its first line, without the full stop; the name of its class where it says nothing.
+
+    Of one of the system, its words alone, without number and file.
+    """
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
