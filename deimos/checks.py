@@ -21,7 +21,7 @@ def one_line(error: BaseException) -> str:
 def check_at_least(name: str, value: int, least: int) -> None:
     """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):  # NumPy's whole numbers too
-        raise ValueError(f"{name} must be a whole number, got {value}.")
+        raise ValueError(f"{name} must be a whole number, got {value!r}.")
     if not value >= least:
         raise ValueError(f"{name} must be at least {least}, got {value}.")
     if value >= 2**31:

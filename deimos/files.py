@@ -1,23 +1,59 @@
-"""Files that survive a kill at any moment: each is written atomically."""
+"""Files that survive a kill at any moment: each is written atomically; what is no file is neither read nor written."""
 
 import contextlib
+import errno
+import glob
+import hashlib
+import math
 import os
 import pickle
+import re
+import secrets
+import stat
 import struct
+import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, TYPE_CHECKING, Any, BinaryIO
 
 from deimos.checks import RunError
 
+if TYPE_CHECKING:
+    import numpy as np
+
 UNREADABLE = (
-    OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError,
-    struct.error, zlib.error, zipfile.BadZipFile, pickle.UnpicklingError,
+    OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, MemoryError, ArithmeticError,
+    SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile, pickle.UnpicklingError,
 )  # fmt: skip
 """What reading damaged and foreign archives was seen to raise."""
+PARTIAL = ".partial"  # ending of a file that is not whole yet
+LONGEST_NAME = 100  # letters
+DEFLATED = 1032  # bytes that one byte of an archive stands for at most (RFC 1951)
+
+
+def open_file(path: Path, mode: str = "rb", **text: Any) -> Any:
+    """Open a file as ``open`` does, but nothing else: no pipe, which might keep us waiting, and no device.
+
+    What is written must not be a link either: the file that it leads to may be somebody else's.
+
+    Raises:
+        OSError: If it cannot be opened, or is no such file.
+    """
+    more = getattr(os, "O_NONBLOCK", 0) | (0 if mode[0] == "r" else getattr(os, "O_NOFOLLOW", 0))
+
+    def opener(name: str, flags: int) -> int:
+        if mode[0] != "r" and os.path.islink(name):
+            raise OSError(errno.ELOOP, "it is a link", name)
+        descriptor = os.open(name, flags | more, 0o666)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise OSError(errno.EINVAL, "it is not a regular file", name)
+        return descriptor
+
+    return open(path, mode, opener=opener, **text)
 
 
 def save_tensors(path: Path, data: dict) -> None:
@@ -32,14 +68,16 @@ def save_tensors(path: Path, data: dict) -> None:
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write a file under a temporary name, to the disk, and only then rename it.
+    """Write a new file beside the old one, to the disk, and only then rename it.
 
     Raises:
         RunError: If it cannot be written; the previous file is untouched.
     """
-    temporary = path.with_name(path.name + ".partial")
+    temporary = path.with_name(f"{path.name}.{secrets.token_hex(4)}{PARTIAL}")  # others may be writing it too
     try:
-        with temporary.open("wb") as file:
+        if path.exists() and not path.is_file():
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        with open_file(temporary, "xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
@@ -49,6 +87,12 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     finally:  # an interrupt too must not leave half a file
         with contextlib.suppress(OSError):  # nothing can be deleted on a read-only disk
             temporary.unlink(missing_ok=True)
+
+
+def remove_partial(path: Path) -> None:
+    """Delete what kills have left of attempts to write a file; nobody may be writing it now."""
+    for left in path.parent.glob(f"{glob.escape(path.name)}.*{PARTIAL}"):
+        left.unlink(missing_ok=True)
 
 
 def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = None) -> dict:
@@ -66,12 +110,14 @@ def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = Non
     import torch
 
     try:
-        with zipfile.ZipFile(path) as archive:  # torch reads on over damaged bytes; the archive's checksums tell
-            if damaged := archive.testzip():
-                raise ValueError(f"{damaged} is damaged")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what torch says of a foreign file; it is refused all the same
-            data = torch.load(path, map_location="cpu", weights_only=True)
+        with open_file(path) as file:
+            with zipfile.ZipFile(file) as archive:  # torch reads on over damaged bytes; the archive's checksums tell
+                if damaged := archive.testzip():
+                    raise ValueError(f"{damaged} is damaged")
+            file.seek(0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what torch says of a foreign file; it is refused all the same
+                data = torch.load(file, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise RunError(f"There is no {what} at {path}.") from error
     except UNREADABLE as error:  # torch's own words on foreign objects advise to run them
@@ -83,6 +129,68 @@ def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = Non
     return data
 
 
+def load_arrays(path: Path) -> "dict[str, np.ndarray]":
+    """Read a NumPy file, an ``.npz`` or an ``.npy``, whose one array then has the name "".
+
+    Nothing is allocated before every array's size was found to be what the file has room for.
+
+    Raises:
+        OSError: If it cannot be opened.
+        ValueError: If it is no such file, or it is broken.
+    """
+    import numpy as np
+
+    with open_file(path) as file:
+        try:
+            if not zipfile.is_zipfile(file):
+                file.seek(0)
+                _check_array(file, os.fstat(file.fileno()).st_size)
+                file.seek(0)
+                return {"": np.lib.format.read_array(file, allow_pickle=False)}
+            with zipfile.ZipFile(file) as archive:
+                return dict(_members(archive))
+        except UNREADABLE as error:
+            raise ValueError(first_line(error)) from error
+
+
+def _members(archive: zipfile.ZipFile) -> "Iterator[tuple[str, np.ndarray]]":
+    """Name and array of every member."""
+    import numpy as np
+
+    for info in archive.infolist():
+        if info.file_size > DEFLATED * info.compress_size:
+            raise ValueError(f"{info.filename} claims {info.file_size} bytes and has {info.compress_size}")
+        with archive.open(info) as member:
+            _check_array(member, info.file_size)
+        with archive.open(info) as member:
+            array = np.lib.format.read_array(member, allow_pickle=False)
+            member.read()  # the checksum is compared at the end
+        yield info.filename.removesuffix(".npy"), array
+
+
+def _check_array(file: IO[bytes], size: int) -> None:
+    """Raise ``ValueError`` unless what the header of an array promises is what follows it in ``size`` bytes."""
+    from numpy.lib import format as npy
+
+    version = npy.read_magic(file)
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = read(file)
+    need, there = math.prod(shape) * dtype.itemsize, size - file.tell()
+    if dtype.hasobject or min(shape, default=0) < 0 or need != there:
+        raise ValueError(f"an array of {dtype}{list(shape)} takes {need} bytes, got {there}")
+
+
+def file_name(text: str) -> str:
+    """A text as the name of a file: as it is where it can be one anywhere, otherwise without what cannot."""
+    clean = re.sub(r"[^\w.+-]", "-", text, flags=re.ASCII).lstrip(".-")[:LONGEST_NAME]
+    return clean if clean == text else f"{clean}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"  # told apart by that
+
+
 def first_line(error: BaseException) -> str:
-    """What an error says in its first line, without the full stop; the name of its class where it says nothing."""
+    """What an error says in its first line, without the full stop; the name of its class where it says nothing.
+
+    Of one of the system, its words alone, without number and file.
+    """
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from deimos.checks import check_positive
-from deimos.files import UNREADABLE, write_whole
+from deimos.files import UNREADABLE, first_line, load_arrays, write_whole
 
 SCHEMA = 1  # of the file that ``Terrain.save`` writes
 FARTHEST = 1e6  # [m] from the origin, and up and down; float32 tells 6 cm there
@@ -67,20 +67,20 @@ class Terrain:
             OSError: If it cannot be read.
             ValueError: If it is not such a file.
         """
-        with Path(path).open("rb") as stream:
-            try:
-                with np.load(stream, allow_pickle=False) as file:
-                    data: dict[str, Any] = {name: file[name] for name in file.files}
-                if data.pop("schema") != SCHEMA:
-                    raise ValueError("it is of another version")
-                data["shapes"] = tuple(str(name) for name in data["shapes"])
-                data["corner"] = tuple(float(value) for value in data["corner"])
-                return Terrain(**data | {name: float(data[name]) for name in ("cell", "tile")})
-            except (*UNREADABLE, MemoryError) as error:
-                raise ValueError(
-                    f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({str(error).rstrip('.')}); "
-                    "files of other programs are imported first: deimos terrain import."
-                ) from error
+        try:
+            data: dict[str, Any] = load_arrays(Path(path))
+            if data.pop("schema") != SCHEMA:
+                raise ValueError("it is of another version")
+            data["shapes"] = tuple(str(name) for name in data["shapes"])
+            data["corner"] = tuple(float(value) for value in data["corner"])
+            return Terrain(**data | {name: float(data[name]) for name in ("cell", "tile")})
+        except OSError:
+            raise
+        except UNREADABLE as error:
+            raise ValueError(
+                f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({first_line(error)}); "
+                "files of other programs are imported first: deimos terrain import."
+            ) from error
 
 
 def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:

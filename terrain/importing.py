@@ -9,7 +9,7 @@ import numpy as np
 from deimos.kernels.ray_cast import SNAP
 
 from deimos.checks import check_positive, check_range
-from deimos.files import UNREADABLE, first_line
+from deimos.files import first_line, load_arrays, open_file
 
 from .export import GREY_NOTE
 from .grid import FARTHEST, Terrain, check_heights, on_ground
@@ -109,9 +109,9 @@ def _check_options(path: Path, takes: Sequence[str], options: dict[str, Any]) ->
 def _is_terrain(path: Path) -> bool:
     """Whether a file is one of ``Terrain.save``."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_file(path) as file, zipfile.ZipFile(file) as archive:
             return "schema.npy" in archive.namelist()
-    except zipfile.BadZipFile:
+    except (zipfile.BadZipFile, NotImplementedError, ValueError):  # of a broken one too
         return False
 
 
@@ -119,7 +119,7 @@ def _read_mesh(path: Path, cell: float, scale: float, device: str) -> _Field:
     """Rasterise a mesh from its lowest to its highest x and y."""
     import trimesh
 
-    with path.open("rb") as file:
+    with open_file(path) as file:
         try:
             mesh = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), process=False, skip_materials=True)
         except Exception as error:  # its readers raise whatever a broken file makes them stumble over
@@ -151,7 +151,7 @@ def _read_picture(path: Path, resolution: float | None, height_range: tuple[floa
     """Grey values as heights; what the picture says of them holds where the arguments say nothing."""
     from PIL import Image
 
-    with path.open("rb") as file:
+    with open_file(path) as file:
         try:
             with Image.open(file) as image:
                 mode, grey = image.mode, np.asarray(image)
@@ -174,13 +174,10 @@ def _read_picture(path: Path, resolution: float | None, height_range: tuple[floa
 
 def _read_array(path: Path, cell: float) -> _Field:
     """The one array of a NumPy file, around the origin."""
-    with path.open("rb") as file:
-        try:
-            found = np.load(file, allow_pickle=False)
-            members = [found] if isinstance(found, np.ndarray) else [found[name] for name in found.files]
-        except UNREADABLE as error:
-            raise ValueError(f"it is no NumPy file of numbers, or it is broken ({first_line(error)}).") from error
-    arrays = [member if isinstance(member, np.ndarray) else np.array(member) for member in members]  # some are bytes
+    try:
+        arrays = [*load_arrays(path).values()]
+    except ValueError as error:
+        raise ValueError(f"it is no NumPy file of numbers, or it is broken ({error}).") from error
     if len(arrays) != 1 or arrays[0].ndim != 2 or arrays[0].dtype.kind not in "fiu":
         shapes = ", ".join(f"{array.dtype}{list(array.shape)}" for array in arrays)
         raise ValueError(f"it must hold one array of numbers with two axes, got {shapes}.")

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from deimos.checks import RunError
+from deimos.lock import hold
 from deimos.run.evaluation import evaluate
 from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.folder import StudyFolder
-from deimos.study.lock import hold
 
 STUDY = """
 seeds = 1

@@ -12,12 +12,12 @@ import pytest
 
 import deimos
 from deimos.checks import RunError
+from deimos.lock import hold
 from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.engine import LocalProcesses, last_words
 from deimos.study.folder import StudyFolder
-from deimos.study.lock import hold
 from deimos.study.results import result
 from deimos.study.runner import Runner
 

@@ -175,9 +175,9 @@ FLAT = partial(np.save, arr=np.zeros((50, 50)))
 @pytest.mark.parametrize(
     ("name", "make", "options", "message"),
     [
-        ("a.npz", of_other_things("a.txt"), {}, "it must hold one array of numbers with two axes, got |S5[]"),
+        ("a.npz", of_other_things("a.txt"), {}, "it is no NumPy file of numbers, or it is broken (EOF"),
         ("a.npz", of_other_things("schema.npy"), {}, "is not a terrain file of version 1, or it is broken"),
-        ("a.npy", boundless, {}, "it does not fit in memory (Unable to allocate 728. TiB"),
+        ("a.npy", boundless, {}, "float64[10000000, 10000000] takes 800000000000000 bytes, got 0)"),
         ("a.npy", lambda path: np.save(path, np.full((3, 3), 1e300)), {}, "heights must be finite everywhere, and"),
         ("a.npy", FLAT, {"tile": 1e-9}, "tile must be at least 0.05 m, the distance of two samples, got 1e-09 m"),
         ("a.npy", FLAT, {"resolution": 1e300}, "resolution must be in [1e-06, 1e+06], got 1e+300"),

@@ -11,6 +11,7 @@ import gc
 import importlib.util
 import io
 import os
+import signal
 import sys
 import threading
 import warnings
@@ -50,7 +51,8 @@ def main(arguments: list[str] | None = None) -> int:
     hook, threading.excepthook = threading.excepthook, _skip_file_errors
     spell, warnings.formatwarning = warnings.formatwarning, _spell_warning
     try:
-        _run(arguments)
+        with console.on_signals(console.raise_stopped):
+            _run(arguments)
         sys.stdout.flush()  # what cannot be written is said here, and not by Python when it ends
     except BrokenPipeError:  # whoever read has read enough
         return BROKEN_PIPE
@@ -61,18 +63,36 @@ def main(arguments: list[str] | None = None) -> int:
         if package not in EXTRAS:
             raise
         return _fail(f"This needs {package}, which is not installed: pip install 'deimos-rl[{EXTRAS[package]}]'")
+    except ImportError as error:
+        return _fail(f"{error.name or 'A library'} cannot be loaded ({error}).")
     except OSError as error:
         what = error.filename or "A file or the output"
         return _fail(f"{what} could not be read or written ({error.strerror or error}).")
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
+        number = interrupt.args[0] if isinstance(interrupt, console.Stopped) else signal.SIGINT
         _fail("Interrupted; files written so far are intact.")
-        return 130
+        return 128 + number
+    except (MemoryError, RuntimeError, ValueError) as error:
+        if reason := _shortage(error):
+            return _fail(reason)
+        raise
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0
     finally:
         threading.excepthook, warnings.formatwarning = hook, spell
         _drop_broken_streams()
     return 0
+
+
+def _shortage(error: BaseException) -> str:
+    """What the system did not give, if that is what an error is about."""
+    if "can't start new thread" in str(error):  # Python's words
+        return "The system does not let this process start another thread; see ulimit -u, or use fewer --threads."
+    if isinstance(error, MemoryError):
+        return "There is not enough memory for this, or the limit of this process (ulimit -v) is too low."
+    from deimos.run.memory import is_shortage
+
+    return f"There is not enough memory for this ({error})." if is_shortage(error) else ""
 
 
 def _prepare_process() -> None:

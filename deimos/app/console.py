@@ -17,6 +17,7 @@ import signal
 import sys
 import tempfile
 import textwrap
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
@@ -253,20 +254,51 @@ def number(value: float, digits: int = 3) -> str:
     return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
+class Stopped(KeyboardInterrupt):
+    """A signal asked this process to end; its one argument is the signal's number."""
+
+
 @contextlib.contextmanager
-def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C end the iteration instead of cutting it; a second one cuts."""
+def stop_on_interrupt() -> Iterator[Callable[[], int]]:
+    """Let Ctrl-C, SIGTERM and SIGHUP end the iteration instead of cutting it; a second one cuts.
+
+    Gives a function that returns the number of the signal that came, or 0.
+    """
     asked: list[int] = []
+    with contextlib.ExitStack() as stack:
 
-    def ask(number: int, frame: Any) -> None:
-        asked.append(number)
-        signal.signal(signal.SIGINT, before)
+        def ask(number: int, frame: Any) -> None:
+            asked.append(number)
+            stack.close()  # the next one finds what was there before
 
-    before = signal.signal(signal.SIGINT, ask)
+        stack.enter_context(on_signals(ask))
+        yield lambda: asked[0] if asked else 0
+
+
+@contextlib.contextmanager
+def on_signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Have a function called on Ctrl-C and on what clusters and terminals send before they are gone.
+
+    Signals reach the main thread alone; in others nothing is changed. A SIGHUP that is ignored, as under nohup, stays
+    so.
+    """
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.getsignal(number) for number in numbers}
+        before = {n: known for n, known in before.items() if n == signal.SIGINT or known is not signal.SIG_IGN}
     try:
-        yield lambda: bool(asked)
+        for number in before:
+            signal.signal(number, handler)
+        yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, known in before.items():
+            signal.signal(number, known)
+
+
+def raise_stopped(number: int, frame: Any) -> None:
+    """A handler of signals: raises ``Stopped``."""
+    raise Stopped(number)
 
 
 def quiet_warp() -> None:

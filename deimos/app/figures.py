@@ -10,6 +10,7 @@ from deimos.app.console import number
 from deimos.app.findings import conditions, heading, percent, wilson
 from deimos.files import write_whole
 from deimos.goals.calibration import reliability
+from deimos.run.evaluation import read_evaluation
 from deimos.run.folder import RunFolder
 
 if TYPE_CHECKING:
@@ -50,8 +51,7 @@ def draw_summary(folder: RunFolder, title: str, weights: str) -> None:
     from matplotlib.figure import Figure
 
     rows = folder.read_csv("progress.csv")
-    evaluated = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
-    evaluated = [row for row in evaluated if row["weights"] == weights]
+    evaluated = [row for row in read_evaluation(folder) if row["weights"] == weights]
     curves = [curve for curve in CURVES if any(row.get(curve[0]) for row in rows)]
     if curves[-1:] == [FEAR]:
         curves.remove(VALUES)

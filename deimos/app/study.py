@@ -1,5 +1,6 @@
 """``deimos study``: the commands of ``deimos.study.cli``."""
 
+import signal
 from functools import partial
 from typing import Any
 
@@ -17,6 +18,9 @@ def _run(options: Any, arguments: list[str], program: str) -> None:
     parsed = console.parse(options, arguments, program)
     if isinstance(parsed, LONG):
         with console.stop_on_interrupt() as stopped, console.progress("study") as report:
-            parsed.run(stopped, report)
+            try:
+                parsed.run(lambda: bool(stopped()), report)
+            except SystemExit:
+                raise SystemExit(128 + (stopped() or signal.SIGINT)) from None
     else:
         parsed.run()

@@ -1,6 +1,7 @@
 """``deimos train``: train a policy and evaluate it, or resume an earlier run."""
 
 import contextlib
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, make_dataclass
@@ -93,7 +94,7 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
             finished = training.train(trainer, folder, report, stopped)
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
-            raise SystemExit(130)
+            raise SystemExit(128 + (stopped() or signal.SIGINT))
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
         parts = [f"{name} {seconds / total:.0%}" for name, seconds in trainer.seconds.items()]

@@ -36,6 +36,7 @@ class GoalCore(Stateful):
     """
 
     saved = ("selector", "interactions", "weight", "percentile", "_delivered", "_steps")
+    unknown = ("percentile", "_delivered")
 
     def __init__(self, selector: GoalSelector, spaces: Spaces, window: int | None = None) -> None:
         self.selector = selector

@@ -80,6 +80,7 @@ class FearSelector(GoalSelector):
     saved: ClassVar[tuple[str, ...]] = (
         "fear", "memory", "calibration", "_learnt_at", "_age", "_auroc", "_issued", "_chosen",
     )  # fmt: skip
+    unknown: ClassVar[tuple[str, ...]] = ("_auroc",)
 
     def __init__(self, config: FearSelectorConfig, spaces: Spaces, seed: int) -> None:
         self.config = config

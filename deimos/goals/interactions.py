@@ -71,6 +71,7 @@ class Interactions(Stateful):
     """
 
     saved = ("now", "active", "_pending", "issued_at", "_horizon", "_ring", "_marks", "_cursor")
+    unknown = ("_pending", "_ring")  # scores
 
     def __init__(
         self, num_envs: int, state_dim: int, goal_dim: int, capacity: int, window: int, device: torch.device,

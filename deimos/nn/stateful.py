@@ -1,5 +1,7 @@
 """What a bit-exact resume needs, by the names of attributes."""
 
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -18,6 +20,9 @@ class Stateful:
 
     saved: ClassVar[tuple[str, ...]] = ()
     """Names of the attributes; ``state_dict`` has them without a leading underscore."""
+    unknown: ClassVar[tuple[str, ...]] = ()
+    """Names of those among them where NaN or an infinity says that something is not known, or not there. All other
+    numbers must be finite, or the run stops."""
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
@@ -32,6 +37,12 @@ class Stateful:
         """
         for name in self.saved:
             setattr(self, name, _restored(getattr(self, name), state[name.lstrip("_")]))
+
+    def must_be_finite(self) -> Mapping[str, Any]:
+        """By name, what ``state_dict`` is made of, but for ``unknown``."""
+        if type(self).state_dict is not Stateful.state_dict:  # its own, which may hold anything
+            return self.state_dict()
+        return {name.lstrip("_"): getattr(self, name) for name in self.saved if name not in self.unknown}
 
 
 def _state(value: Any) -> Any:
@@ -64,3 +75,28 @@ def _restored(value: Any, state: Any) -> Any:
     else:
         return list(state) if isinstance(state, list) else state
     return value
+
+
+def not_finite(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
+    """Names and tensors of what ``value`` would save in which a number is not finite that must be; see ``unknown``.
+
+    Args:
+        name: What ``value`` is called.
+        value: Anything that an attribute of ``Stateful.saved`` may be, or a mapping of such.
+    """
+    if isinstance(value, float):
+        value = torch.tensor(value) if not math.isfinite(value) else None
+    if isinstance(value, Tensor):
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            yield name, value.detach()
+        return
+    if isinstance(value, nn.Module):
+        parts: Any = weights_of(value)
+    elif isinstance(value, tuple | list):
+        parts = {str(i): item for i, item in enumerate(value)}
+    elif isinstance(value, Stateful):
+        parts = value.must_be_finite()
+    else:
+        parts = value.state_dict() if hasattr(value, "state_dict") else value
+    for key, part in parts.items() if isinstance(parts, Mapping) else ():
+        yield from not_finite(f"{name}.{key}".lstrip("."), part)

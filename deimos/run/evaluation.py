@@ -12,21 +12,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from deimos.checks import RunError, check_at_least, check_range
+from deimos.files import open_file
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.learn.policy import load_policy
 from deimos.nn.threads import torch_on_one
+from deimos.run import memory
 from deimos.run.attack import Attack, Policy, Target, attacker, uniform_goals
 from deimos.run.config import to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop
 from deimos.sim.env import Env, EnvConfig
+
+EVALUATION = "evaluation.json"
+_ROW: dict[str, Any] = {
+    "goals": str, "weights": str, "worlds": int, "steps": int, "goal_period": int,
+    "crash_rate": int | float | None, "score": int | float | None,
+}  # fmt: skip
+"""What every row of it says, and of what kind that is."""
 
 Progress = Callable[[str, float], None]
 """Called now and then with the stage's name and the share of it that is done."""
@@ -95,7 +105,7 @@ def evaluate_run(
     policy = load_policy(folder.path, str(device))
     env_config = env_config.resolved(device)
     weights = {"weights": weights_hash(policy.actor)}
-    known = folder.read_json("evaluation.json") if (folder.path / "evaluation.json").exists() else []
+    known = read_evaluation(folder)
     identities = [(identity | weights).items() for identity in _identities(env_config, config)]
     same = [row for row in known if any(row.items() >= identity for identity in identities)]
     if len(same) == len(identities) and not again:
@@ -103,8 +113,39 @@ def evaluate_run(
     with torch_on_one():
         there = [] if again else same
         fresh = [row | weights for row in evaluate(policy.scaled, env_config, config, device, progress, known=there)]
-    folder.write_json("evaluation.json", [row for row in known if row not in same] + fresh)
+    with folder.adding(EVALUATION):
+        others = [row for row in read_evaluation(folder) if row not in same]  # another process may have added some
+        folder.write_json(EVALUATION, others + fresh)
     return fresh
+
+
+def read_evaluation(folder: RunFolder) -> list[dict]:
+    """The rows of a run's ``evaluation.json``; none if there is no such file.
+
+    Raises:
+        RunError: If it cannot be read, or a row lacks what it is told by.
+    """
+    rows = folder.read_rows(EVALUATION)
+    for number, row in enumerate(rows, 1):
+        for name, kinds in _ROW.items():
+            if not isinstance(row.get(name), kinds) or isinstance(row.get(name), bool):
+                words = "a text" if kinds is str else "a number"
+                raise RunError(
+                    f"{folder.path / EVALUATION}, row {number}: {name} must be {words}, got {row.get(name)!r:.80}."
+                )
+    return rows
+
+
+def check_memory(env_config: EnvConfig, config: EvalConfig, device: torch.device) -> None:
+    """Raise ``RunError`` for an evaluation that does not fit in memory: all its interactions are kept until its end."""
+    memory.require_worlds(config.worlds, 0, device)
+    budgets = [("steps", config.steps)]
+    budgets += [("adversary_steps", attacker(name).learning_steps(config.adversary_steps)) for name in config.attackers]
+    for name, steps in budgets:
+        memory.require_interactions(
+            "The interactions of an evaluation", config.worlds, steps, env_config.goal_period, device,
+            f"use fewer worlds, or lower {name}",
+        )  # fmt: skip
 
 
 def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
@@ -116,7 +157,7 @@ def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
 
     here = {row.get("engine") for row in rows}
     same = [identity(row) for row in rows]
-    known = folder.read_json("evaluation.json")
+    known = read_evaluation(folder)
     return [row for row in known if row.get("engine") not in here and identity(row) in same]
 
 
@@ -161,7 +202,8 @@ def _setting(shared: dict, config: EvalConfig, name: str) -> str:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        with open_file(path) as file:
+            return file.read()
     except OSError as error:
         raise RunError(f"{path} cannot be read ({error.strerror}).") from error
 
@@ -192,6 +234,7 @@ def evaluate(
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
     """
     env_config = env_config.for_evaluation().resolved(device)
+    check_memory(env_config, config, device)
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
     target = make_target(policy, env_config, config, device)

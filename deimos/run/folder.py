@@ -4,12 +4,19 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable
+import numbers
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 from deimos.checks import RunError
-from deimos.files import first_line, write_whole
+from deimos.files import first_line, open_file, remove_partial, write_whole
+from deimos.lock import hold
+
+OF_TRAINING = ("config.json", "checkpoint.pt", "policy.pt", "progress.csv", "timing.csv")
+"""Files that only the process that trains writes."""
+PATIENCE_SECONDS = 60.0  # to add to a file that another process is just adding to
 
 
 class RunFolder:
@@ -20,6 +27,7 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._columns: dict[str, list[str]] = {}  # of the files that were added to
 
     @classmethod
     def create(cls, path: Path) -> "RunFolder":
@@ -40,6 +48,18 @@ class RunFolder:
             raise RunError(f"{path} is not a run folder: it holds no config.json.")
         return cls(path)
 
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Hold the run as the only process that trains it; ``RunError`` if another does."""
+        with hold(self.path / "lock", str(self.path)):
+            for name in OF_TRAINING:
+                remove_partial(self.path / name)
+            yield
+
+    def adding(self, name: str) -> AbstractContextManager[None]:
+        """Hold a file while something is added to it; waits for another process that is just doing so."""
+        return hold(self.path / f"{name}.lock", str(self.path / name), patience=PATIENCE_SECONDS)
+
     def write_json(self, name: str, data: Any) -> None:
         """Write a JSON file whole or not at all; NaN becomes null."""
         text = json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n"
@@ -48,9 +68,22 @@ class RunFolder:
     def read_json(self, name: str) -> Any:
         """Read a JSON file, which must be there and be JSON."""
         try:
-            return json.loads((self.path / name).read_text())
-        except (OSError, ValueError) as error:
+            with open_file(self.path / name) as file:
+                return json.loads(file.read())
+        except (OSError, ValueError, RecursionError) as error:  # the last where it is nested too deeply
             raise RunError(f"{self.path / name} cannot be read ({first_line(error)}).") from error
+
+    def read_rows(self, name: str) -> list[dict[str, Any]]:
+        """Read a JSON file of rows: a list of tables; none if there is no file."""
+        if not (self.path / name).exists():
+            return []
+        rows = self.read_json(name)
+        if not isinstance(rows, list):
+            raise RunError(f"{self.path / name} must hold a list of rows, got {type(rows).__name__}.")
+        for number, row in enumerate(rows, 1):
+            if not isinstance(row, dict):
+                raise RunError(f"{self.path / name}, row {number}: it must be a table, got {type(row).__name__}.")
+        return rows
 
     def keep(self, name: str, read: Callable[[], tuple[bytes, str]]) -> str:
         """Copy a file that a run is built from; gives what the copy is called.
@@ -67,37 +100,103 @@ class RunFolder:
         return name + ending
 
     def read_csv(self, name: str) -> list[dict[str, str]]:
-        """All whole rows of a CSV file; none if there is no file."""
+        """All rows of a CSV file, each of numbers or empty cells; none if there is no file.
+
+        A last line without its end is that of a killed run, and left out.
+
+        Raises:
+            RunError: If it cannot be read, or is damaged; the message names the line.
+        """
         path = self.path / name
-        if not path.is_file():
+        if not path.exists():
             return []
-        with path.open(newline="") as file:
-            return [row for row in csv.DictReader(file) if None not in row.values()]
+        try:
+            with open_file(path) as file:
+                return list(_rows(file.read()))
+        except OSError as error:
+            raise RunError(f"{path} cannot be read ({error.strerror}).") from error
+        except ValueError as error:
+            way_out = "mend it, or move it away: the run goes on without it."
+            raise RunError(f"{path}, {first_line(error)}; {way_out}") from error
 
     def cut_csv(self, name: str, iteration: int) -> None:
-        """Drop the rows after an iteration: a resumed run writes them again."""
-        rows = [row for row in self.read_csv(name) if int(row["iteration"]) <= iteration]
-        if not rows:
-            (self.path / name).unlink(missing_ok=True)
-            return
+        """Drop the rows after an iteration, and half a line: a resumed run writes them again."""
+        rows = self.read_csv(name)
+        kept = [row for row in rows if int(row["iteration"]) <= iteration]
+        path = self.path / name
+        if not kept:
+            path.unlink(missing_ok=True)
+        elif len(kept) < len(rows) or not path.read_bytes().endswith(b"\n"):
+            self._write_csv(name, kept[0], kept)
+
+    def append_csv(self, name: str, row: dict[str, float]) -> None:
+        """Add a row, and columns that are new in it; NaN becomes an empty cell.
+
+        Raises:
+            RunError: If it cannot be written.
+            TypeError: If a value is no number.
+        """
+        path = self.path / name
+        cells = {key: _cell(key, value) for key, value in row.items()}
+        if name not in self._columns:
+            self._columns[name] = [*next(iter(self.read_csv(name)), {})]
+        columns = self._columns[name]
+        if columns and (new := [key for key in row if key not in columns]):  # of a version that says more
+            columns += new
+            self._write_csv(name, columns, self.read_csv(name))
+        try:
+            with open_file(path, "a", newline="") as file:
+                writer = csv.DictWriter(file, columns or [*row], restval="")
+                if not columns:
+                    columns += row
+                    writer.writeheader()
+                writer.writerow(cells)
+        except OSError as error:
+            raise RunError(f"{path} could not be written ({error.strerror}); the last checkpoint is whole.") from error
+
+    def _write_csv(self, name: str, columns: Iterable[str], rows: Iterable[dict[str, str]]) -> None:
         text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, rows[0])
+        writer = csv.DictWriter(text, [*columns], restval="")
         writer.writeheader()
         writer.writerows(rows)
         write_whole(self.path / name, lambda file: file.write(text.getvalue().encode()))
 
-    def append_csv(self, name: str, row: dict[str, float]) -> None:
-        """Add a row, and a header where there is none yet; NaN becomes an empty cell."""
-        path = self.path / name
+
+def _cell(name: str, value: Any) -> str:
+    """A number as it is written, those of NumPy and one-element tensors as those of Python; NaN as nothing."""
+    if isinstance(value, numbers.Integral):
+        return repr(int(value))
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be a number, got {value!r}.") from error
+    return "" if math.isnan(number) else repr(number)
+
+
+def _rows(data: bytes) -> Iterator[dict[str, str]]:
+    """The rows of a CSV file of numbers whose iterations grow; ``ValueError`` names the first line that is none."""
+    lines = data.decode("utf-8-sig", "surrogateescape").split("\n")[:-1]  # after the last end there is half a line
+    columns: list[str] = []
+    last = 0
+    for number, line in enumerate(lines, 1):
         try:
-            is_new = not path.exists() or path.stat().st_size == 0
-            with path.open("a", newline="") as file:
-                writer = csv.writer(file)
-                if is_new:
-                    writer.writerow(row)
-                writer.writerow(["" if isinstance(v, float) and math.isnan(v) else repr(v) for v in row.values()])
-        except OSError as error:
-            raise RunError(f"{path} could not be written ({error.strerror}); the last checkpoint is whole.") from error
+            (cells,) = csv.reader([line.removesuffix("\r")], strict=True)
+            if not columns:
+                if "iteration" not in cells or len(set(cells)) < len(cells) or not all(map(str.isprintable, cells)):
+                    raise ValueError("the names of the columns, iteration among them, are missing or damaged")
+                columns = cells
+                continue
+            if len(cells) != len(columns):
+                raise ValueError(f"it must have {len(columns)} cells, got {len(cells)}")
+            row = dict(zip(columns, cells, strict=True))
+            for cell in filter(None, cells):
+                float(cell)
+            if not int(row["iteration"]) > last:
+                raise ValueError(f"its iteration must be above {last}, got {row['iteration']}")
+            last = int(row["iteration"])
+        except (csv.Error, ValueError) as error:
+            raise ValueError(f"line {number}: {ascii(first_line(error))[1:-1]}") from error
+        yield row
 
 
 def _without_nan(data: Any) -> Any:

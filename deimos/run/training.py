@@ -1,8 +1,6 @@
 """From nothing or from a checkpoint to a trained policy: how a run begins, resumes, is saved and ends."""
 
-import os
 import platform
-import re
 import shutil
 import subprocess
 import time
@@ -18,20 +16,18 @@ from deimos import __version__
 from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
+from deimos.run import memory
 from deimos.run.branch import check_branch
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.cores import cores
+from deimos.run.evaluation import check_memory
+from deimos.run.failure import check_finite, dumped
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 
 SCHEMA = 1  # of config.json
 CHECKPOINT_SCHEMA = 3  # of checkpoint.pt; of earlier ones the networks can be loaded, but not the rest
 CHECKPOINT_SECONDS = 30.0
-_NO_MEMORY = re.compile(
-    "out of memory|allocate|alloc_failed|allowed dimension|too big|storage size|representable", re.IGNORECASE
-)
-"""How Warp, torch and NumPy each say that an array does not fit."""
-LEAST_BYTES = 100  # of any transition, and of any world
 
 
 def resolve_device(name: str) -> torch.device:
@@ -129,31 +125,18 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
     Raises:
         RunError: If its worlds do not fit in memory, or what the configuration names is not there or does not fit.
     """
-    _check_memory(config)
+    memory.require_worlds(config.num_envs, config.ppo.num_steps, device)
+    if config.evaluation:
+        check_memory(config.env, config.eval, device)
     try:
-        return Trainer(config, device)
+        trainer = Trainer(config, device)
     except (MemoryError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        if isinstance(error, MemoryError) or _NO_MEMORY.search(reason):
+        reason = one_line(error) or type(error).__name__
+        if memory.is_shortage(error):
             reason = f"{config.num_envs} worlds could not be allocated ({reason}); use fewer (num_envs)."
         raise RunError(reason) from error
-
-
-def _check_memory(config: TrainConfig) -> None:
-    """Raise ``RunError`` for what this machine cannot hold.
-
-    Systems promise more memory than they have, and would kill the process halfway.
-    """
-    if not hasattr(os, "sysconf"):
-        return
-    each = config.ppo.num_steps * LEAST_BYTES + LEAST_BYTES
-    need = config.num_envs * each
-    has = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if need > has:
-        raise RunError(
-            f"{config.num_envs} worlds need more than {need / 2**30:.0f} GiB of memory, each at least "
-            f"{each / 2**10:.0f} KiB, and this machine has {has / 2**30:.0f} GiB; use fewer (num_envs)."
-        )
+    memory.require_candidates(config.num_envs, trainer.loop.selector.num_candidates, trainer.env.goal_dim, device)
+    return trainer
 
 
 def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
@@ -209,19 +192,18 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
         RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.
     """
     folder = RunFolder.open(path)
-    config = read_config(folder)
-    if env_steps is not None:
-        if env_steps < config.env_steps:
-            raise RunError(f"--env-steps must exceed the {config.env_steps} already set, got {env_steps}.")
-        config = replace(config, env_steps=env_steps)
-    if device is not None:
-        config = replace(config, device="cuda" if resolve_device(device).type == "cuda" else "cpu")
-    trainer = load(folder, config)
-    stored = folder.read_json("config.json")  # whose files keep the names that they were given by
-    stored["config"] |= {"env_steps": config.env_steps, "device": config.device}
-    folder.write_json("config.json", stored)
-    for name in ("progress.csv", "timing.csv"):
-        folder.cut_csv(name, trainer.iteration)
+    with folder.hold():
+        config = read_config(folder)
+        if env_steps is not None:
+            if env_steps < config.env_steps:
+                raise RunError(f"--env-steps must exceed the {config.env_steps} already set, got {env_steps}.")
+            config = replace(config, env_steps=env_steps)
+        if device is not None:
+            config = replace(config, device="cuda" if resolve_device(device).type == "cuda" else "cpu")
+        trainer = load(folder, config)
+        stored = folder.read_json("config.json")  # whose files keep the names that they were given by
+        stored["config"] |= {"env_steps": config.env_steps, "device": config.device}
+        folder.write_json("config.json", stored)
     return trainer, folder
 
 
@@ -253,8 +235,10 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     """Write the checkpoint and the policy.
 
     Raises:
+        SimulationError: If a number is not finite that must be; the previous ones are intact.
         RunError: If they cannot be written; the previous ones are intact.
     """
+    check_finite(trainer)
     save_tensors(folder.path / "checkpoint.pt", {"schema": CHECKPOINT_SCHEMA, **trainer.state_dict()})
     ppo, env = trainer.config.ppo, trainer.env
     policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
@@ -267,13 +251,25 @@ def train(
 ) -> bool:  # fmt: skip
     """Run all iterations that are left, and return whether the budget was used up.
 
-    After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true
-    ends the run early, with a checkpoint.
+    Rows of later iterations that the folder has are written again. Meanwhile no other process can train the run. After
+    every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true ends the
+    run early, with a checkpoint.
 
     Raises:
-        SimulationError: If a number is not finite; the last checkpoint is intact.
-        RunError: If a file cannot be written; the last checkpoint is intact.
+        SimulationError: If a number is not finite; the last checkpoint is intact, and ``failure.json`` has the details.
+        RunError: If a file cannot be written, in which case the last checkpoint is intact; or another process trains
+            the run.
     """
+    with folder.hold(), dumped(trainer, folder, provenance):
+        for name in ("progress.csv", "timing.csv"):
+            folder.cut_csv(name, trainer.iteration)
+        return _iterate(trainer, folder, report, stopped)
+
+
+def _iterate(
+    trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None], stopped: Callable[[], bool]
+) -> bool:
+    """See ``train``."""
     from torch.utils.tensorboard import SummaryWriter
 
     transitions = trainer.rollout.reward.numel()

@@ -17,6 +17,7 @@ import torch
 
 from deimos.checks import RunError, SimulationError, one_line
 from deimos.goals.fear_selector import fear_selector
+from deimos.lock import hold
 from deimos.run import training
 from deimos.run.attack import attacker
 from deimos.run.attackers.pooled import save_fear
@@ -26,7 +27,6 @@ from deimos.run.trainer import Trainer
 from deimos.sim.shared import one_stream
 from deimos.study.audits import Audits, speed
 from deimos.study.folder import FEAR, StudyFolder
-from deimos.study.lock import hold
 from deimos.study.plan import Cell
 from deimos.study.results import evaluated, result
 from deimos.study.source import check_sources, code

@@ -265,9 +265,10 @@ class ShowOptions(_FolderOptions):
                 format(median(values[column]), form) if values[column] else "-" for column, form in columns.items()
             ]
             table.add_row(environment, name, goals, str(period), str(len(group)), *medians)
-        screen = Console()
+        screen = Console(markup=False, emoji=False)  # names are data
         needed = Measurement.get(screen, screen.options.update(width=WIDEST), table).maximum
-        Console(width=max(screen.width, needed)).print(table)  # the terminal wraps what does not fit; nothing is cut
+        screen.width = max(screen.width, needed)  # the terminal wraps what does not fit; nothing is cut
+        screen.print(table)
         _say_strays(study)
         if cells:
             finished = study.finished(cells)

@@ -5,6 +5,7 @@ A text is a heading (``## ...``), a list (lines of ``* ...``) or a paragraph, as
 
 import base64
 import html
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,9 +75,15 @@ def to_markdown(blocks: Sequence[Block], pictures: str) -> str:
 def _markdown(block: Block, pictures: str) -> str:
     match block:
         case str():
-            return block
+            return _plain(block)
         case Picture(name, caption):
-            return f"![{caption}]({pictures}/{name}.png)"
+            return f"![{_plain(caption)}]({pictures}/{name}.png)"
         case rows:
             lines = [rows[0], ["---"] * len(rows[0]), *(row.values() for row in rows)]
-            return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+            shown = ([_plain(cell).replace("|", "\\|") for cell in line] for line in lines)
+            return "\n".join("| " + " | ".join(line) + " |" for line in shown)
+
+
+def _plain(text: str) -> str:
+    """A text in which nothing is a tag of HTML, which Markdown would let through."""
+    return re.sub("<(?=[A-Za-z/!?])", "&lt;", text)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from deimos.files import file_name
 from deimos.study.data import Data, Style
 from deimos.study.document import Block, Picture
 from deimos.study.stats import Array
@@ -30,6 +31,7 @@ WINDOW = 0.05  # of the training, for the rolling mean
 PRINT = {
     "font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5,
     "legend.fontsize": 7.5, "figure.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False,
+    "text.parse_math": False,  # a dollar in a name is a dollar
 }  # fmt: skip
 
 Figures = dict[str, tuple[str, "Figure | None"]]
@@ -48,7 +50,8 @@ def write(figures: Figures, folder: Path) -> list[Block]:
     import matplotlib
 
     blocks: list[Block] = []
-    for name, (caption, figure) in figures.items():
+    for title, (caption, figure) in figures.items():
+        name = file_name(title)
         if figure is None:
             blocks.append(f"There are no data for this figure: {caption}")
             continue

@@ -13,9 +13,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from deimos.checks import RunError, one_line
+from deimos.lock import hold
 from deimos.run.config import from_dict, to_dict
 from deimos.run.folder import RunFolder
-from deimos.study.lock import hold
 from deimos.study.plan import AttackRound, Cell, read_cell
 from deimos.study.results import Results
 

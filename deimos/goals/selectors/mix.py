@@ -1,6 +1,8 @@
 """Some uniform goals among a method's own."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,6 +60,10 @@ class Mix(Delegate):
     def state_dict(self) -> dict:
         """See ``GoalSelector.state_dict``."""
         return self.current.state_dict()
+
+    def must_be_finite(self) -> Mapping[str, Any]:
+        """See ``GoalSelector.must_be_finite``."""
+        return self.current.must_be_finite()
 
     def load_state_dict(self, state: dict) -> None:
         """See ``GoalSelector.load_state_dict``."""

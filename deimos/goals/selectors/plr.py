@@ -56,6 +56,7 @@ class PLR(GoalSelector):
 
     needs_rollout = True
     saved = ("_level", "_score", "_made", "_seen", "_upto", "_carry", "_learnt_at", "replaying")
+    unknown = ("_score",)
 
     def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config

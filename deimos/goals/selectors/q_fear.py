@@ -45,6 +45,7 @@ class QFear(director.Director):
     config: Config
     inputs_per_row: ClassVar[int] = 2  # an interaction, and the worst that could follow it: NaN where nobody knows
     saved = (*director.Director.saved, "_worst")
+    unknown = (*director.Director.unknown, "_worst")
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         super().__init__(config, spaces, seed)

@@ -71,6 +71,7 @@ class RND(GoalSelector):
         "predictor", "target", "optimizer", "generator", "_uniform", "_moments", "_mean", "_scale", "_learnt_at",
         "fitted",
     )  # fmt: skip
+    unknown = ("_uniform",)
 
     @torch_on_one()  # orthogonal weights come from a decomposition whose sums depend on torch's threads
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:

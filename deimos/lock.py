@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO
 
 from deimos.checks import RunError
+from deimos.files import open_file
 
 POLL_SECONDS = 0.1
 
@@ -45,7 +46,7 @@ def hold(path: Path, what: str, *, patience: float = 0.0, one_machine: bool = Fa
     """
     with contextlib.ExitStack() as stack:
         try:
-            file = stack.enter_context(path.open("a+"))
+            file = stack.enter_context(open_file(path, "a+"))
             while not _is_taken(file):
                 if patience <= 0.0:
                     raise RunError(f"{what} is being worked on by {_holder(file)[1]}.")

@@ -9,14 +9,14 @@ import sys
 
 import pytest
 
+from deimos import lock
 from deimos.checks import RunError
-from deimos.study import lock
 
 TAKER = """
 import sys, time
 from pathlib import Path
 from deimos.checks import RunError
-from deimos.study.lock import hold
+from deimos.lock import hold
 folder = Path(sys.argv[1])
 while not (folder / "go").exists():
     time.sleep(0.001)

@@ -1,0 +1,87 @@
+"""What a run leaves behind when its numbers are no numbers any more, so that whoever mends it can see why."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from torch import Tensor
+
+from deimos.checks import RunError, SimulationError
+from deimos.files import save_tensors
+from deimos.learn.rollout import Rollout
+from deimos.nn.stateful import not_finite
+from deimos.run.folder import RunFolder
+from deimos.run.trainer import Trainer
+
+REPORT, STATE = "failure.json", "failure.pt"
+SHOWN = 16  # worlds, or places of another tensor, that the report lists
+SCHEMA = 1  # of both files
+
+
+def check_finite(trainer: Trainer) -> None:
+    """Raise ``SimulationError`` if a number is not finite that a checkpoint would keep and that must be."""
+    for name, tensor in not_finite("", _parts(trainer)):
+        count, where = int((~tensor.isfinite()).sum()), _places(tensor)[:1]
+        raise SimulationError(
+            f"Iteration {trainer.iteration}: {count} of the {tensor.numel()} numbers of {name} are not finite, the "
+            f"first in row {where[0] if where else 0}."
+        )
+
+
+def dump(trainer: Trainer, folder: RunFolder, error: SimulationError, versions: dict[str, str]) -> None:
+    """Write down what stopped a run: ``failure.json`` for reading, ``failure.pt`` with all its numbers.
+
+    The report lists every tensor with a number that is not finite: its shape, how many there are, and in which worlds
+    (or rows, where a tensor has no worlds); and the first steps of the rollout on which a world broke, with what it
+    observed and did before. The state holds the whole rollout.
+    """
+    rollout = {name: value for name, value in vars(trainer.rollout).items() if isinstance(value, Tensor)}
+    found = [*not_finite("", _parts(trainer)), *not_finite("rollout", rollout)]
+    report = {
+        "schema": SCHEMA, "error": str(error), "iteration": trainer.iteration, "versions": versions,
+        "not_finite": [
+            {"name": name, "shape": list(tensor.shape), "count": int((~tensor.isfinite()).sum()),
+             "worlds" if trainer.config.num_envs in tensor.shape else "rows": _places(tensor, trainer.config.num_envs)}
+            for name, tensor in found
+        ],
+        "invalid": _invalid(trainer.rollout),
+        "last_rows": folder.read_csv("progress.csv")[-10:],
+    }  # fmt: skip
+    folder.write_json(REPORT, report)
+    state = {"schema": SCHEMA, "error": str(error), "rollout": rollout, **trainer.state_dict()}
+    save_tensors(folder.path / STATE, state)
+
+
+def _invalid(rollout: Rollout) -> list[dict[str, Any]]:
+    """The first steps after which a world was no longer valid."""
+    steps = rollout.invalid.nonzero()[:SHOWN].tolist()
+    return [
+        {"step": t, "world": world, "obs": rollout.obs[t, world].tolist(), "action": rollout.action[t, world].tolist()}
+        for t, world in steps
+    ]
+
+
+def _parts(trainer: Trainer) -> dict[str, Any]:
+    return {"ppo": trainer.ppo, "env": trainer.env, "goals": trainer.loop.core}
+
+
+def _places(tensor: Tensor, worlds: int | None = None) -> list[int]:
+    """The first worlds with a number that is not finite; along the first axis where none has that many."""
+    axis = list(tensor.shape).index(worlds) if worlds is not None and worlds in tensor.shape else 0
+    if tensor.dim() == 0:
+        return [0]
+    bad = (~tensor.isfinite()).movedim(axis, 0).flatten(1).any(1) if tensor.dim() > 1 else ~tensor.isfinite()
+    return bad.nonzero().squeeze(1)[:SHOWN].tolist()
+
+
+@contextlib.contextmanager
+def dumped(trainer: Trainer, folder: RunFolder, versions: Callable[[], dict[str, str]]) -> Iterator[None]:
+    """Write down what a ``SimulationError`` within the context was about, and raise it with the place of the report."""
+    try:
+        yield
+    except SimulationError as error:
+        try:
+            dump(trainer, folder, error, versions())
+        except RunError:  # the disk is full too: the first error is the one to tell
+            raise error from None
+        raise SimulationError(f"{error} What it was about is in {folder.path / REPORT}.") from error
