@@ -93,11 +93,11 @@ def test_pool_is_part_of_what_a_cell_is_made_from(tmp_path):
     """The file of a pool counts by its content, and one that is missing or has changed is refused in one line."""
     pool = tmp_path / "pool.pt"
     with pytest.raises(RunError, match=r"pool\.pt cannot be read \(No such file"):
-        source.sources((), pool)
+        source.hashes((), {"pool": pool.read_bytes})
     pool.write_bytes(b"one")
-    made = source.sources((), pool)
+    made = source.hashes((), {"pool": pool.read_bytes}) | {"code": source.code().name}
     assert set(made) == {"code", "pool"}
-    source.check_sources("Cell x", made, (), pool)
+    source.check_sources("Cell x", made, (), {"pool": pool.read_bytes})
     pool.write_bytes(b"two")
     with pytest.raises(RunError, match="Cell x: the file of 'pool' is not the one that it was made with"):
-        source.check_sources("Cell x", made, (), pool)
+        source.check_sources("Cell x", made, (), {"pool": pool.read_bytes})

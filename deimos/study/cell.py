@@ -61,7 +61,7 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
         try:
             with one_stream(device):
                 if not (home / "result.json").exists():
-                    check_sources(f"Cell {cell.name}", cell.sources, cell.plugins, cell.config.eval.pool)
+                    check_sources(f"Cell {cell.name}", cell.sources, cell.plugins, cell.files)
                     if not _train(RunFolder(home), cell, device, stopped) or stopped():
                         return False
                     _finish(RunFolder(home), cell, device, watch)
@@ -80,7 +80,7 @@ def _train(home: RunFolder, cell: Cell, device: torch.device, stopped: Callable[
         trainer, folder = training.resume(path)
     else:
         shutil.rmtree(path, ignore_errors=True)  # it was killed before its first checkpoint
-        trainer, folder = training.start(cell.config, path, None)
+        trainer, folder = training.start(cell.config, path, branch_from=cell.branch_from)
     audits = Audits(home, trainer.config, cell.audit_worlds)
     if not training.train(trainer, folder, lambda row, fps: audits.after(trainer), stopped):
         return False
@@ -110,9 +110,10 @@ def _attack(study: StudyFolder, cell: Cell, device: torch.device, watch: Callabl
     """Evaluate a finished cell under the study's further attackers that it has not met, and add the rows."""
     home, made_by = RunFolder(study.cell_path(cell)), code().name
     for period, attackers in study.missing(cell).items():
-        if any(attacker(name).needs_pool for name in attackers):
-            pool = {name: value for name, value in cell.sources.items() if name == "pool"}
-            check_sources(f"Cell {cell.name}", pool | {"code": made_by}, (), cell.config.eval.pool)
+        used = {*cell.config.env.files} | ({"pool"} if any(attacker(name).needs_pool for name in attackers) else set())
+        wanted = {name: value for name, value in cell.sources.items() if name in used}
+        files = {name: read for name, read in cell.files.items() if name in used}
+        check_sources(f"Cell {cell.name}", wanted | {"code": made_by}, (), files)
         folder = RunFolder.open(home.path / "run")
         config = replace(cell.config.eval, attackers=attackers)
         rows = evaluate_run(folder, cell.config.env.with_goal_period(period), config, device, watch, again=False)

@@ -146,7 +146,7 @@ def _open(study: StudyFolder) -> list[plan.Cell]:
     left = [cell for cell in cells if cell.digest not in finished]
     untrained = [cell for cell in left if not (study.cell_path(cell) / "result.json").exists()]
     for cell in {tuple(sorted(cell.sources.items())): cell for cell in untrained}.values():
-        check_sources(f"Cell {cell.name}", cell.sources, cell.plugins, cell.config.eval.pool)
+        check_sources(f"Cell {cell.name}", cell.sources, cell.plugins, cell.files)
     return left
 
 

@@ -9,28 +9,29 @@ import typing
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial, reduce
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
 from deimos.checks import RunError, check_at_least, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
-from deimos.run import presets
+from deimos.run import presets, training
 from deimos.run.attack import attacker
+from deimos.run.branch import branch_config, check_branch
 from deimos.run.config import from_dict, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
 from deimos.study import factors
 from deimos.study.factors import merged
-from deimos.study.source import import_plugins, sources
+from deimos.study.source import Files, code, hashes, import_plugins
 from deimos.study.tables import check_keys, check_kind, shown
 
 SCHEMA = 2  # of cell.json
 MOST_SEEDS = 100_000
 _OWN: dict[str, tuple[type, type | None]] = {
-    "methods": (list, str), "train": (dict, None), "audit_worlds": (int, None),
+    "methods": (list, str), "train": (dict, None), "audit_worlds": (int, None), "branch_from": (str, None),
 }  # fmt: skip
 _KEYS: dict[str, tuple[type, type | None]] = _OWN | {
     "base": (str, None), "plugins": (list, str), "environment": (list, dict), "factors": (dict, None),
@@ -60,8 +61,10 @@ class Cell:
     """Worlds whose choices are audited at a time late in the training, at least 0; 0 for no audits."""
     plugins: tuple[str, ...] = ()
     """Modules that are imported before names are resolved."""
+    branch_from: Path | None = None
+    """Folder of the run that it branches off; ``None`` to begin from nothing."""
     sources: dict[str, str] = field(default_factory=dict)
-    """What the numbers depend on beside all this; see ``deimos.study.source.sources``."""
+    """What the numbers depend on beside all this: the ``code``, and by their SHA-256 the plugins and ``files``."""
 
     def __post_init__(self) -> None:
         check_at_least("audit_worlds", self.audit_worlds, 0)
@@ -90,10 +93,20 @@ class Cell:
         """The same of what the cells of one method must share: what the method's name stands for."""
         return _digest(selector=_spelled_out(self.config.goals))
 
+    @property
+    def files(self) -> Files:
+        """Those of its environment, the ``pool`` of its attackers, and the checkpoint that it branches off."""
+        env, pool = self.config.env, self.config.eval.pool
+        others = {"pool": pool, "branch_from": self.branch_from and self.branch_from / "checkpoint.pt"}
+        own: Files = {name: lambda name=name: env.read_file(name)[0] for name in env.files}
+        return {**own, **{name: path.read_bytes for name, path in others.items() if path}}
+
     def _config(self) -> dict:
-        """The run's configuration; the file of the pool is told by its hash, wherever it lies."""
+        """The run's configuration; files are told by their hashes, wherever they lie."""
         fields = to_dict(self.config)
-        return fields | {"eval": {name: value for name, value in fields["eval"].items() if name != "pool"}}
+        for part, left_out in (("env", self.config.env.files), ("eval", ("pool",))):
+            fields[part] = {name: value for name, value in fields[part].items() if name not in left_out}
+        return fields
 
     @cached_property
     def name(self) -> str:
@@ -142,6 +155,8 @@ def read(path: Path) -> dict:
     * ``environment``: for each environment or variant its ``name``, ``env`` (``kind`` and fields) and, if they differ
       there, ``methods``, ``train``, ``audit_worlds`` and ``goal_periods``; its ``preset`` is one of
       ``deimos.run.presets``, where its environment and settings come from that are not said;
+    * ``branch_from``: folder of a run that all cells branch off, or those of an environment (``deimos.run.branch``);
+      what is not said is as it was there, and critics learn first;
     * ``factors`` and ``design``: see ``deimos.study.factors``;
     * ``audit_worlds``: see ``Cell``;
     * ``plugins``: names of modules that register selectors, attackers or environments;
@@ -204,11 +219,9 @@ def expand(
             for index, point in enumerate(points)
             for cell in _environment(table, description, methods, train or {}, point, _place(index, len(points)))
         ]  # fmt: skip
-        made_from = cache(partial(sources, tuple(description.get("plugins", ()))))  # it asks git, once
-        return [
-            replace(cell, config=replace(cell.config, seed=seed), sources=made_from(cell.config.eval.pool))
-            for seed in numbers for cell in grid
-        ]  # fmt: skip
+        made_by = {"code": code().name}
+        grid = [replace(cell, sources=made_by | hashes(cell.plugins, cell.files)) for cell in grid]
+        return [replace(cell, config=replace(cell.config, seed=seed)) for seed in numbers for cell in grid]
     except (AttributeError, RecursionError, TypeError, ValueError) as error:  # of from_dict and the configurations
         raise RunError(one_line(error)) from error
 
@@ -232,20 +245,28 @@ def _environment(
     if not methods:
         raise RunError(f"Environment '{name}' has no methods.")
     _check_unique("method", methods)
+    origin = table.get("branch_from", study.get("branch_from"))
+    stored = None if origin is None else training.read_config(RunFolder.open(Path(origin)))
     try:
-        ready = _training_preset(table)
+        ready = _training_preset(table) if stored is None else _branch(table, stored)
         tried = point.fields.get("env", {})
         env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried)))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error
     fields = reduce(merged, (ready, {"threads": 1}, shared, own, train, point.fields, {"env": to_dict(env)}))
     configs = [from_dict(TrainConfig, fields | {"method": each}) for each in methods]
+    try:
+        for config in configs if stored else ():
+            check_branch(config, stored)
+    except ValueError as error:
+        raise RunError(f"Environment '{name}' cannot branch off {origin}: {error}") from error
     plugins = tuple(study.get("plugins", ()))
     worlds = table.get("audit_worlds", study.get("audit_worlds", Cell.audit_worlds))
     return [
         Cell(
             environment=name + place, config=config, goal_periods=tuple(table.get("goal_periods") or [env.goal_period]),
             base_environment=name, levels=point.levels, audit_worlds=worlds, plugins=plugins,
+            branch_from=None if origin is None else Path(origin),
         )
         for config in configs
     ]  # fmt: skip
@@ -288,8 +309,21 @@ def _training_preset(table: dict) -> dict:
     kind = table.get("env", {}).get("kind", presets.environment(name))
     if kind != presets.environment(name):
         raise ValueError(f"preset '{name}' is for {presets.environment(name)}, not for {kind}.")
-    fields = to_dict(presets.preset(name))
-    return {key: value for key, value in fields.items() if key == "env" or key not in _GRID | {"threads", "device"}}
+    return _settings(presets.preset(name))
+
+
+def _branch(table: dict, origin: TrainConfig) -> dict:
+    """The same of the run that an environment's cells branch off."""
+    if "preset" in table:
+        raise ValueError("preset and branch_from cannot be combined; a branch has the settings of its run.")
+    return _settings(branch_config(origin))
+
+
+def _settings(config: TrainConfig) -> dict:
+    """The fields of a training, but for the grid's and the machine's."""
+    return {
+        key: value for key, value in to_dict(config).items() if key == "env" or key not in _GRID | {"threads", "device"}
+    }
 
 
 def parse_seeds(given: Any) -> list[int]:

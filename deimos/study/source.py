@@ -5,7 +5,7 @@ import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,9 @@ from deimos.checks import RunError, one_line
 
 PACKAGES = ("deimos", "deimos.kernels", "deimos.terrain")
 DIGITS = 12  # of a commit or a SHA-256
+
+Files = Mapping[str, Callable[[], bytes]]
+"""What reads the files that a cell's numbers depend on, by their names."""
 
 
 @dataclass(frozen=True)
@@ -83,34 +86,26 @@ def import_plugins(names: Iterable[str]) -> None:
             raise RunError(f"plugins: the module {name} cannot be imported ({reason}).") from error
 
 
-def sources(plugins: Sequence[str], pool: Path | None) -> dict[str, str]:
-    """What a cell's numbers depend on beside its configuration.
+def hashes(plugins: Sequence[str], files: Files) -> dict[str, str]:
+    """What a cell's numbers depend on beside its configuration and the code: plugins and files by their SHA-256.
 
     Args:
         plugins: Modules, which must be imported.
-        pool: File of the attacker ``pooled``; ``None`` for none.
-
-    Returns:
-        The ``code`` and, by its SHA-256, every plugin and the ``pool``.
+        files: See ``Cell.files``.
 
     Raises:
-        RunError: If the pool cannot be read.
+        RunError: If a file cannot be read.
     """
+    modules = {name: Path(str(sys.modules[name].__file__)).read_bytes for name in plugins}
     try:
-        files = {name: Path(str(sys.modules[name].__file__)) for name in plugins} | ({"pool": pool} if pool else {})
-        return {"code": code().name} | {name: file_hash(path) for name, path in files.items()}
+        return {name: hashlib.sha256(read()).hexdigest()[:DIGITS] for name, read in {**modules, **files}.items()}
     except OSError as error:
         raise RunError(f"{error.filename} cannot be read ({error.strerror}).") from error
 
 
-def file_hash(path: Path) -> str:
-    """First digits of a file's SHA-256."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS]
-
-
-def check_sources(what: str, wanted: dict[str, str], plugins: Sequence[str], pool: Path | None) -> None:
-    """Raise ``RunError`` unless the code, the plugins and the pool are still those that a cell was made with."""
-    found = sources(plugins, pool) | {"code": wanted.get("code", "")}
+def check_sources(what: str, wanted: dict[str, str], plugins: Sequence[str], files: Files) -> None:
+    """Raise ``RunError`` unless the code, the plugins and the files are still those that a cell was made with."""
+    found = hashes(plugins, files) | {"code": wanted.get("code", "")}
     here = code()
     if wanted.get("code") not in (here.commit if not here.changed else "", here.sources):
         raise RunError(

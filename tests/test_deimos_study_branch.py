@@ -1,0 +1,132 @@
+"""Studies whose cells branch off one run, and cells whose environment is built from files."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from deimos.checks import RunError
+from deimos.learn.ppo import PPOConfig
+from deimos.run import training
+from deimos.run.branch import WARM_UP
+from deimos.run.evaluation import EvalConfig
+from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig
+from deimos.sim.envs import particle
+from deimos.study import cell as worker
+from deimos.study import plan
+from deimos.study.folder import StudyFolder
+
+CONFIG = TrainConfig(
+    env=particle.Config(goal_period=8, max_speed=40.0), method="p25", ppo=PPOConfig(num_steps=8, hidden=(16, 16)),
+    evaluation=False, seed=3, num_envs=32, env_steps=32, device="cpu", threads=1,
+    eval=EvalConfig(worlds=16, steps=16, adversary_steps=16, attackers=("scripted",)),
+)  # fmt: skip
+QUAD = """
+seeds = 1
+methods = ["uniform"]
+[[environment]]
+name = "hills"
+env = { kind = "quad", terrain = "hills.npz" }
+"""
+
+
+@pytest.fixture(scope="module")
+def origin(tmp_path_factory):
+    """The folder of a finished run."""
+    trainer, folder = training.start(CONFIG, tmp_path_factory.mktemp("study") / "origin")
+    training.train(trainer, folder)
+    return folder.path
+
+
+def described(origin, **changes):
+    """A study of two methods that branch off a run."""
+    table = {"name": "after", "train": {"env_steps": 16, "device": "cpu"}}
+    return {
+        "branch_from": str(origin),
+        "methods": ["uniform", "p75"],
+        "audit_worlds": 0,
+        "environment": [table],
+    } | changes
+
+
+def test_cells_have_the_settings_of_the_run_that_they_branch_off(origin):
+    """What the study does not say is the run's; seeds and methods are the grid's, and critics learn first."""
+    cells = plan.expand(described(origin), seeds=[5, 6])
+    assert [(cell.config.seed, cell.config.method) for cell in cells] == [
+        (5, "uniform"), (5, "p75"), (6, "uniform"), (6, "p75"),
+    ]  # fmt: skip
+    first = cells[0]
+    assert first.config == replace(
+        CONFIG, method="uniform", seed=5, env_steps=16, critic_warmup=WARM_UP, evaluation=True
+    )
+    assert (first.branch_from, first.goal_periods) == (origin, (8,))
+    assert len({cell.setting for cell in cells}) == 1
+    table = {"name": "other", "branch_from": str(origin), "env": {"kind": "particle", "crash_penalty": 3.0}}
+    (other,) = plan.expand({"methods": ["uniform"], "environment": [table]}, seeds=[5])
+    assert (other.config.env, other.branch_from) == (replace(CONFIG.env, crash_penalty=3.0), origin)
+
+
+def test_the_checkpoint_is_part_of_the_hash(origin, tmp_path):
+    """The run counts by its checkpoint, wherever it lies; another checkpoint makes other cells."""
+    (tmp_path / "moved").mkdir()
+    for path in origin.iterdir():
+        (tmp_path / "moved" / path.name).write_bytes(path.read_bytes())
+    here, moved = (plan.expand(described(path), seeds=[0])[0] for path in (origin, tmp_path / "moved"))
+    assert (here.digest, here.setting) == (moved.digest, moved.setting)
+    with (tmp_path / "moved" / "checkpoint.pt").open("ab") as file:
+        file.write(b"x")
+    changed = plan.expand(described(tmp_path / "moved"), seeds=[0])[0]
+    assert changed.digest != here.digest
+    assert changed.setting != here.setting
+    study = StudyFolder(tmp_path / "study")
+    study.add([moved])
+    with pytest.raises(RunError, match="the file of 'branch_from' is not the one that it was made with"):
+        worker.run(study, study.cells()[0])
+
+
+def test_a_cell_begins_where_the_run_ended(origin, tmp_path):
+    """A worker trains a branch: its policy is the run's while critics learn first, and its row is like any other."""
+    study = StudyFolder(tmp_path / "study")
+    study.add(plan.expand(described(origin), seeds=[5], methods=["p75"]))
+    (cell,) = study.cells()
+    assert worker.run(study, cell)
+    home = study.cell_path(cell)
+    stored = json.loads((home / "run" / "config.json").read_text())
+    assert stored["branch_from"] == str(origin)
+    ours, theirs = (training.load_checkpoint(RunFolder(path))["ppo"]["actor"] for path in (home / "run", origin))
+    assert all(bool((ours[name] == theirs[name]).all()) for name in theirs)  # two rollouts, fewer than WARM_UP
+    assert {row["goals"] for row in study.results().rows} == {"naive", "scripted"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"train": {"num_envs": 64}}, "Environment 'after' cannot branch off .*: num_envs must be 32, as it was there"),
+        ({"environment": [{"name": "a", "preset": "particle"}]}, "preset and branch_from cannot be combined"),
+        ({"branch_from": 3}, "branch_from must be a text, got 3"),
+        ({"branch_from": "nowhere"}, "nowhere"),
+    ],
+)
+def test_what_cannot_branch_off_is_refused(origin, changes, message):
+    """A study that would change what a branch shares with its run is refused in one line before anything runs."""
+    with pytest.raises(RunError, match=message):
+        plan.expand(described(origin, **changes), seeds=[0])
+
+
+def test_files_of_an_environment_are_part_of_the_hash(tmp_path, monkeypatch):
+    """A terrain counts by its content, wherever it lies: another one under the same name makes another cell."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "study.toml").write_text(QUAD)
+    with pytest.raises(RunError, match=r"hills\.npz"):
+        plan.expand(plan.read(tmp_path / "study.toml"))
+    found = []
+    for name, content in (("hills.npz", b"one"), ("hills.npz", b"two"), ("moved.npz", b"one")):
+        (tmp_path / name).write_bytes(content)
+        (tmp_path / "study.toml").write_text(QUAD.replace("hills.npz", name))
+        found += plan.expand(plan.read(tmp_path / "study.toml"))
+    one, two, moved = found
+    assert set(one.sources) == {"code", "terrain"}
+    assert one.digest == moved.digest
+    assert one.digest != two.digest
+    assert one.setting != two.setting
