@@ -111,11 +111,14 @@ def test_dir_names_what_the_package_offers():
 
 @pytest.mark.parametrize("schema", [1, 2])
 def test_an_old_run_is_resumed_or_refused_in_one_line(tmp_path, capsys, schema):
-    """A checkpoint of 0.1.0, or of an unreleased 0.2 before the last change, is not resumed half understood."""
+    """A checkpoint of 0.1.0, or of an unreleased 0.2 before the last change, is not used half understood."""
     path = tmp_path / "run"
     shutil.copytree(OLD, path)
     torch.save(torch.load(path / "checkpoint.pt") | {"schema": schema}, path / "checkpoint.pt")
-    code = cli.main(["train", "--resume", str(path), "--env-steps", "72"])
-    said = capsys.readouterr().err.strip().splitlines()
-    assert (code, len(said)) == (2, 1)
-    assert f"has the schema {schema}, of an earlier version, and cannot be resumed" in said[0]
+    branch = ["--branch-from", str(path), "--out", str(tmp_path / "branch")]
+    for arguments in (["--resume", str(path), "--env-steps", "72"], branch):
+        code = cli.main(["train", *arguments])
+        said = capsys.readouterr().err.strip().splitlines()
+        assert (code, len(said)) == (2, 1)
+        assert f"has the schema {schema}, of an earlier version, and cannot be resumed or branched off" in said[0]
+    assert not (tmp_path / "branch").exists()

@@ -249,10 +249,9 @@ class PPO(Stateful):
                         if learn_policy else self._learn_value(minibatch)
                     )  # fmt: skip
             value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
-        if (
-            learn_policy and self.actor.normalizer is not None
-        ):  # only now: the policy that acted is the one that learning starts from
-            for obs, weight in zip(rollout.obs, rollout.weight, strict=False):
+        if learn_policy and self.actor.normalizer is not None:
+            # Only now: the policy that acted is the one that learning starts from.
+            for obs, weight in zip(rollout.obs[:-1], rollout.weight, strict=True):
                 self.actor.normalizer.update(obs, (weight > 0).float())
         return {
             "value_loss": value_loss,

@@ -217,8 +217,8 @@ class Choices:
     """How often fear ranks a candidate that crashes above one that does not, in the worlds that have both; empty
     without a fear network that has learnt."""
     place: Tensor
-    """Where each world was in the box of its world, in [-1, 1], shape (n, goal_dim): its position or, where that is no
-    part of the state or has another size, the active goal in the box of valid goals."""
+    """Where each world was, in [-1, 1], shape (n, goal_dim): its ``Env.place`` or, where there is none, the active goal
+    in the box of valid goals; none where these are no box."""
     chosen: Tensor
     """Where the chosen goal is in the box of valid goals, in [-1, 1], shape (n, goal_dim); none where these are no
     box."""

@@ -153,7 +153,7 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
 
 def _take_over(trainer: Trainer, origin: RunFolder) -> None:
     """Continue with networks, optimiser, worlds and levels of a run's last checkpoint."""
-    state = load_checkpoint(origin)
+    state = _load_current(origin)
     try:
         check_branch(trainer.config, read_config(origin))
         trainer.ppo.load_learnt(state["ppo"])
@@ -167,18 +167,24 @@ def load_checkpoint(folder: RunFolder) -> dict:
     return load_tensors(folder.path / "checkpoint.pt", "checkpoint", CHECKPOINT_SCHEMA, oldest=1)
 
 
+def _load_current(folder: RunFolder) -> dict:
+    """The same of this version alone; raises ``RunError`` otherwise."""
+    state = load_checkpoint(folder)
+    if state["schema"] != CHECKPOINT_SCHEMA:
+        raise RunError(
+            f"{folder.path / 'checkpoint.pt'} has the schema {state['schema']}, of an earlier version, and cannot be "
+            "resumed or branched off; evaluate its policy, or start a run with its networks by --init-from."
+        )
+    return state
+
+
 def load(folder: RunFolder, config: TrainConfig) -> Trainer:
     """Rebuild a run as it was at its last checkpoint; writes nothing.
 
     Raises:
         RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
     """
-    state = load_checkpoint(folder)
-    if state["schema"] != CHECKPOINT_SCHEMA:
-        raise RunError(
-            f"{folder.path / 'checkpoint.pt'} has the schema {state['schema']}, of an earlier version, and cannot be "
-            "resumed; evaluate its policy, or start a run with its networks by --init-from."
-        )
+    state = _load_current(folder)
     torch.set_num_threads(config.threads)
     trainer = build(config, resolve_device(config.device))
     trainer.load_state_dict(state)
