@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 import deimos
 from deimos.goals import picks
@@ -178,7 +179,10 @@ def draw_goal(scene: Scene) -> None:
             axes.annotate(
                 "", path[10] + way, path[10], arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.5, "ls": ":"}
             )
-            axes.annotate(f"goal {i + 1}", path[10] + 1.3 * way, color=colour, ha="center", va="center")
+            clear = [withStroke(linewidth=4, foreground=ink["paper"])]  # where a path runs below the letters
+            axes.annotate(
+                f"goal {i + 1}", path[10] + 1.3 * way, color=colour, ha="center", va="center", path_effects=clear
+            )
         axes.set(xlabel="x [u]", ylabel="y [u]", aspect="equal", adjustable="datalim")
 
 
