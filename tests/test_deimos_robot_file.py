@@ -233,6 +233,11 @@ def test_a_draft_says_what_the_model_says(tmp_path):
     robot, notes = robot_draft.draft(write_scout(tmp_path))
     assert [note.split()[0] for note in notes] == ["pose", "stiffness", "damping"]
     assert robot.max_torque == (9.0,) * 3
+    path = write_scout(tmp_path)
+    path.write_text(path.read_text().replace('joint="knee_rr"/>', 'joint="knee_rr" ctrlrange="-12 12"/>'))
+    robot, notes = robot_draft.draft(path)
+    assert robot.max_torque == (9.0,) * 3
+    assert any("the MJCF has others for other legs; write what suits all four" in note for note in notes)
 
 
 def test_what_has_no_name_is_named_after_its_joint(tmp_path):

@@ -45,7 +45,12 @@ def draft(path: Path, held: tuple[str, ...] = ()) -> tuple[RobotFile, list[str]]
         notes.append("pose is a guess, for the MJCF has no keyframe 'home': legs bent, feet below the hips")
     data = _posed(source, chains, poses)
     torques = np.max([_standing_torque(source, data, chain) for chain in chains], axis=0)
-    servos = [source.servos[source.name(joint)] for joint in chains[0]]
+    servos, *others = [[source.servos[source.name(joint)] for joint in chain] for chain in chains]
+    if any(leg != servos for leg in others):
+        notes.append(
+            "stiffness, damping and max_torque are the front left leg's, and the MJCF has others for other legs; write "
+            "what suits all four"
+        )
     stiffness, damping, max_torque = (
         [getattr(servo, key) for servo in servos] for key in ("stiffness", "damping", "max_torque")
     )
