@@ -25,10 +25,10 @@ from deimos.run.audit import audit_fear
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.run.training import cores
 from deimos.sim.envs import particle
+from deimos.study.audits import points
 
 METHODS = ("p25-literal", "p25-threshold", "p25", "p75-literal", "p75-threshold", "p75")
 VARIANTS = {"directional": 2000, "absolute": 5000}  # and the steps of a training, as in the thesis
-POINTS = 5  # in the last quarter
 CONTEXTS = 200  # with both outcomes, at most, at every point
 BAR, FLOOR = 0.8, 0.7  # what the mean over seeds shall reach, and what hardly any point shall be below
 
@@ -47,11 +47,10 @@ def measure(name: str, variant: str, seed: int) -> dict[str, object]:
     )  # fmt: skip
     trainer = Trainer(config, torch.device("cpu"))
     count = config.iterations
-    points = {round(count * (0.75 + 0.25 * (k + 1) / POINTS)) for k in range(POINTS)}
     rows, auroc, contexts = [], [], []
     while trainer.iteration < count:
         rows.append(trainer.iterate())
-        if trainer.iteration in points:
+        if trainer.iteration in points(count):
             other = Trainer(config, torch.device("cpu"))
             other.load_state_dict(copy.deepcopy(trainer.state_dict()))
             try:
@@ -128,9 +127,9 @@ def show(rows: list[dict[str, str]]) -> None:
         table.add_column(name, justify="left" if name in ("variant", "method") else "right")
     for variant, name in sorted({(row["variant"], row["method"]) for row in rows}):
         own = [row for row in rows if (row["variant"], row["method"]) == (variant, name)]
-        points = [[float(x) for x in row["auroc"].split() if x != "nan"] for row in own]
-        means = [math.fsum(values) / len(values) for values in points if values]
-        every = [value for values in points for value in values]
+        aurocs = [[float(x) for x in row["auroc"].split() if x != "nan"] for row in own]
+        means = [math.fsum(values) / len(values) for values in aurocs if values]
+        every = [value for values in aurocs for value in values]
         if not every:
             continue
         center, half = math.fsum(means) / len(means), math.nan

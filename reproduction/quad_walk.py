@@ -26,6 +26,7 @@ from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.engines import PhysicsConfig
+from deimos.study.factors import merged
 
 METER = "processor.csv"
 GOAL_PERIOD = 100  # steps; two seconds, T2
@@ -54,12 +55,6 @@ class Meter:
     def seconds(self) -> float:
         """So far [s], with what it took to build the worlds."""
         return self.before + time.process_time() - self.start
-
-
-def merged(fields: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """Nested fields with some of them changed."""
-    both = {key: merged(fields[key], value) for key, value in change.items() if isinstance(fields.get(key), dict)}
-    return fields | change | both
 
 
 def train(config: TrainConfig, path: Path, minutes: float) -> float:

@@ -228,7 +228,23 @@ def test_archive_alone_gives_the_policies_back(whole, tmp_path, capsys):
         cli.PackOptions(folder=tmp_path / "empty").run()
 
 
-@pytest.mark.parametrize("name", ["../evil", "a/b/policy.pt", "x/cell.json.exe", "/etc/cell.json"])
+def test_archive_takes_any_name_of_an_environment(whole, tmp_path):
+    """Letters of any language, which a study's file may use, go into an archive and come back."""
+    study = StudyFolder(tmp_path / "study")
+    first = whole.cells()[0]
+    cell = dataclasses.replace(first, environment="Hügel.1")
+    study.add([cell])
+    shutil.copytree(whole.cell_path(first) / "run", study.cell_path(cell) / "run")
+    shutil.copy(whole.cell_path(first) / "result.json", study.cell_path(cell))
+    cli.PackOptions(folder=study.path).run()
+    shutil.rmtree(study.path / "cells")
+    cli.UnpackOptions(folder=study.path).run()
+    assert study.cells() == [cell]
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "../cell.json", "./cell.json", "a/b/policy.pt", "x/cell.json.exe", "/etc/cell.json"]
+)
 def test_foreign_archive_is_refused(tmp_path, name):
     """An archive that would write anything but the files of cells is refused, and nothing of it is written."""
     with zipfile.ZipFile(tmp_path / "policies.zip", "w") as archive:

@@ -202,6 +202,19 @@ def test_mean_without_an_interval_says_so(tmp_path, monkeypatch):
     assert "Run on v, v." in text
 
 
+def test_share_of_safe_policies_has_its_exact_interval(tmp_path):
+    """Where no policy is safe, or every one, the interval of the share is as wide as so few policies leave it."""
+    fill(tmp_path)
+    rows = report.outcomes(Data.read(tmp_path), "quad", 100)[2]
+    found = {row["method"]: row["policies below 1 % [%]"] for row in rows}
+    assert found["uniform"] == "0 [0, 60.2]"  # of 4: 1 - 0.025^(1/4)
+    data = Data.read(tmp_path)
+    for row in data.rows:
+        row["crash_rate"] = 0.001
+    safe = report.outcomes(data, "quad", 100)[2]
+    assert {row["policies below 1 % [%]"] for row in safe} == {"100 [39.8, 100]"}
+
+
 def test_text_is_escaped():
     """What HTML or a Markdown table would take for markup is only text."""
     blocks = ["# a < b", [{"x": "P(a | b) & <c>"}]]

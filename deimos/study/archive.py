@@ -19,7 +19,7 @@ from deimos.study.results import SCHEMA, Results
 FILE = "policies.zip"
 PARTS = ("cell.json", "run/config.json", "run/policy.pt", FEAR)
 MOST_BYTES = 2**28  # of a part
-_NAME = re.compile(rf"([\w.+-]+)/({'|'.join(map(re.escape, PARTS))})", re.ASCII)
+_NAME = re.compile(rf"(?!\.\.?/)[\w.+-]+/({'|'.join(map(re.escape, PARTS))})")
 
 
 def pack(study: StudyFolder) -> tuple[Path, int]:

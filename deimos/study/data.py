@@ -76,7 +76,6 @@ class Data:
         self.cells = cells
         """What made them; none where the tables are all that there is."""
         self._results, self.rows = results, results.rows
-        self.weak = [row for row in self.rows if row["weak_adversary"]]
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = defaultdict(dict)
         for row in self.rows:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import sem
 
 from deimos.run.config import to_dict
@@ -175,7 +176,7 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
             better = f"{stats.probability_of_improvement([(base, rate)]):.2f}"
         rows.append({
             "method": name, "seeds": str(max(len(rate), len(score))),
-            f"policies below {SAFE:g} % [%]": _boot(100.0 * (100 * rate < SAFE), _mean),
+            f"policies below {SAFE:g} % [%]": _share(100 * rate < SAFE),
             "mean rate [%]": _boot(100 * rate, _mean),
             f"P(safer than {data.style.reference})": better,
             "score: IQM": _boot(score, stats.iqm, ".3f"),
@@ -228,6 +229,14 @@ def _boot(x: Array, statistic: stats.Statistic, form: str = ".3g") -> str:
     return format(stats.bootstrap([x], statistic), form) if len(x) >= 2 else "-"
 
 
+def _share(holds: NDArray[np.bool_]) -> str:
+    """Share of the policies that something holds for, in percent, with its exact interval."""
+    if not len(holds):
+        return "-"
+    found = stats.share(holds)
+    return f"{stats.Interval(*(100 * x for x in (found.estimate, found.low, found.high))):.3g}"
+
+
 def over_all(data: Data) -> list[Block]:
     """The primary outcomes over all environments and T, for the methods that were run in all of them."""
     places = [attacked(data, name, period) for name in data.environments for period in data.periods(name)]
@@ -243,7 +252,10 @@ def over_all(data: Data) -> list[Block]:
         rows.append({"method": name} | dict(zip(
             (f"policies below {SAFE:g} % [%]", "mean rate [%]"), (f"{each:.3g}" for each in both), strict=True
         )))  # fmt: skip
-    text = f"Means over {len(places)} evaluations of crashes per interaction under attack, each of which counts alike."
+    text = (
+        f"Means over {len(places)} evaluations of crashes per interaction under attack, each of which counts alike. "
+        "These intervals are bootstraps, which have no width where all policies are below, or none."
+    )
     return ["## Over all environments", text, rows]
 
 
