@@ -131,6 +131,10 @@ FORGOTTEN = {
         '    """Carts; see ``Config``."""\n', '    goal_group_names = ("place", "speed")\n',
         "goal_group_names must name every group once",
     ),
+    "a weight": (
+        '    """Carts; see ``Config``."""\n', "    goal_group_weights = (1.0, 0.5)\n",
+        "goal_group_weights must be empty, or a number of at least 0 for every group",
+    ),
 }  # fmt: skip
 
 

@@ -123,6 +123,9 @@ def _check_layout(env: Env, build: Build) -> Claims:
         covered[group] += 1
     yield covered == 1, "goal_groups must name every component of a goal once."
     yield len(env.goal_group_names) == len(env.goal_groups), "goal_group_names must name every group once."
+    weights = env.goal_group_weights
+    valid = len(weights) in (0, len(env.goal_groups)) and min(weights, default=0.0) >= 0.0
+    yield valid, "goal_group_weights must be empty, or a number of at least 0 for every group."
     yield len(env.strata()) in (0, WORLDS), "strata must name every world's kind, or be empty."
 
 
