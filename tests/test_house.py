@@ -100,7 +100,7 @@ ROOMS = {  # package: those that it may import, and those that these may import
     "app": {"study", "terrain"},
     "adapters": {"run"},
 }
-LEAVES = {"_version", "checks", "files", "plugins"}  # modules that everybody may import
+LEAVES = {"_version", "checks", "files", "lock", "plugins"}  # modules that everybody may import
 BACKENDS = {"deimos/nn/cpu.py"}  # imported by functions, where Warp is installed
 ENTRIES = {"train.py", "deimos/__main__.py", "terrain/__main__.py"}  # may import app
 

@@ -17,7 +17,7 @@ from deimos.checks import RunError, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run import memory
-from deimos.run.config import from_dict, kind, to_dict
+from deimos.run.config import from_dict, kind, to_dict, with_plain_numbers
 from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
 from deimos.run.failure import check_finite, dumped
@@ -69,6 +69,7 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
         RunError: If the folder exists, or the networks do not fit.
     """
     device = resolve_device(config.device)
+    config = with_plain_numbers(config)
     config = replace(
         config, env=config.env.resolved(device), threads=config.threads or cores(),
         device="cuda" if device.type == "cuda" else "cpu",
@@ -85,7 +86,7 @@ def start(config: TrainConfig, path: Path | None, init_from: Path | None) -> tup
             "files": {name: folder.keep(name, partial(config.env.read_file, name)) for name in config.env.files},
         })  # fmt: skip
         save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
-    except RunError:
+    except BaseException:  # a plug-in's, or an interrupt: whatever it is
         shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
         raise
     return trainer, folder
