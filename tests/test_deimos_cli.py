@@ -535,6 +535,7 @@ def test_run_leaves_its_files(finished):
     assert len(events) == 1
     assert names - events == {
         "config.json", "progress.csv", "timing.csv", "checkpoint.pt", "policy.pt", "evaluation.json", "summary.png",
+        "lock", "evaluation.json.lock",
     }  # fmt: skip
     assert out.splitlines()[-1] == str(path)
     assert re.search(r"uniform goals +attacked by +attacked by\n +\(Naive\) +argmax +scripted\n", out)

@@ -10,7 +10,7 @@ from deimos.checks import RunError
 from deimos.nn.threads import on_threads
 from deimos.run import training
 from deimos.run.branch import branch_config
-from deimos.run.config import from_dict, to_dict
+from deimos.run.config import from_dict, to_dict, with_plain_numbers
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -91,7 +91,8 @@ def configure_evaluation(
     """
     try:
         period = config.env.goal_period if goal_period is None else goal_period
-        env_config, eval_config = config.env.with_goal_period(period), replace(config.eval, **changes)
+        env_config = config.env.with_goal_period(period)
+        eval_config = with_plain_numbers(replace(config.eval, **changes))
         if engine is not None:
             env_config = from_dict(EnvConfig, to_dict(env_config) | {"engine": engine})
         if eval_config.steps < 2 * period:

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from deimos import plugins
 from deimos.goals import selectors
 from deimos.goals.selector import SelectorConfig
@@ -31,6 +33,18 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and math.isinf(value):
         return str(value)  # JSON has no infinity
     return list(value) if isinstance(value, tuple) else value
+
+
+def with_plain_numbers(value: Any) -> Any:
+    """A configuration with Python's numbers in place of NumPy's, which neither JSON nor Warp take for numbers."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, tuple):
+        return tuple(with_plain_numbers(item) for item in value)
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value
+    fields = [field.name for field in dataclasses.fields(value) if field.init]
+    return dataclasses.replace(value, **{name: with_plain_numbers(getattr(value, name)) for name in fields})
 
 
 def kind(config: EnvConfig | SelectorConfig) -> str:

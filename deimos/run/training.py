@@ -18,7 +18,7 @@ from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run import memory
 from deimos.run.branch import check_branch
-from deimos.run.config import from_dict, kind, to_dict
+from deimos.run.config import from_dict, kind, to_dict, with_plain_numbers
 from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
 from deimos.run.failure import check_finite, dumped
@@ -80,6 +80,7 @@ def start(
     if init_from is not None and branch_from is not None:
         raise RunError("--init-from and --branch-from cannot be combined; the latter takes over the networks too.")
     device = resolve_device(config.device)
+    config = with_plain_numbers(config)
     config = replace(
         config, env=config.env.resolved(device), threads=config.threads or cores(),
         device="cuda" if device.type == "cuda" else "cpu",
@@ -99,7 +100,7 @@ def start(
             "files": {name: folder.keep(name, partial(config.env.read_file, name)) for name in config.env.files},
         })  # fmt: skip
         save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
-    except RunError:
+    except BaseException:  # a plug-in's, or an interrupt: whatever it is
         shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
         raise
     return trainer, folder
