@@ -33,7 +33,9 @@ def folder_of(tmp_path, progress="", rows=()):
     """A run folder with rows of its training and of its evaluations."""
     folder = RunFolder(tmp_path)
     if progress:
-        (tmp_path / "progress.csv").write_text(HEADER + progress)
+        lines = (HEADER + progress).splitlines()
+        numbered = [f"{number or 'iteration'},{line}\n" for number, line in enumerate(lines)]
+        (tmp_path / "progress.csv").write_text("".join(numbered))
     if rows:
         folder.write_json("evaluation.json", rows)
     return folder

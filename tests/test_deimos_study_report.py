@@ -220,7 +220,7 @@ def test_text_is_escaped():
     blocks = ["# a < b", [{"x": "P(a | b) & <c>"}]]
     assert "<h1>a &lt; b</h1>" in document.to_html(blocks, None)
     assert "<td>P(a | b) &amp; &lt;c&gt;</td>" in document.to_html(blocks, None)
-    assert "| P(a \\| b) & <c> |" in document.to_markdown(blocks, "figures")
+    assert "| P(a \\| b) & &lt;c> |" in document.to_markdown(blocks, "figures")
 
 
 def test_methods_have_their_own_colours():
