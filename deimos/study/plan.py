@@ -255,11 +255,12 @@ def _environment(
         raise RunError(f"Environment '{name}': {error}") from error
     fields = reduce(merged, (ready, {"threads": 1}, shared, own, train, point.fields, {"env": to_dict(env)}))
     configs = [from_dict(TrainConfig, fields | {"method": each}) for each in methods]
-    try:
-        for config in configs if stored else ():
-            check_branch(config, stored)
-    except ValueError as error:
-        raise RunError(f"Environment '{name}' cannot branch off {origin}: {error}") from error
+    if stored is not None:
+        try:
+            for config in configs:
+                check_branch(config, stored)
+        except ValueError as error:
+            raise RunError(f"Environment '{name}' cannot branch off {origin}: {error}") from error
     plugins = tuple(study.get("plugins", ()))
     worlds = table.get("audit_worlds", study.get("audit_worlds", Cell.audit_worlds))
     return [

@@ -30,11 +30,12 @@ Pictures = Mapping[str, Sequence[Block]]
 
 FIGURES = "figures"
 FACTORS = ""
-COVERAGE = (  # python -m reproduction coverage, its defaults
-    "All intervals are percentile bootstraps over policies, but for the means under Distributions. Those of IQMs and "
-    "medians cover 93 to 94 % at n = 10, on normal and on lognormal data; those of means 90 % and 81 %, so read the "
-    "mean rates of skewed populations with care. The means under Distributions have bootstrap-t intervals (94 % and "
-    "91 %); of few seeds, or many equal values, a mean has none there."
+COVERAGE = (  # docs/lab/study.md; `python -m reproduction coverage` simulates it again
+    "Intervals of shares of policies are exact, but for those over all environments; all others are percentile "
+    "bootstraps over policies, but for the means under Distributions. Those of IQMs and medians cover some 93 to 94 % "
+    "at n = 10, of normal, lognormal and bimodal data alike; those of means 91, 80 and 78 %, so read the mean rates of "
+    "skewed populations with care. The means under Distributions have bootstrap-t intervals (some 95, 91 and 95 %); of "
+    "few seeds, or many equal values, a mean has none there."
 )
 _median = partial(np.median, axis=-1)
 _mean = partial(np.mean, axis=-1)
