@@ -368,7 +368,7 @@ def test_it_says_once_that_goals_are_uniform_yet(caplog):
         for _ in range(30):
             goals.step(torch.zeros(4, 3), torch.zeros(4, 2), no, no, torch.zeros(4, 9, 2))
     assert [record.getMessage() for record in caplog.records] == [
-        "Goals are uniform until the fear network has seen 1 crash(es) and as many survivals; "
+        "Goals are uniform until the fear network has seen crashes (1) and as many survivals; "
         "the last 2 T steps had 0 and 0."
     ]
     assert goals.metrics["fear/chosen"] == 0

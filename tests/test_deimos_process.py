@@ -229,7 +229,7 @@ def test_a_director_without_fear_yet_says_so(tmp_path, capfd):
     for number in range(2):
         assert cli.main([*TINY, "--method", "p75", "--out", str(tmp_path / f"run{number}")]) == 0
         (line,) = capfd.readouterr().err.splitlines()
-        assert line.startswith("Goals are uniform until the fear network has seen 1 crash(es) and as many survivals;")
+        assert line.startswith("Goals are uniform until the fear network has seen crashes (1) and as many survivals;")
     assert not logging.getLogger("deimos").handlers
     assert not logging.getLogger("deimos").isEnabledFor(logging.INFO)
 

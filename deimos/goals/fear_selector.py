@@ -203,7 +203,7 @@ class FearSelector(GoalSelector):
         self._said = True
         least, crashes = self.config.fear.min_per_class, int(window.crashed.sum())
         _log.info(
-            "Goals are uniform until the fear network has seen %d crash(es) and as many survivals; "
+            "Goals are uniform until the fear network has seen crashes (%d) and as many survivals; "
             "the last 2 T steps had %d and %d.", least, crashes, len(window) - crashes,
         )  # fmt: skip
 

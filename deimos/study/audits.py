@@ -91,9 +91,11 @@ def _mean(values: Sequence[float]) -> float:
 def _risk(trainer: Trainer) -> float:
     """How often fear at a dangerous place exceeds that at a safe one, over goals, ties counting half; see ``Env``."""
     afraid = fear_selector(trainer.loop.selector)
+    if afraid is None or not afraid.fear.fitted:
+        return math.nan
     env = trainer.config.env.for_evaluation().build(PLACES, trainer.env.device, trainer.config.seed)
     contrast = env.risk_contrast()
-    if afraid is None or not afraid.fear.fitted or contrast is None:
+    if contrast is None:
         return math.nan
     rows = torch.cat(contrast)
     obs, candidates = env.obs[rows], env.sample_goals(rows, CANDIDATES).clone()
