@@ -76,6 +76,8 @@ def simulate(n: int = 10, populations: int = 2000, resamples: int = 2000, seed: 
 
 def _bca(x: Array, resamples: int, seed: int) -> Interval:
     """The bias-corrected and accelerated interval of a mean, which the report does not use."""
+    if not np.ptp(x):  # all policies are at 0: scipy would divide by 0
+        return Interval(float(x[0]), float(x[0]), float(x[0]))
     found = scipy_stats.bootstrap(
         (x,), np.mean, n_resamples=resamples, method="BCa", vectorized=True, rng=np.random.default_rng(seed)
     )

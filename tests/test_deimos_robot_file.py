@@ -477,7 +477,7 @@ def test_a_run_keeps_its_robot(tmp_path, capsys):
             ["--env.robot", "scout.toml", "--env.terrain", "fine.npz"],
             "terrain must have cells of at least 0.05 m under",
         ),
-        (["--env.robot", "scout.toml", "--num-envs", "2000000000"], "2000000000 worlds need more than "),
+        (["--env.robot", "scout.toml", "--num-envs", "2000000000"], "2000000000 worlds, each at least "),
         (["--env.robot", "bad.toml"], "joint 'abduct_rr' of body 'shoulder_rr' must have a range of angles; give it"),
         (
             ["--env.robot", "scout.xml"],
