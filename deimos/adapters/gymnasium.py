@@ -62,6 +62,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     ) -> None:  # fmt: skip
         check_at_least("num_envs", num_envs, 1)
         self.num_envs = num_envs
+        self.loop: GoalLoop
+        self._fresh: torch.Tensor  # where a world stands as an episode begins
+        self._over: torch.Tensor  # where an episode has ended and no new one has begun
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
         self._build = partial(config.build, num_envs, torch.device(device), env_offset=env_offset)
@@ -80,8 +83,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         env = self._build(seed=int(seed))
         self.loop = GoalLoop(env, self._selector.build(spaces(env), int(seed)))
         everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=env.device)
-        self._fresh = everywhere  # where a world stands as an episode begins
-        self._over = ~everywhere  # where an episode has ended and no new one has begun
+        self._fresh, self._over = everywhere, ~everywhere
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         """Begin an episode.

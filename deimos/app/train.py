@@ -91,7 +91,7 @@ def _run(trainer: Trainer, folder: RunFolder) -> None:
     config = trainer.config
     with console.stop_on_interrupt() as stopped:
         with _training_progress(trainer) as report:
-            finished = training.train(trainer, folder, report, stopped)
+            finished = training.train(trainer, folder, report, lambda: bool(stopped()))
         if not finished or stopped():
             print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
             raise SystemExit(128 + (stopped() or signal.SIGINT))

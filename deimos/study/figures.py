@@ -28,7 +28,7 @@ TRAINING = (
 DPI = 200
 WIDTH = 7.2  # [inch]: the text of an A4 page, at which every figure can be read
 WINDOW = 0.05  # of the training, for the rolling mean
-PRINT = {
+PRINT: dict[Any, Any] = {
     "font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5,
     "legend.fontsize": 7.5, "figure.titlesize": 8.5, "axes.spines.top": False, "axes.spines.right": False,
     "text.parse_math": False,  # a dollar in a name is a dollar

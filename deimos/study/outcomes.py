@@ -167,9 +167,9 @@ def pareto(data: Data, environment: str, period: int) -> "Figure | None":
     panel.plot(
         *np.array([middles[name] for name in front]).T, color="#777777", linewidth=1, drawstyle="steps-post", zorder=2
     )
-    for name, (rate, score) in middles.items():
+    for name, middle in middles.items():
         panel.plot(
-            rate, score, linestyle="", marker=data.style.marker(name), markersize=7.5, zorder=3,
+            *middle, linestyle="", marker=data.style.marker(name), markersize=7.5, zorder=3,
             color=data.style.colours[name], markeredgecolor="black", markeredgewidth=0.7,
         )  # fmt: skip
     panel.axvline(SAFE, color="black", linewidth=0.8, linestyle=":")

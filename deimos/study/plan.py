@@ -9,7 +9,7 @@ import typing
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,11 @@ class Cell:
         """Those of its environment, the ``pool`` of its attackers, and the checkpoint that it branches off."""
         env, pool = self.config.env, self.config.eval.pool
         others = {"pool": pool, "branch_from": self.branch_from and self.branch_from / "checkpoint.pt"}
-        own: Files = {name: lambda name=name: env.read_file(name)[0] for name in env.files}
+
+        def read(name: str) -> bytes:
+            return env.read_file(name)[0]
+
+        own: Files = {name: partial(read, name) for name in env.files}
         return {**own, **{name: path.read_bytes for name, path in others.items() if path}}
 
     def _config(self) -> dict:

@@ -38,7 +38,10 @@ COVERAGE = (  # docs/lab/study.md; `python -m reproduction coverage` simulates i
     "few seeds, or many equal values, a mean has none there."
 )
 _median = partial(np.median, axis=-1)
-_mean = partial(np.mean, axis=-1)
+
+
+def _mean(x: Array) -> Array:
+    return np.mean(x, axis=-1)
 
 
 def page(data: Data, pictures: Pictures) -> list[Block]:
@@ -248,7 +251,7 @@ def over_all(data: Data) -> list[Block]:
         return []
     rows = []
     for name, samples in shared.items():
-        safe = [100.0 * (rate < SAFE) for rate in samples]
+        safe = [np.where(rate < SAFE, 100.0, 0.0) for rate in samples]
         both = (stats.bootstrap(values, _over_places) for values in (safe, samples))
         rows.append({"method": name} | dict(zip(
             (f"policies below {SAFE:g} % [%]", "mean rate [%]"), (f"{each:.3g}" for each in both), strict=True
