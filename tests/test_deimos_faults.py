@@ -17,6 +17,8 @@ import deimos
 from deimos.app import cli, console
 from deimos.checks import RunError, SimulationError
 from deimos.files import load_tensors, open_file
+from deimos.goals.methods import METHODS
+from deimos.goals.selector import with_parts
 from deimos.goals.selectors import director
 from deimos.learn.ppo import PPOConfig
 from deimos.run import memory, training
@@ -32,6 +34,8 @@ CONFIG = TrainConfig(
     env=particle.Config(goal_period=8), method="uniform", ppo=PPOConfig(hidden=(8,), num_steps=8, minibatches=2),
     evaluation=False, num_envs=16, env_steps=8 * 6, device="cpu", threads=1,
 )  # fmt: skip
+
+WILD = PPOConfig(hidden=(8,), num_steps=8, minibatches=2, init_std=100.0)  # throws itself about, and crashes
 
 
 @pytest.fixture(scope="module")
@@ -213,14 +217,20 @@ def test_a_checkpoint_is_never_poisoned(run, spoil, name):
     assert (run.path / "checkpoint.pt").read_bytes() == before
 
 
-@pytest.mark.parametrize("selector", ["plr", "q-fear", "rnd", "p75"])
-def test_what_is_not_known_may_be_saved(selector):
-    """A selector's marks of what it does not know yet are no fault."""
-    trainer = training.build(dataclasses.replace(CONFIG, method=selector), CPU)
+@pytest.mark.parametrize("method", [*METHODS, "p75", "p75-literal"])
+def test_what_is_not_known_may_be_saved(method):
+    """A selector's marks of what it does not know are no fault: not at first, and not once worlds have crashed."""
+    env = particle.Config(goal_period=8, max_speed=200.0, max_force=100.0)
+    trainer = training.build(dataclasses.replace(CONFIG, env=env, method=method, ppo=WILD), CPU)
     check_finite(trainer)
-    for _ in range(2):
-        trainer.iterate()
+    rows = [trainer.iterate() for _ in range(12)]
+    assert sum(row["crashes"] for row in rows) > 5
     check_finite(trainer)
+    for memory_of in (part.memory for part in with_parts(trainer.loop.selector) if getattr(part, "memory", None)):
+        assert memory_of.stored
+        memory_of._crash[0, 0] = torch.nan
+        with pytest.raises(SimulationError, match="memory.crash"):
+            check_finite(trainer)
 
 
 def test_what_stopped_a_run_is_written_down(run, monkeypatch):

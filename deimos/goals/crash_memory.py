@@ -5,7 +5,8 @@ it. Old crashes beside young survivals would teach something else: to tell *when
 kept together with survivals of the same time, and both fade alike.
 """
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -27,15 +28,19 @@ class CrashMemory(Stateful):
     Args:
         capacity: Crashes that are kept, at least 1.
         period: T, in steps: what was issued that long ago is known to have crashed or survived.
-        width: Components of a row: what the network sees of an interaction, and whatever else belongs to it.
+        inputs: Components of a row that the network sees of an interaction.
         device: Where they are kept.
         seed: Seed of which survivals are kept.
+        extra: Components of a row after these: whatever else belongs to an interaction, NaN where it is not known.
     """
 
     saved: ClassVar[tuple[str, ...]] = ("_crash", "_partners", "_issued", "stored", "_upto", "generator")
 
-    def __init__(self, capacity: int, period: int, width: int, device: torch.device, seed: int) -> None:
-        self._period = period
+    def __init__(
+        self, capacity: int, period: int, inputs: int, device: torch.device, seed: int, extra: int = 0
+    ) -> None:
+        self._period, self._inputs = period, inputs
+        width = inputs + extra
         self._crash = torch.zeros(capacity, width, dtype=torch.float32, device=device)
         self._partners = torch.zeros(capacity, PARTNERS, width, dtype=torch.float32, device=device)
         self._issued = torch.zeros(capacity, dtype=torch.int64, device=device)
@@ -43,6 +48,11 @@ class CrashMemory(Stateful):
         """Crashes stored so far, those that have made way included."""
         self._upto = -1  # step that interactions have been looked at up to
         self.generator = generator(seed, "crash memory", device)
+
+    def must_be_finite(self) -> Mapping[str, Any]:
+        """See ``Stateful``: what the network sees, but not the components after it."""
+        inputs = slice(self._inputs)
+        return {**super().must_be_finite(), "crash": self._crash[:, inputs], "partners": self._partners[..., inputs]}
 
     @torch.no_grad()
     def store(self, rows: Tensor, window: Resolved, now: int) -> None:

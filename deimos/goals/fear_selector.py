@@ -91,8 +91,9 @@ class FearSelector(GoalSelector):
         self.memory: CrashMemory | None = None
         """Where the crashes are kept that fear is learnt from; ``None`` for the last 2 T steps alone."""
         if config.memory:
-            width = self.inputs_per_row * (spaces.state_dim + 2 * spaces.goal_dim)
-            self.memory = CrashMemory(config.memory, spaces.goal_period, width, spaces.device, seed)
+            inputs = spaces.state_dim + 2 * spaces.goal_dim
+            extra = (self.inputs_per_row - 1) * inputs
+            self.memory = CrashMemory(config.memory, spaces.goal_period, inputs, spaces.device, seed, extra)
         self._age = -1  # rollouts since the last fit, -1 before the first
         self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
         self._issued, self._chosen = 0, 0  # goals since the last call of learn, and those of them that fear chose
