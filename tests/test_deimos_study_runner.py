@@ -1,5 +1,6 @@
 """Studies run for real, on tiny budgets: stopped, killed, resumed, with workers that die."""
 
+import math
 import os
 import shutil
 import signal
@@ -9,10 +10,12 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 import deimos
 from deimos.checks import RunError
 from deimos.lock import hold
+from deimos.run import evaluation
 from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, plan
@@ -83,6 +86,24 @@ def wait_until(condition, seconds=120):
     while not condition():
         assert time.monotonic() < end, "it never became true"
         time.sleep(0.02)
+
+
+def test_the_scale_of_the_score_is_computed_once(whole):
+    """All cells of a task share its scale, which is that of an evaluation by itself; another task has its own."""
+    (kept,) = RunFolder(whole.path).read_rows("scales.json")
+    cell = whole.cells()[0]
+    path, config = whole.cell_path(cell) / "run", cell.config
+    rows = evaluation.evaluate_run(RunFolder.open(path), config.env, config.eval, torch.device("cpu"))
+    stored = {row["goals"]: row["score"] for row in whole.results().rows if row["hash"] == cell.digest}
+    assert {row["goals"]: row["score"] for row in rows} == stored
+    task = {name: value for name, value in kept.items() if name not in ("measure", "low", "high")}
+    assert whole.scale(task, pytest.fail) == (kept["measure"], kept["low"], kept["high"])
+    other = StudyFolder(whole.path.parent / "other")
+    other.path.mkdir()
+    missing = ("return_per_step", math.nan, math.nan)
+    for name, scale in (("a", ("matching", 0.25, 1.0)), ("b", missing), ("c", (kept["measure"], 0.1, 1.0 / 3.0))):
+        assert other.scale({"environment": name}, lambda scale=scale: scale) is scale
+        assert repr(other.scale({"environment": name}, pytest.fail)) == repr(scale)
 
 
 def test_study_leaves_its_tables(whole):

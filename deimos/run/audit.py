@@ -95,35 +95,6 @@ def audit_fear(trainer: Trainer, contexts: int) -> dict:
     }  # fmt: skip
 
 
-def audit_percentile(trainer: Trainer, contexts: int) -> dict[str, float]:
-    """Measure how dangerous the goals of a training run's selector are, by the truth.
-
-    Args:
-        trainer: A run. Its worlds move on.
-        contexts: Contexts to collect where candidates differ in danger, at least 1.
-
-    Returns:
-        ``percentile``: the mean percentile of the chosen goal among 50 candidates, by how soon each crashes the policy,
-        ties counting half: 50 is Uniform's; and the number of ``contexts``.
-
-    Raises:
-        RunError: If no context has candidates that differ.
-    """
-    act, clones = _explorers(trainer)
-    found: list[float] = []
-    tried = 0
-    while len(found) < contexts and tried < PATIENCE * contexts:
-        rows, state, goal, candidates, survived = _next_contexts(trainer, act, clones)
-        tried += len(rows)
-        chosen = trainer.loop.selector.propose(rows, state, goal, candidates, trainer.env.draw(rows)).goal
-        pick = (candidates == chosen.unsqueeze(1)).all(2).int().argmax(1)
-        percentile = picks.percentile(-survived, pick)
-        found += percentile[survived.amin(1) < survived.amax(1)].tolist()
-    if not found:
-        raise RunError(f"In none of {tried} contexts do candidates differ in danger.")
-    return {"percentile": math.fsum(found) / len(found), "contexts": float(len(found))}
-
-
 def _explorers(trainer: Trainer) -> tuple[_Explorer, Clones]:
     """Who acts in the run's own worlds, and clones to try candidates in; both explore as in training."""
     config = trainer.config

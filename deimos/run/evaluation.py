@@ -80,6 +80,16 @@ class EvalConfig:
         return min(self.worlds, self.oracle_worlds) if few else self.worlds
 
 
+Scale = tuple[str, float, float]
+"""What a score is made of, and its values that make 0 and 1."""
+Once = Callable[[dict, Callable[[], Scale]], Scale]
+"""Gives a scale, from what it depends on and a function that computes it."""
+
+
+def _at_once(task: dict, compute: Callable[[], Scale]) -> Scale:
+    return compute()
+
+
 def weights_hash(module: nn.Module) -> str:
     """First 16 hexadecimal digits of the SHA-256 of all weights."""
     digest = hashlib.sha256()
@@ -91,7 +101,7 @@ def weights_hash(module: nn.Module) -> str:
 
 def evaluate_run(
     folder: RunFolder, env_config: EnvConfig, config: EvalConfig, device: torch.device,
-    progress: Progress = lambda stage, share: None, *, again: bool = True,
+    progress: Progress = lambda stage, share: None, *, again: bool = True, once: Once = _at_once,
 ) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
 
@@ -112,7 +122,8 @@ def evaluate_run(
         return same
     with torch_on_one():
         there = [] if again else same
-        fresh = [row | weights for row in evaluate(policy.scaled, env_config, config, device, progress, known=there)]
+        rows = evaluate(policy.scaled, env_config, config, device, progress, known=there, once=once)
+        fresh = [row | weights for row in rows]
     with folder.adding(EVALUATION):
         others = [row for row in read_evaluation(folder) if row not in same]  # another process may have added some
         folder.write_json(EVALUATION, others + fresh)
@@ -210,7 +221,7 @@ def _read(path: Path) -> bytes:
 
 def evaluate(
     policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device,
-    progress: Progress = lambda stage, share: None, *, known: Sequence[dict] = (),
+    progress: Progress = lambda stage, share: None, *, known: Sequence[dict] = (), once: Once = _at_once,
 ) -> list[dict]:  # fmt: skip
     """Evaluate a policy against uniform goals and against attackers.
 
@@ -221,6 +232,7 @@ def evaluate(
         device: Where to simulate.
         progress: Told how far it is.
         known: Rows of this policy that there are: they are given back and not made again.
+        once: Gives the scale of the score, from what it depends on and a function that computes it; a study keeps it.
 
     Returns:
         A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` gives, and ``score``: for
@@ -238,9 +250,11 @@ def evaluate(
     if config.steps < 2 * env_config.goal_period:
         raise ValueError(f"steps must be at least 2 T = {2 * env_config.goal_period}, got {config.steps}.")
     target = make_target(policy, env_config, config, device)
-    measure, low, high = score_scale(target.build, config, progress)
+    identities = _identities(env_config, config)
+    task = {name: value for name, value in identities[0].items() if name != "goals"} | {"device": device.type}
+    measure, low, high = once(task, lambda: score_scale(target.build, config, progress))
     rows = []
-    for identity in _identities(env_config, config):
+    for identity in identities:
         goals = identity["goals"]
         if there := next((row for row in known if row.items() >= identity.items()), None):
             rows.append(there)
@@ -302,7 +316,7 @@ def _halves(row: dict) -> tuple[float, float, int] | None:
 
 def score_scale(
     build: Callable[[int, int], Env], config: EvalConfig, progress: Progress = lambda stage, share: None
-) -> tuple[str, float, float]:
+) -> Scale:
     """What the score is made of, and its values that make 0 and 1; see ``evaluate``."""
     env = build(config.worlds, config.seed)
     rest = env.tracking_at_rest()

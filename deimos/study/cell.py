@@ -21,7 +21,7 @@ from deimos.lock import hold
 from deimos.run import training
 from deimos.run.attack import attacker
 from deimos.run.attackers.pooled import save_fear
-from deimos.run.evaluation import evaluate_run
+from deimos.run.evaluation import Once, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import Trainer
 from deimos.sim.shared import one_stream
@@ -64,7 +64,7 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
                     check_sources(f"Cell {cell.name}", cell.sources, cell.plugins, cell.files)
                     if not _train(RunFolder(home), cell, device, stopped) or stopped():
                         return False
-                    _finish(RunFolder(home), cell, device, watch)
+                    _finish(study, cell, device, watch)
                 _attack(study, cell, device, watch)
         except _Interrupted:
             return False
@@ -95,15 +95,22 @@ def _keep_fear(path: Path, trainer: Trainer) -> None:
         save_fear(path, afraid.fear, trainer.env, {})
 
 
-def _finish(home: RunFolder, cell: Cell, device: torch.device, watch: Callable[[str, float], None]) -> None:
+def _finish(study: StudyFolder, cell: Cell, device: torch.device, watch: Callable[[str, float], None]) -> None:
     """Evaluate what was trained, and write ``result.json``."""
-    folder, config = RunFolder(home.path / "run"), cell.config
+    home, config = RunFolder(study.cell_path(cell)), cell.config
+    folder, once = RunFolder(home.path / "run"), _scales(study)
     tasks = [config.env.with_goal_period(period) for period in cell.goal_periods]
-    parts = [evaluate_run(folder, task, config.eval, device, watch, again=False) for task in tasks]
+    parts = [evaluate_run(folder, task, config.eval, device, watch, again=False, once=once) for task in tasks]
     audited: dict[str, Any] = Audits(home, config, cell.audit_worlds).row()
     if audited:
         audited["speed"] = speed(folder, config.env, config.eval.seed, device)
     home.write_json("result.json", result(cell, folder, [row for part in parts for row in part], audited))
+
+
+def _scales(study: StudyFolder) -> Once:
+    """The scales of scores that a study keeps, of this code."""
+    made_by = {"code": code().name}
+    return lambda task, compute: study.scale(task | made_by, compute)
 
 
 def _attack(study: StudyFolder, cell: Cell, device: torch.device, watch: Callable[[str, float], None]) -> None:
@@ -116,7 +123,8 @@ def _attack(study: StudyFolder, cell: Cell, device: torch.device, watch: Callabl
         check_sources(f"Cell {cell.name}", wanted | {"code": made_by}, (), files)
         folder = RunFolder.open(home.path / "run")
         config = replace(cell.config.eval, attackers=attackers)
-        rows = evaluate_run(folder, cell.config.env.with_goal_period(period), config, device, watch, again=False)
+        task, once = cell.config.env.with_goal_period(period), _scales(study)
+        rows = evaluate_run(folder, task, config, device, watch, again=False, once=once)
         found = home.read_json("result.json")
         fresh = evaluated(cell, folder, [row for row in rows if row["goals"] in attackers], made_by)
         home.write_json("result.json", found | {"rows": found["rows"] + fresh})

@@ -77,8 +77,11 @@ def cost(study: StudyFolder, cell: Cell) -> tuple[int, int]:
 
 
 def evaluation_steps(config: EvalConfig, goals: Iterable[str]) -> int:
-    """World-steps of an evaluation under some goals, those that attackers learn from and the score's scale included."""
-    total = 2 * config.worlds * config.steps  # the policy that does nothing, and the reference
+    """World-steps of an evaluation under some goals, those that attackers learn from included.
+
+    The scale of the score is not: all cells of a task share it.
+    """
+    total = 0
     for name in goals:
         worlds = config.worlds_against(name)
         tries = 0 if name == "naive" or not attacker(name).few_worlds else OF_ORACLE

@@ -2,24 +2,27 @@
 
 A cell's folder holds ``cell.json`` (what it is), ``run/`` (its run folder), ``audits.json`` (what was measured late in
 its training), ``fear.pt`` (its fear network, where it has one), ``result.json`` once it is finished, ``log.txt`` (what
-its workers said) and ``failures.jsonl`` (how they died). ``attack.json`` has the attackers that were added later.
+its workers said) and ``failures.jsonl`` (how they died). ``attack.json`` has the attackers that were added later,
+``scales.json`` the returns that make scores of 0 and 1, once for each task.
 """
 
 import contextlib
 import json
+import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from deimos.checks import RunError, one_line
 from deimos.lock import hold
 from deimos.run.config import from_dict, to_dict
+from deimos.run.evaluation import Scale
 from deimos.run.folder import RunFolder
 from deimos.study.plan import AttackRound, Cell, read_cell
 from deimos.study.results import Results
 
-ATTACK, FEAR = "attack.json", "fear.pt"
+ATTACK, FEAR, SCALES = "attack.json", "fear.pt", "scales.json"
 
 
 class StudyFolder:
@@ -83,6 +86,19 @@ class StudyFolder:
         met = {(row["goal_period"], row["goals"]) for row in rows}
         left = {period: tuple(n for n in names if (period, n) not in met) for period in cell.goal_periods}
         return {period: attackers for period, attackers in left.items() if attackers}
+
+    def scale(self, task: dict, compute: Callable[[], Scale]) -> Scale:
+        """The scale of the score in a task: as an earlier cell found it, or computed and kept for the later ones."""
+        folder = RunFolder(self.path)
+        found = next((row for row in folder.read_rows(SCALES) if row.items() >= task.items()), None)
+        if found is not None:
+            low, high = (math.nan if found[end] is None else found[end] for end in ("low", "high"))
+            return found["measure"], low, high
+        scale = compute()
+        row = task | dict(zip(("measure", "low", "high"), scale, strict=True))
+        with folder.adding(SCALES):  # another worker may have added the same row
+            folder.write_json(SCALES, [*(each for each in folder.read_rows(SCALES) if each != row), row])
+        return scale
 
     def cells(self) -> list[Cell]:
         """All cells, seed by seed; see ``cell``."""
