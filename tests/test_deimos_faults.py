@@ -229,7 +229,7 @@ def test_what_is_not_known_may_be_saved(method):
     for memory_of in (part.memory for part in with_parts(trainer.loop.selector) if getattr(part, "memory", None)):
         assert memory_of.stored
         memory_of._crash[0, 0] = torch.nan
-        with pytest.raises(SimulationError, match="memory.crash"):
+        with pytest.raises(SimulationError, match=r"memory\.crash"):
             check_finite(trainer)
 
 
