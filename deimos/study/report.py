@@ -32,10 +32,10 @@ FIGURES = "figures"
 FACTORS = ""
 COVERAGE = (  # docs/lab/study.md; `python -m reproduction coverage` simulates it again
     "Intervals of shares of policies are exact, but for those over all environments; all others are percentile "
-    "bootstraps over policies, but for the means under Distributions. Those of IQMs and medians cover some 93 to 94 % "
-    "at n = 10, of normal, lognormal and bimodal data alike; those of means 91, 80 and 78 %, so read the mean rates of "
-    "skewed populations with care. The means under Distributions have bootstrap-t intervals (some 95, 91 and 95 %); of "
-    "few seeds, or many equal values, a mean has none there."
+    "bootstraps over policies, but for the means under Distributions. Those of IQMs and medians cover 93 to 94 % at "
+    "n = 10, of normal, lognormal and bimodal data alike; ratios of spreads 94, 90 and 90 %; those of means 91, 81 and "
+    "80 %, so read the mean rates of skewed populations with care. The means under Distributions have bootstrap-t "
+    "intervals (95, 91 and 95 %); of few seeds, or many equal values, a mean has none there."
 )
 _median = partial(np.median, axis=-1)
 
