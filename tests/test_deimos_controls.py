@@ -285,13 +285,13 @@ def test_a_penalty_is_taken_from_the_learner_alone():
     torch.testing.assert_close(taken, 3.0 * plain.rollout.terminated * plain.env.config.largest_reward)
     assert torch.equal(plain.rollout.obs, punished.rollout.obs)
     assert rows[0]["reward"] == pytest.approx(rows[1]["reward"], rel=1e-5)
-    assert method("penalty-100").size == 10 * method("penalty-10").size == 100
-    assert mix.Config(base="penalty-10").build(SPACES, 0).crash_penalty == 10
+    assert (method("penalty-30").size, method("penalty-100").size) == (30, 100)
+    assert mix.Config(base="penalty-30").build(SPACES, 0).crash_penalty == 30
 
 
 def test_weights_make_goals_uniform():
     """In expectation over choices a goal's weighted frequency is Uniform's, for its own decision and overall."""
-    config = weighted.Config(candidates=20)
+    config = weighted.Config(candidates=20, mix=0.5, alpha=1.0)
     selector = history(config.build(SPACES, 0), across)
     arguments = decisions()
     chosen = selector.propose(*arguments)
@@ -322,8 +322,8 @@ def test_alpha_and_mix_span_from_uniform_to_the_director():
 
 
 def test_effective_share_and_state_shift_are_told():
-    """The share is 1 / E_u[u / q] = 0.625 at the defaults; the shift is 0.5 where goals move no states."""
-    selector = history(weighted.Config(candidates=100).build(SPACES, 0), across)
+    """The share is 1 / E_u[u / q] = 0.625 at a mix of 0.5; the shift is 0.5 where goals move no states."""
+    selector = history(weighted.Config(candidates=100, mix=0.5, alpha=1.0).build(SPACES, 0), across)
     selector.propose(*decisions(candidates=100))
     interactions = Interactions(WORLDS, STATE, GOAL, 3, 10, CPU)
     for shift, low, high in ((0.0, 0.35, 0.65), (3.0, 0.9, 1.0)):
@@ -346,12 +346,12 @@ def test_effective_share_and_state_shift_are_told():
 
 def test_the_learner_takes_the_weights():
     """A run's transitions weigh as their goal does, and a GoalDirector hands the weights out."""
-    run = small_run(weighted.Config(candidates=20))
+    run = small_run(weighted.Config(candidates=20, mix=0.5, alpha=1.0))
     for _ in range(4):
         run.iterate()
     assert {0.4, 1.0, 2.0} >= {round(value, 4) for value in run.rollout.weight.unique().tolist()} >= {0.4, 2.0}
     goals, no = (
-        GoalDirector(weighted.Config(candidates=9), goal_period=2, learn_every=4),
+        GoalDirector(weighted.Config(candidates=9, mix=0.5, alpha=1.0), goal_period=2, learn_every=4),
         torch.zeros(4, dtype=torch.bool),
     )
     seen = set()

@@ -229,7 +229,7 @@ from deimos import GoalDirector, load_policy
 assert callable(load_policy)
 no = torch.zeros(4, dtype=torch.bool)
 for name in ("p75", "uniform", "rnd", "cl", "learnability", "band", "boltzmann", "grid", "mix", "state-blind",
-             "swapped", "weighted", "fear-novelty", "q-fear", "penalty-10", "rnd-raw", "p75-literal"):
+             "swapped", "weighted", "fear-novelty", "q-fear", "penalty-30", "rnd-raw", "p75-literal"):
     goals = GoalDirector(name, goal_period=2, total_steps=100)
     for t in range(50):
         crash = no.clone()

@@ -206,7 +206,7 @@ def has_weights(name):
 
 def test_who_has_weights():
     """All of ours have, but those that only draw or count."""
-    without = {"uniform", "cl", "grid", "plr", "plr-robust", "penalty-10", "penalty-100"}
+    without = {"uniform", "cl", "grid", "plr", "plr-robust", "penalty-30", "penalty-100"}
     assert {name for name in METHODS if not has_weights(name)} == without
 
 

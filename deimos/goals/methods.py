@@ -42,7 +42,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "uniform-ensemble": ("vds", {"rule": "uniform"}),
     "vds-argmax": ("vds", {"rule": "argmax"}),
     "rnd-raw": ("rnd", {"whiten": False}),
-    "penalty-10": ("penalty", {"size": 10.0}),
+    "penalty-30": ("penalty", {"size": 30.0}),
     "penalty-100": ("penalty", {"size": 100.0}),
 }
 """Methods with names of their own: the selector, and its options where they are not the defaults."""

@@ -24,7 +24,7 @@ from deimos.nn.seeds import derive
 class Config(FearSelectorConfig):
     """Goals in proportion to p (1 - p) times their rank in novelty to the power of eta."""
 
-    eta: float = 1.0
+    eta: float = 4.0
     """0 for fear alone; the larger, the more novelty counts. In [0, 100]."""
     heads: int = 4
     """Fear networks, one of which is drawn for every decision, at least 1."""

@@ -17,7 +17,7 @@ class Config(SelectorConfig):
 
     base: str = "uniform"
     """Name of the method."""
-    size: float = 10.0
+    size: float = 30.0
     """What a crash takes, in units of the largest reward of a step, in [0, 1e6]."""
 
     def __post_init__(self) -> None:

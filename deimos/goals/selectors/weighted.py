@@ -27,9 +27,9 @@ class Config(FearSelectorConfig):
 
     percentile: float = 75.0
     """p, in [0, 100]: the share of candidates that the top-k leaves out [%]."""
-    mix: float = 0.5
+    mix: float = 0.25
     """Share of uniform goals, in (0, 1]; no weight is above 1 / mix."""
-    alpha: float = 1.0
+    alpha: float = 0.5
     """0 for weights of 1, a Director with a share of uniform goals; 1 for those that make goals uniform in
     expectation. In [0, 1]."""
 
