@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from deimos.app import cli
-from deimos.app.drawing import BLUE, HEADER, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing
+from deimos.app.drawing import BLUE, INK, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing, with_caption
 from deimos.app.playback import PlayOptions
 from deimos.app.video import ENDINGS, pictures, video
 from deimos.checks import RunError
@@ -83,7 +83,7 @@ def test_a_particle_is_drawn_where_it_is():
     assert pixel(0, -500, -500) == PAPER
     assert pixel(0, 1080, 0) == pixel(1, -1080, 0) == OUTSIDE
     blank = (picture == 255).all(axis=(1, 2))
-    assert abs(top + side + 8 + (top - HEADER) - 480) <= 1  # as much is left below as above
+    assert abs(top + side + 8 + (top - drawing._header) - 480) <= 1  # as much is left below as above
     assert blank[top + side :].all()
     counts = [int((picture == colour).all(axis=2).sum()) for colour in (ORANGE, RED)]
     assert counts[0] > 20
@@ -91,6 +91,24 @@ def test_a_particle_is_drawn_where_it_is():
     drawing()
     env.reset(torch.ones(1, dtype=torch.bool))
     assert int((drawing() == RED).all(axis=2).sum()) > counts[1] + 20
+
+
+@pytest.mark.parametrize("width", [160, 640, 1920])
+def test_a_caption_grows_with_the_picture(width):
+    """At the width of a phone (360 pixels) letters are more than 9 pixels high, and no word is cut off."""
+    blue = np.full((width, width, 3), BLUE, np.uint8)
+    goals = "  ".join(f"{value:+.2f}" for value in np.linspace(-1.0, 1.0, 12))
+
+    def inked(text):
+        """Rows and columns that hold letters, as first and last."""
+        rows, columns = np.nonzero((with_caption(blue, text) == INK).all(axis=2))
+        return rows.min(), rows.max(), columns.min(), columns.max()
+
+    first, last, *_ = inked("|")
+    assert 9.0 < (last - first) * 360 / width < 20.0
+    top, bottom, *_ = inked("goal")
+    assert inked(f"goal {goals}")[1] - top > 1.5 * (bottom - top)  # a second line
+    assert inked(f"goal {goals}")[3] < width - 2
 
 
 def test_a_velocity_leads_somewhere():

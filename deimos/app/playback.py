@@ -154,9 +154,9 @@ def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | No
 def _caption(env: Env, afraid: FearSelector | None, t: int, crashes: int) -> str:
     goal = env.obs[:, env.goal_slice]
     field = next(field for field in env.layout if field.name == "goal")
-    physical = (goal[0] / torch.as_tensor(field.scale)).tolist()
+    physical = (goal[0] / torch.as_tensor(field.scale)).round(decimals=2) + 0.0  # never "-0.00"
     now = f"{t * env.dt:5.2f} s" if env.has_seconds else f"step {t}"
-    text = f"{now}   crashes {crashes}   goal " + "  ".join(f"{value:+.2f}" for value in physical) + f"  [{field.unit}]"
+    text = f"{now}   crashes {crashes}   goal " + "  ".join(f"{value:+.2f}" for value in physical.tolist()) + f"  [{field.unit}]"
     if afraid is None:
         return text
     score = afraid.score(env.state(env.obs), goal, goal.unsqueeze(1))[:, 0]
