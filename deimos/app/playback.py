@@ -156,7 +156,8 @@ def _caption(env: Env, afraid: FearSelector | None, t: int, crashes: int) -> str
     field = next(field for field in env.layout if field.name == "goal")
     physical = (goal[0] / torch.as_tensor(field.scale)).round(decimals=2) + 0.0  # never "-0.00"
     now = f"{t * env.dt:5.2f} s" if env.has_seconds else f"step {t}"
-    text = f"{now}   crashes {crashes}   goal " + "  ".join(f"{value:+.2f}" for value in physical.tolist()) + f"  [{field.unit}]"
+    values = "  ".join(f"{value:+.2f}" for value in physical.tolist())
+    text = f"{now}   crashes {crashes}   goal {values}  [{field.unit}]"
     if afraid is None:
         return text
     score = afraid.score(env.state(env.obs), goal, goal.unsqueeze(1))[:, 0]
