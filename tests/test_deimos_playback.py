@@ -48,12 +48,27 @@ def test_every_format_that_help_names_works(particle, tmp_path, ending, capsys):
     asked = "--seconds 1 --fps 10 --width 160 --height 120".split()
     assert cli.main(["play", str(particle), "--video", str(path), *asked]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == str(path)
+    frames, seconds = decoded_webp(path) if ending == ".webp" else decoded(path)
+    frames = frames.reshape(10, 120, 160, 3)
+    assert len({frame.tobytes() for frame in frames}) > 1
+    assert seconds == pytest.approx(1.0, abs=0.06)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def decoded(path):
+    """The pictures of a video, by ffmpeg, uint8 and flat, and its duration [s]."""
     decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     raw = subprocess.run(decode, capture_output=True, check=True).stdout
-    frames = np.frombuffer(raw, np.uint8).reshape(10, 120, 160, 3)
-    assert len({frame.tobytes() for frame in frames}) > 1
-    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (10, pytest.approx(1.0, abs=0.06))
-    assert list(tmp_path.iterdir()) == [path]
+    return np.frombuffer(raw, np.uint8), imageio_ffmpeg.count_frames_and_secs(str(path))[1]
+
+
+def decoded_webp(path):
+    """The same by Pillow: ffmpeg reads no animated WebP."""
+    from PIL import Image, ImageSequence
+
+    with Image.open(path) as image:
+        found = [(np.asarray(frame.convert("RGB")), frame.info["duration"]) for frame in ImageSequence.Iterator(image)]
+    return np.stack([picture for picture, _ in found]), sum(duration for _, duration in found) / 1000
 
 
 def test_the_shortest_video_has_a_picture(particle, tmp_path, capsys):
@@ -132,7 +147,7 @@ def test_pictures_of_a_particle_need_no_mujoco(particle, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("x.avi", "video must end in one of .mp4, .mkv, .mov, .webm, .gif, got x.avi"),
+        ("x.avi", "video must end in one of .mp4, .mkv, .mov, .webm, .gif, .webp, got x.avi"),
         ("x", "video must end in one of"),
         ("nowhere/x.gif", "The folder of nowhere/x.gif does not exist"),
     ],
