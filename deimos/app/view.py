@@ -14,6 +14,7 @@ import tyro
 
 from deimos.app import console
 from deimos.app.drawing import with_caption
+from deimos.app.findings import percent
 from deimos.app.loading import SavedRun
 from deimos.app.playback import LARGEST, choose_renderer, rendering
 from deimos.app.video import video
@@ -25,7 +26,6 @@ from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.run.attack import attacker
 from deimos.run.attack import names as attacker_names
 
-FPS = 25.0  # pictures of a video and changes of the panel per second
 PATIENCE = 1.0  # [s] between two looks at whether the run has written a checkpoint
 SIDE_OF_MAP = 0.3  # of a picture's height, in its corner
 
@@ -63,6 +63,8 @@ class ViewOptions:
     """Video to write meanwhile: .mp4, .mkv, .mov, .webm, .gif or .webp. What is paused is left out."""
     seconds: float | None = None
     """End after so many simulated seconds, or 50 steps each where the world has none; by default when stopped."""
+    fps: float = 25.0
+    """Changes of the panel, and pictures of the video, per second, positive."""
     width: int = 640
     """Width of the video [pixels], in [16, 8192]."""
     height: int = 480
@@ -77,8 +79,9 @@ class ViewOptions:
                 check_at_least(name, getattr(self, name), 1)
         check_at_least("world", self.world, 0)
         check_range("seed", self.seed, 0, 2**32 - 1)
-        if self.seconds is not None:
-            check_positive("seconds", self.seconds, finite=True)
+        for name in ("fps", "seconds"):
+            if getattr(self, name) is not None:
+                check_positive(name, getattr(self, name), finite=True)
         for name in ("width", "height"):
             check_range(name, getattr(self, name), 16, LARGEST)
 
@@ -87,7 +90,10 @@ def main(arguments: list[str], program: str) -> None:
     """Run ``deimos view``."""
     options: ViewOptions = console.parse(ViewOptions, arguments, program)
     console.quiet_warp()
-    choose_renderer()
+    if options.record:
+        choose_renderer()
+        with rendering():
+            import mujoco  # noqa: F401 (it decides now how it will render)
     run = SavedRun.open(options.run, options.goal_period, options.terrain)
     with console.progress("attackers learn") as report:
         attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report)
@@ -107,25 +113,41 @@ def watch(session: Session, options: ViewOptions) -> None:
     """Show a session until it is stopped, the viewer is closed, or ``options.seconds`` have passed."""
     scene = build_scene(session)
     panel = Panel(scene)
+    left: KeyboardInterrupt | None = None
     with ExitStack() as stack:
-        write = stack.enter_context(_recorder(scene, options)) if options.record else lambda shown: None
+        write = stack.enter_context(_recorder(session, scene, options)) if options.record else lambda moment: None
         handle, port = stack.enter_context(serve(panel, options.port))
         print(f"http://{HOST}:{port}/ (Ctrl+C ends)", file=sys.stderr)
         if session.fear is None:
             print("There is no fear network in this run; --attackers argmax trains one for the map.", file=sys.stderr)
         try:
-            _simulate(session, scene, panel, handle, write, options.seconds)
-        except KeyboardInterrupt:  # it is how one leaves
-            pass
+            simulate(session, scene, panel, handle, write, fps=options.fps, seconds=options.seconds)
+        except KeyboardInterrupt as interrupt:  # it is how one leaves; a video is kept
+            left = interrupt
     if options.record:
         print(options.record)
+    if isinstance(left, console.Stopped):
+        raise left
 
 
-def _simulate(
-    session: Session, scene: Scene, panel: Panel, handle: Any, write: Callable[[Moment], object], seconds: float | None
-) -> None:
-    """Step at the pace of real time; a machine that is too slow falls behind instead of hurrying afterwards."""
-    every = max(1, round(1.0 / (FPS * session.seconds_per_step)))
+def simulate(
+    session: Session, scene: Scene, panel: Panel, handle: Any, write: Callable[[Moment], object], *,
+    fps: float, seconds: float | None,
+) -> None:  # fmt: skip
+    """Let a session run at the pace of real time, until its viewer is closed.
+
+    A machine that is too slow falls behind instead of hurrying afterwards.
+
+    Args:
+        session: What runs.
+        scene: What is shown of it.
+        panel: What stands beside it.
+        handle: The viewer, from ``serve``.
+        write: Takes every moment that the panel shows, unless it stands still.
+        fps: Moments per second, positive.
+        seconds: Duration, positive, in the seconds of the simulation; ``None`` for no end.
+    """
+    every = _stride(session, fps)
     due = looked = time.monotonic()
     handle.set_model(scene.model, data=scene.data)
     for tick in itertools.count():
@@ -137,10 +159,10 @@ def _simulate(
             session.step()
         scene.update()
         if tick % every == 0:
-            shown = Moment.of(session, scene)
-            panel.show(shown)
+            moment = Moment.of(session, scene)
+            panel.show(moment)
             if not session.paused:
-                write(shown)
+                write(moment)
         if not handle.is_running():
             return
         handle.sync(scene.model, scene.data)
@@ -152,8 +174,13 @@ def _simulate(
         panel.wait(due - now)
 
 
+def _stride(session: Session, fps: float) -> int:
+    """Steps from one moment that is shown to the next."""
+    return max(1, round(1.0 / (fps * session.seconds_per_step)))
+
+
 @contextmanager
-def _recorder(scene: Scene, options: ViewOptions) -> Iterator[Callable[[Moment], object]]:
+def _recorder(session: Session, scene: Scene, options: ViewOptions) -> Iterator[Callable[[Moment], object]]:
     """Gives what writes a moment into the video: the scene, its caption, and the map of fear in a corner."""
     assert options.record is not None
     with rendering():
@@ -163,34 +190,32 @@ def _recorder(scene: Scene, options: ViewOptions) -> Iterator[Callable[[Moment],
         renderer = mujoco.Renderer(scene.model, options.height, options.width)
     camera, colours = mujoco.MjvCamera(), np.round(255 * palette()).astype(np.uint8)
     camera.distance, camera.azimuth, camera.elevation = scene.distance, 130.0, scene.elevation
+    fps = 1.0 / (_stride(session, options.fps) * session.seconds_per_step)
+    with renderer, video(options.record, (options.width, options.height), fps) as send:
 
-    with renderer, video(options.record, (options.width, options.height), FPS) as send:
-
-        def write(shown: Moment) -> None:
+        def write(moment: Moment) -> None:
             camera.lookat[:] = scene.data.xpos[scene.body]
             renderer.update_scene(scene.data, camera)
             room = renderer.scene.geoms[renderer.scene.ngeom : renderer.scene.maxgeom]
-            for slot, geom in zip(room, shown.shapes, strict=False):
+            for slot, geom in zip(room, moment.shapes, strict=False):
                 mujoco.mjv_initGeom(slot, geom.type, np.zeros(3), np.zeros(3), np.eye(3).ravel(), geom.rgba)
                 slot.size, slot.pos, slot.mat = geom.size, geom.pos, geom.mat
                 renderer.scene.ngeom += 1
             picture = renderer.render().copy()
-            if shown.fear is not None:
-                inset = colours[shades(shown.fear)[::-1]]
+            if moment.fear is not None:
+                inset = colours[shades(moment.fear)[::-1]]
                 times = max(1, round(SIDE_OF_MAP * options.height / len(inset)))
                 inset = inset.repeat(times, axis=0).repeat(times, axis=1)[: options.height, : options.width]
                 picture[-len(inset) :, -len(inset[0]) :] = inset
-            send(with_caption(picture, caption(shown)))
+            send(with_caption(picture, caption(moment)))
 
         yield write
 
 
-def caption(shown: Moment) -> str:
+def caption(moment: Moment) -> str:
     """What stands in the corner of a picture: the time, who chooses the goals, the goal and its risk."""
-    from deimos.app.findings import percent
-
-    goal = "  ".join(f"{value + 0.0:+.2f}" for value in np.round(shown.goal, 2))
-    lines = [shown.text[0], f"goals: {shown.current}   {goal}"]
-    if shown.risk is not None:
-        lines.append(f"predicted crash probability {percent(shown.risk)}")
+    goal = "  ".join(f"{value + 0.0:+.2f}" for value in np.round(moment.goal, 2))
+    lines = [moment.text[0], f"goals: {moment.current}   {goal}"]
+    if moment.risk is not None:
+        lines.append(f"predicted crash probability {percent(moment.risk)}")
     return "\n".join(lines)

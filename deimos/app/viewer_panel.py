@@ -66,7 +66,7 @@ class Moment:
         time_text = f"{seconds:.1f} s" if session.env.has_seconds else f"step {session.steps}"
         text = (
             f"{time_text}   crashes {session.crashes}   episodes {session.episodes}",
-            f"T = {session.env.goal_period} steps   checkpoint {session.loads}",
+            f"T = {session.env.goal_period} steps   policy of iteration {session.iteration}",
         )
         return cls(
             text=text, names=session.names, current=session.goals.current, world=session.world, paused=session.paused,
@@ -91,7 +91,6 @@ class Panel:
         self._asked: queue.SimpleQueue[Command] = queue.SimpleQueue()
         self._colours = np.round(255 * palette()).astype(np.uint8)
         self._follows = True
-        self._has_carpet = True
         self._texture = 0
         self._drawn: FearMap | None = None  # what the texture shows
         self.frames = 0
@@ -134,12 +133,13 @@ class Panel:
         from mujoco.studio import ux
         from mujoco.studio.dear_imgui import dear_imgui as imgui
 
+        if not self.frames:
+            ux.setup_theme(ux.GuiTheme.LIGHT)
         self.frames += 1
         shown = self._shown
         if shown is None:
             return
-        viewer.extra_geoms[:] = shown.shapes if self._has_carpet else shown.shapes[:1]
-        ux.setup_theme(ux.GuiTheme.LIGHT)
+        viewer.extra_geoms[:] = shown.shapes
         imgui.SetNextWindowPos(imgui.Vec2(10, 10), int(imgui.Cond.FirstUseEver))
         imgui.SetNextWindowSize(imgui.Vec2(WIDTH, 0))
         imgui.Begin("Deimos", True, int(imgui.WindowFlags.NoSavedSettings))
@@ -175,7 +175,7 @@ class Panel:
             if changed:
                 self.place_camera(viewer)
             imgui.SameLine()
-            _, self._has_carpet = imgui.Checkbox("carpet of fear", self._has_carpet)
+            _, self._scene.has_carpet = imgui.Checkbox("carpet of fear", self._scene.has_carpet)
 
     def _draw_goal(self, imgui: Any, shown: Moment) -> None:
         """A slider per component of the goal: to move one is to choose by hand."""
@@ -206,8 +206,10 @@ class Panel:
             side = len(opaque)
             self._texture = viewer.upload_image(self._texture, opaque.tobytes(), side, side, 4)
             self._drawn = fear
+        corner = imgui.GetCursorScreenPos()
         imgui.Image(self._texture, imgui.Vec2(MAP, MAP))
-        corner = imgui.GetItemRectMin()
+        imgui.SetCursorScreenPos(corner)
+        imgui.InvisibleButton("map", imgui.Vec2(MAP, MAP))  # else a click would move the panel
         lists, low, size = (
             imgui.GetWindowDrawList(),
             fear.low,
@@ -217,7 +219,7 @@ class Panel:
             share = [(goal[axis] - low[k]) / size[k] for k, axis in enumerate(fear.axes)]
             middle = imgui.Vec2(corner.x + MAP * share[0], corner.y + MAP * (1.0 - share[1]))
             lists.AddCircle(middle, radius, imgui.ColorConvertFloat4ToU32(imgui.Vec4(*colour)), 0, 2.5)
-        if imgui.IsItemHovered() and imgui.IsMouseDown(0):
+        if imgui.IsItemActive():
             mouse, goal = imgui.GetMousePos(), list(shown.goal)
             goal[fear.axes[0]] = low[0] + size[0] * (mouse.x - corner.x) / MAP
             goal[fear.axes[1]] = low[1] + size[1] * (1.0 - (mouse.y - corner.y) / MAP)

@@ -50,6 +50,8 @@ class Scene(abc.ABC):
     """Angle of the camera above the horizon, negative when it looks down [degrees]."""
     body: int
     """The body that a camera may follow; 0 where nothing is to be followed."""
+    has_carpet: bool = True
+    """Whether fear lies around a robot as a carpet."""
 
     @abc.abstractmethod
     def update(self) -> None:
@@ -102,7 +104,7 @@ class RobotScene(Scene):
         point = self._session.env.goal_point(0)
         if point is not None:
             shapes.append(sphere(point, 0.025, RED))
-        if fear is not None and fear.axes == (0, 1) and self._is_flat:
+        if fear is not None and fear.axes == (0, 1) and self._is_flat and self.has_carpet:
             shapes += self._carpet(fear)
         return shapes
 

@@ -129,7 +129,7 @@ class Session:
         """Load the policy and the fear network as they are now; the worlds go on."""
         current, own = (self.goals.current, self.goals.own) if self.loads else (UNIFORM, None)
         self._stamp = self._stamps()
-        self._policy = self._run.policy(self.env)
+        self._policy, self.iteration = self._run.policy(self.env), self._run.iteration()
         trained = self._run.fear(self.env)
         self.fear = trained or (self._fallback(self.env) if self._fallback else None)
         choices = {UNIFORM: uniform_goals(self.env)}
