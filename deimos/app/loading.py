@@ -68,9 +68,9 @@ class SavedRun:
         return policy
 
     def iteration(self) -> int:
-        """The iteration of the training that the run has come to; 0 where it has no checkpoint."""
-        is_there = (self.folder.path / "checkpoint.pt").exists()
-        return int(load_checkpoint(self.folder)["iteration"]) if is_there else 0
+        """The iteration of the training that the run has come to; 0 where it has no log."""
+        rows = self.folder.read_csv("progress.csv")
+        return int(rows[-1]["iteration"]) if rows else 0
 
     def build(self, num_envs: int, seed: int, world: int) -> Env:
         """Make worlds on the CPU, the first of the global number ``world``.

@@ -4,6 +4,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     import mujoco
 
 WIDTH = 330  # [pixels] of the panel
-MAP = 300  # [pixels] along a side of the map
+MAP = 250  # [pixels] along a side of the map
 WHITE, ORANGE, CYAN = (1.0, 1.0, 1.0, 1.0), (1.0, 0.6, 0.0, 1.0), (0.3, 1.0, 1.0, 1.0)
 Command = Callable[[Session], object]
 """What a person asks of a session."""
@@ -66,7 +67,7 @@ class Moment:
         time_text = f"{seconds:.1f} s" if session.env.has_seconds else f"step {session.steps}"
         text = (
             f"{time_text}   crashes {session.crashes}   episodes {session.episodes}",
-            f"T = {session.env.goal_period} steps   policy of iteration {session.iteration}",
+            f"T = {session.env.goal_period} steps   iteration {session.iteration}",
         )
         return cls(
             text=text, names=session.names, current=session.goals.current, world=session.world, paused=session.paused,
@@ -238,8 +239,12 @@ class Panel:
                 imgui.SameLine()
             changed, axes[k] = imgui.Combo(label, axes[k], names)
             if changed and axes[0] != axes[1]:
-                self.ask(lambda session, axes=tuple(axes): setattr(session, "axes", axes))
+                self.ask(partial(_set_axes, axes=(axes[0], axes[1])))
         imgui.PopItemWidth()
+
+
+def _set_axes(session: Session, axes: tuple[int, int]) -> None:
+    session.axes = axes
 
 
 def _step_once(session: Session) -> None:

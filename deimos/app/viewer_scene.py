@@ -172,9 +172,9 @@ class BoxScene(Scene):
                     self._trail.clear()
             elif age[world] > self._age[world]:
                 self._velocity[world] = place - old.position / old.half_side
+                if world == 0 and age[0] % STRIDE == 0:
+                    self._trail = [*self._trail[-TRAIL:], place]
             self.data.mocap_pos[world] = place
-        if age[0] % STRIDE == 0:
-            self._trail = [*self._trail[-TRAIL:], self._sketches[0].position / self._sketches[0].half_side]
         del self._ends[:-MARKS]
         self._age = age
         mujoco.mj_forward(self.model, self.data)

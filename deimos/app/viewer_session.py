@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -113,6 +114,7 @@ class Session:
         self.paused = False
         self.axes = (0, 1)
         self.crashes = self.steps = self.episodes = self.loads = 0
+        self.goals = Steered({})
         self._go_to(world)
 
     def _go_to(self, world: int) -> None:
@@ -127,7 +129,7 @@ class Session:
 
     def _load(self) -> None:
         """Load the policy and the fear network as they are now; the worlds go on."""
-        current, own = (self.goals.current, self.goals.own) if self.loads else (UNIFORM, None)
+        current, own = self.goals.current, self.goals.own
         self._stamp = self._stamps()
         self._policy, self.iteration = self._run.policy(self.env), self._run.iteration()
         trained = self._run.fear(self.env)
@@ -271,8 +273,8 @@ class Session:
         found = self._risks(goals.view(1, SIDE * SIDE, -1))
         if found is None:
             return None
-        ends = tuple((float(end[first]), float(end[second])) for end in (low, high))
-        return FearMap(self.axes, *ends, found.view(SIDE, SIDE))
+        lowest, highest = ((float(end[first]), float(end[second])) for end in (low, high))
+        return FearMap(self.axes, lowest, highest, found.view(SIDE, SIDE))
 
 
 def prepare(
@@ -297,12 +299,12 @@ def prepare(
     if slow:
         raise RunError(f"{slow[0]} tries every goal in clones of the world, which is too slow to be watched.")
     env = run.build(1, 0, 0)
-    policy, learnt = run.policy(env), {}
+    policy = run.policy(env)
+    target = make_target(policy.scaled, run.config.env, replace(run.config.eval, worlds=worlds), env.device)
+    learnt = target.learnt  # what one attacker has learnt is there for the others
     attacks = {}
     for name in names:
-        target = make_target(policy.scaled, run.config.env, replace(run.config.eval, worlds=worlds), env.device)
-        target = replace(target, learnt=learnt, progress=lambda share, name=name: report(name, share))
-        attacks[name] = attacker(name).prepare(target)
+        attacks[name] = attacker(name).prepare(replace(target, progress=partial(report, name)))
     fitted = [(fear, facts) for fear, facts in learnt.values() if fear.fitted]
     if not fitted:
         return attacks, None

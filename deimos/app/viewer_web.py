@@ -7,6 +7,7 @@ until the thread that simulates takes it.
 import contextlib
 import io
 import logging
+import socket
 from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -45,8 +46,18 @@ def serve(panel: Panel, port: int) -> "Iterator[tuple[ViewerHandle, int]]":
                 panel.wait(0.01)
         except RuntimeError as error:
             raise RunError(f"Port {port} is in use on {HOST}; choose another --port, or 0 for a free one.") from error
+        found = made.pop().port  # the viewer itself belongs to its thread, which ends before this process does
         with handle:
-            yield handle, made[0].port
+            _await_answer(found, panel, handle)
+            yield handle, found
+
+
+def _await_answer(port: int, panel: Panel, handle: "ViewerHandle") -> None:
+    """Wait until somebody listens on a port that is bound already."""
+    while handle.is_running():
+        with contextlib.suppress(ConnectionRefusedError), socket.create_connection((HOST, port)):
+            return
+        panel.wait(0.01)
 
 
 def _run(endpoint: Any, config: Any, plugins: list[Any], made: list[Any]) -> None:
@@ -56,6 +67,11 @@ def _run(endpoint: Any, config: Any, plugins: list[Any], made: list[Any]) -> Non
     viewer = _loopback_viewer()(config, endpoint, plugins=plugins)
     made.append(viewer)
     viewer_protocol.run_viewer_loop(viewer)
+    # Who holds whom in a circle is undone, so that the viewer is freed here, in its own thread: the garbage collector
+    # would do it in any other, beside another viewer's graphics, and the process would crash.
+    viewer.plugins = None
+    for plugin in plugins:
+        plugin.viewer = None
 
 
 def _loopback_viewer() -> Any:
