@@ -189,7 +189,7 @@ def test_a_new_checkpoint_is_loaded_where_the_worlds_are(scared, tmp_path):
             weights.add_(1.0)
     save_policy(run / "policy.pt", policy)
     assert session.reload()
-    assert (session.loads, session.steps, session.goals.current) == (2, 5, "p75")
+    assert (session.steps, session.goals.current) == (5, "p75")
     assert torch.equal(session.env.obs, place)
     assert not torch.equal(session._policy.scaled(session.env.obs), before)
     assert not session.reload()
@@ -329,6 +329,8 @@ def test_a_video_is_recorded_meanwhile(scared, tmp_path):
         (["--goals", "argmax"], "There is no 'argmax' for --goals here; there are: uniform, p75, and with --attackers"),
         (["--attackers", "oracle"], "oracle tries every goal in clones of the world, which is too slow to be watched"),
         (["--attackers", "nobody"], "There is no attacker 'nobody'"),
+        (["--attackers", "pooled"], "pool must be a file of deimos pool for the attacker pooled, got none"),
+        (["--attackers", "argmax", "argmax"], "attackers must be different, got argmax, argmax"),
         (["--terrain", "rough"], "terrain is for legged robots"),
         (["--port", "70000"], r"port must be in [0, 65535], got 70000"),
     ],

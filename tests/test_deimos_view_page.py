@@ -165,3 +165,15 @@ def test_a_broken_panel_stops_the_simulation(robot, monkeypatch):
     with pytest.raises(ZeroDivisionError, match="a fault"), serve(panel, 0) as (handle, port), viewer.Page(port):
         simulate(robot, scene, panel, handle, lambda moment: None, fps=25.0, seconds=PATIENCE)
     assert torch.isfinite(robot.env.obs).all()
+
+
+def test_the_benchmark_measures_frames_and_cost(capsys):
+    """Frames are counted and trainings run alone and beside the viewer; the table says all of it."""
+    tiny = "--num-envs 16 --env-steps 120 --threads 1 --env.goal-period 5".split()
+    found = viewer.measure(1, seconds=1.0, options=tiny)
+    assert found["state frames per second"] > 0
+    assert set(found["training, FPS"]) == {"alone", "beside the viewer"}
+    alone, beside = found["training, FPS"].values()
+    assert found["beside the viewer / alone"] == pytest.approx(beside / alone)
+    viewer.show(found)
+    assert f"{found['beside the viewer / alone']:.3f}" in capsys.readouterr().out

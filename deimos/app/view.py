@@ -23,7 +23,6 @@ from deimos.app.viewer_scene import Scene, build_scene, palette, shades
 from deimos.app.viewer_session import UNIFORM, Session, prepare
 from deimos.app.viewer_web import HOST, serve
 from deimos.checks import RunError, check_at_least, check_positive, check_range
-from deimos.run.attack import attacker
 from deimos.run.attack import names as attacker_names
 
 PATIENCE = 1.0  # [s] between two looks at whether the run has written a checkpoint
@@ -72,8 +71,6 @@ class ViewOptions:
 
     def __post_init__(self) -> None:
         check_range("port", self.port, 0, 65535)
-        for name in self.attackers:
-            attacker(name)
         for name in ("attacker_worlds", "worlds", "goal_period"):
             if getattr(self, name) is not None:
                 check_at_least(name, getattr(self, name), 1)

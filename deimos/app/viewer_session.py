@@ -113,7 +113,7 @@ class Session:
         self._attacks, self._fallback = dict(attacks or {}), afraid
         self.paused = False
         self.axes = (0, 1)
-        self.crashes = self.steps = self.episodes = self.loads = 0
+        self.crashes = self.steps = self.episodes = 0
         self.goals = Steered({})
         self._go_to(world)
 
@@ -141,7 +141,6 @@ class Session:
         self.goals = Steered(choices)
         self.goals.current, self.goals.own = current if current in (*choices, BY_HAND) else UNIFORM, own
         self._loop = GoalLoop(self.env, self.goals)
-        self.loads += 1
 
     def _stamps(self) -> list[tuple[int, int]]:
         """What tells whether the files of a run are those that were loaded."""
@@ -293,14 +292,18 @@ def prepare(
         crash rate that it has met; ``None`` where none has.
 
     Raises:
-        RunError: If an attacker is too slow to be watched.
+        RunError: If an attacker is unknown, lacks what it needs, or is too slow to be watched.
     """
+    try:
+        setting = replace(run.config.eval, attackers=tuple(names), worlds=worlds)
+    except ValueError as error:
+        raise RunError(str(error)) from error
     slow = [name for name in names if attacker(name).few_worlds]
     if slow:
         raise RunError(f"{slow[0]} tries every goal in clones of the world, which is too slow to be watched.")
     env = run.build(1, 0, 0)
     policy = run.policy(env)
-    target = make_target(policy.scaled, run.config.env, replace(run.config.eval, worlds=worlds), env.device)
+    target = make_target(policy.scaled, run.config.env, setting, env.device)
     learnt = target.learnt  # what one attacker has learnt is there for the others
     attacks = {}
     for name in names:
