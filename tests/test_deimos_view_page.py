@@ -1,6 +1,7 @@
 """The page of ``deimos view``, met as a browser meets it, but for the drawing; and who cannot meet it."""
 
 import errno
+import gc
 import socket
 import threading
 import time
@@ -23,6 +24,19 @@ from deimos.run.trainer import TrainConfig
 from deimos.sim.envs.particle import Config
 
 PATIENCE = 120.0  # [s] for frames, on a machine that does other things
+
+# MuJoCo's server leaves the connection between its own halves to the garbage collector.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _collect_garbage():
+    """What a test leaves is collected before another test is blamed for it."""
+    yield
+    gc.collect()
 
 
 def some_fear(env):

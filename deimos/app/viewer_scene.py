@@ -137,7 +137,7 @@ class BoxScene(Scene):
         session: Where they live.
     """
 
-    distance, elevation, body = 4.2, -20.0, 0
+    distance, elevation, body = 4.8, -20.0, 0
 
     def __init__(self, session: Session) -> None:
         import mujoco
