@@ -190,7 +190,7 @@ class BoxScene(Scene):
             shapes.append(line(place, target, 0.003, (*ORANGE[:3], 0.6 * faint)))
             shapes.append(line(place, place + ahead * self._velocity[world], 0.012, (*BLUE[:3], faint), arrow=True))
         shapes += [line(a, b, 0.004, BLUE) for a, b in zip(self._trail, self._trail[1:], strict=False)]
-        return shapes + [sphere(end, 0.012, RED) for end in self._ends]
+        return shapes + [sphere(end, 0.025, RED) for end in self._ends]
 
 
 def sphere(place: np.ndarray, radius: float, colour: tuple[float, ...]) -> "mujoco.MjvGeom":
