@@ -116,7 +116,8 @@ def watch(session: Session, options: ViewOptions) -> None:
         handle, port = stack.enter_context(serve(panel, options.port))
         print(f"http://{HOST}:{port}/ (Ctrl+C ends)", file=sys.stderr)
         if session.fear is None:
-            print("There is no fear network in this run; --attackers argmax trains one for the map.", file=sys.stderr)
+            advice = "none of the attackers has learnt one" if options.attackers else "--attackers argmax trains one"
+            print(f"There is no fear network for a map: {advice}.", file=sys.stderr)
         try:
             simulate(session, scene, panel, handle, write, fps=options.fps, seconds=options.seconds)
         except KeyboardInterrupt as interrupt:  # it is how one leaves; a video is kept

@@ -196,7 +196,7 @@ class Panel:
         """The map of fear, with the active goal in white and the next one in cyan; a click chooses by hand."""
         imgui.SeparatorText("predicted probability of a crash within T")
         if shown.fear is None:
-            imgui.TextUnformatted("No fear network: see --attackers.")
+            imgui.TextUnformatted("There is no fear network.")
             return
         if len(shown.components) > 2:
             self._draw_axes(imgui, shown)
