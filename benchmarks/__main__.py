@@ -23,6 +23,7 @@ from benchmarks import (
     table41,
     terrain,
     training,
+    viewer,
 )
 from benchmarks.timing import wide_console
 from deimos.checks import RunError, check_at_least, check_positive
@@ -53,6 +54,7 @@ class BenchOptions:
             "learner",
             "commits",
             "table41",
+            "viewer",
         ]
     ]
     """What to measure."""
@@ -98,6 +100,10 @@ def run(options: BenchOptions) -> dict[str, Any]:
     if options.what == "commits":
         results["commits"] = commits.measure(options.against, options.rounds, options.threads or cores())
         commits.show(results["commits"], options.against)
+        return _write(results, options.json)
+    if options.what == "viewer":
+        results["viewer"] = viewer.measure(options.rounds)
+        viewer.show(results["viewer"])
         return _write(results, options.json)
     if options.what == "learner":
         results["learner"] = learner.measure(options.rounds)

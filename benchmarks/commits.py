@@ -55,7 +55,7 @@ def compare(other: Path, rounds: int, threads: int, jobs: dict[str, list[str]] =
         runs: dict[str, list[dict[str, float]]] = {"other": [], "this": []}
         for _ in range(rounds):
             for name, home in (("other", other), ("this", HOME)):
-                runs[name].append(_run(home, [*options, "--threads", str(threads)]))
+                runs[name].append(train_once(home, [*options, "--threads", str(threads)]))
         ratios = [
             {key: this[key] / that[key] for key in this} for this, that in zip(runs["this"], runs["other"], strict=True)
         ]
@@ -63,7 +63,7 @@ def compare(other: Path, rounds: int, threads: int, jobs: dict[str, list[str]] =
     return results
 
 
-def _run(home: Path, options: list[str]) -> dict[str, float]:
+def train_once(home: Path, options: list[str]) -> dict[str, float]:
     """Train in a checkout; waiting threads sleep, so that a busy machine disturbs less."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"

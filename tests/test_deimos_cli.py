@@ -106,7 +106,7 @@ TRAIN_ERRORS = {
     "--init-from there": "there is not a run folder: it holds no config.json",
 }
 OTHER_ERRORS = {
-    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, pool, study, play, robot, terrain",
+    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, pool, study, play, view, robot,",
     "--bogus": "There is no command '--bogus'",
     "evaluate": "Missing from deimos evaluate: .*Folder of the run",
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
@@ -419,7 +419,8 @@ def test_usage_lists_the_commands(capsys, arguments):
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
     assert all(
-        re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate", "study", "play", "terrain")
+        re.search(rf"^  {name} ", out, re.MULTILINE)
+        for name in ("train", "evaluate", "study", "play", "view", "terrain")
     )
 
 
@@ -490,7 +491,9 @@ def test_plugins_are_one_line_in_a_list():
             assert "\n\n" not in module.Config.__doc__.strip(), name
 
 
-@pytest.mark.parametrize("command", ["evaluate", "play", "study", "study run", "study show", "terrain", "terrain grid"])
+@pytest.mark.parametrize(
+    "command", ["evaluate", "play", "view", "study", "study run", "study show", "terrain", "terrain grid"]
+)
 def test_other_commands_explain_themselves(capsys, command):
     """The other commands have a help too."""
     assert "--help" in shown_help(command.split(), capsys)

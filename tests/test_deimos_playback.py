@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from deimos.app import cli
-from deimos.app.drawing import BLUE, HEADER, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing
+from deimos.app.drawing import BLUE, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing, with_caption
 from deimos.app.playback import PlayOptions
 from deimos.app.video import ENDINGS, pictures, video
 from deimos.checks import RunError
@@ -48,12 +48,27 @@ def test_every_format_that_help_names_works(particle, tmp_path, ending, capsys):
     asked = "--seconds 1 --fps 10 --width 160 --height 120".split()
     assert cli.main(["play", str(particle), "--video", str(path), *asked]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == str(path)
+    frames, seconds = decoded_webp(path) if ending == ".webp" else decoded(path)
+    frames = frames.reshape(10, 120, 160, 3)
+    assert len({frame.tobytes() for frame in frames}) > 1
+    assert seconds == pytest.approx(1.0, abs=0.06)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def decoded(path):
+    """The pictures of a video, by ffmpeg, uint8 and flat, and its duration [s]."""
     decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     raw = subprocess.run(decode, capture_output=True, check=True).stdout
-    frames = np.frombuffer(raw, np.uint8).reshape(10, 120, 160, 3)
-    assert len({frame.tobytes() for frame in frames}) > 1
-    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (10, pytest.approx(1.0, abs=0.06))
-    assert list(tmp_path.iterdir()) == [path]
+    return np.frombuffer(raw, np.uint8), imageio_ffmpeg.count_frames_and_secs(str(path))[1]
+
+
+def decoded_webp(path):
+    """The same by Pillow: ffmpeg reads no animated WebP."""
+    from PIL import Image, ImageSequence
+
+    with Image.open(path) as image:
+        found = [(np.asarray(frame.convert("RGB")), frame.info["duration"]) for frame in ImageSequence.Iterator(image)]
+    return np.stack([picture for picture, _ in found]), sum(duration for _, duration in found) / 1000
 
 
 def test_the_shortest_video_has_a_picture(particle, tmp_path, capsys):
@@ -83,7 +98,7 @@ def test_a_particle_is_drawn_where_it_is():
     assert pixel(0, -500, -500) == PAPER
     assert pixel(0, 1080, 0) == pixel(1, -1080, 0) == OUTSIDE
     blank = (picture == 255).all(axis=(1, 2))
-    assert abs(top + side + 8 + (top - HEADER) - 480) <= 1  # as much is left below as above
+    assert abs(top + side + 8 + (top - drawing._header) - 480) <= 1  # as much is left below as above
     assert blank[top + side :].all()
     counts = [int((picture == colour).all(axis=2).sum()) for colour in (ORANGE, RED)]
     assert counts[0] > 20
@@ -91,6 +106,24 @@ def test_a_particle_is_drawn_where_it_is():
     drawing()
     env.reset(torch.ones(1, dtype=torch.bool))
     assert int((drawing() == RED).all(axis=2).sum()) > counts[1] + 20
+
+
+@pytest.mark.parametrize("width", [160, 640, 1920])
+def test_a_caption_grows_with_the_picture(width):
+    """At the width of a phone (360 pixels) letters are more than 9 pixels high, and no word is cut off."""
+    blue = np.full((width, width, 3), BLUE, np.uint8)
+    goals = "  ".join(f"{value:+.2f}" for value in np.linspace(-1.0, 1.0, 12))
+
+    def inked(text):
+        """Rows and columns that hold letters, as first and last."""
+        rows, columns = np.nonzero(with_caption(blue, text).max(axis=2) < 170)
+        return rows.min(), rows.max(), columns.min(), columns.max()
+
+    first, last, *_ = inked("|")
+    assert 9.0 < (last - first) * 360 / width < 20.0
+    top, bottom, *_ = inked("goal")
+    assert inked(f"goal {goals}")[1] - top > 1.5 * (bottom - top)  # a second line
+    assert inked(f"goal {goals}")[3] < width - 2
 
 
 def test_a_velocity_leads_somewhere():
@@ -114,7 +147,7 @@ def test_pictures_of_a_particle_need_no_mujoco(particle, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("x.avi", "video must end in one of .mp4, .mkv, .mov, .webm, .gif, got x.avi"),
+        ("x.avi", "video must end in one of .mp4, .mkv, .mov, .webm, .gif, .webp, got x.avi"),
         ("x", "video must end in one of"),
         ("nowhere/x.gif", "The folder of nowhere/x.gif does not exist"),
     ],

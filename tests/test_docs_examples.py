@@ -48,6 +48,7 @@ BUDGETS = {
     "evaluate": {"--worlds": "8", "--oracle-worlds": "4", "--calibration": "100", "--contexts": "2"},
     "study run": {"--methods": "uniform p25", "--num-envs": "16", "--env-steps": "48", "--threads": "1"},
     "play": {"--seconds": "0.2", "--fps": "10", "--width": "64", "--height": "48"},
+    "view": {"--seconds": "0.2", "--attacker-worlds": "8", "--width": "64", "--height": "48"},
 }
 """By command: what its options become. Those of ``evaluate`` only where the page gives them."""
 SMALL = {
@@ -185,7 +186,7 @@ class Session:
                 arguments = shortened(arguments, {"--seeds": "{0}-{0}".format(*re.findall(r"\d+", seeds))})
         if arguments[:2] == ["study", "attack"]:
             arguments = [*arguments, "--allow-uncommitted"]
-        if name in ("play", "robot"):  # MuJoCo decides once in a process how it renders
+        if name in ("play", "robot", "view"):  # MuJoCo decides once in a process how it renders
             self.process(sys.executable, "-m", "deimos", *shortened(arguments, BUDGETS.get(name, {})))
             return
         budget = BUDGETS.get(name, {})

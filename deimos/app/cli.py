@@ -26,6 +26,7 @@ COMMANDS = {
     "pool": ("deimos.app.pool", "train the network of the attacker pooled on other runs"),
     "study": ("deimos.app.study", "train and compare populations of policies"),
     "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
+    "view": ("deimos.app.view", "watch a policy in the browser, and drive it, also while it trains"),
     "robot": ("deimos.app.robot", "check a robot of your own, and draft its file from an MJCF"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }

@@ -1,5 +1,6 @@
 """Worlds that are points in a box, drawn from above and from the side, and the captions of all pictures."""
 
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,8 @@ VIEWS = {"from above: x, y": (0, 1), "from the side: x, z": (0, 2)}
 REACH = 1.15  # half sides of the box that are seen
 TRAIL = 150  # pictures that the trail goes back
 FINE = 2  # pixels drawn for every pixel shown, along both axes
-HEADER = 72  # [pixels] above the boxes, for the caption and the legend
+LETTERS = 1 / 32  # of a picture's width: as high as letters are, so that a phone shows them
+LINES = 4.6  # heights of letters that are kept free above the boxes, for the caption and the legend
 
 
 class Drawing:
@@ -29,8 +31,10 @@ class Drawing:
 
     def __init__(self, env: Env, width: int, height: int) -> None:
         self._env, self._width, self._height = env, width, height
-        self._side = max(1, min(width // 2, height - HEADER) - 8)
-        self._top = HEADER + max(0, height - HEADER - self._side - 8) // 2
+        self._letters = letters(width)
+        self._header = round(LINES * self._letters)
+        self._side = max(1, min(width // 2, height - self._header) - 8)
+        self._top = self._header + max(0, height - self._header - self._side - 8) // 2
         ends = "ends of episodes" if env.time_limit else "crashes"
         self._legend = (("particle", BLUE), ("goal (or where it leads)", ORANGE), (ends, RED))
         self._trail: list[np.ndarray] = []
@@ -55,8 +59,8 @@ class Drawing:
             picture.paste(self._view(sketch, axes, name), (left, self._top))
         draw, left = ImageDraw.Draw(picture), gap
         for text, colour in self._legend:
-            draw.text((left, self._top - 20), text, fill=colour, font_size=12)
-            left += round(draw.textlength(text, font_size=12)) + 16
+            draw.text((left, self._top - 1.5 * self._letters), text, fill=colour, font_size=self._letters)
+            left += round(draw.textlength(text, font_size=self._letters)) + self._letters
         return np.asarray(picture)
 
     def _view(self, sketch: Sketch, axes: tuple[int, int], name: str) -> "Image":
@@ -88,17 +92,26 @@ class Drawing:
         draw.line([at(point) for point in self._trail], fill=BLUE, width=FINE + 1)
         draw.ellipse(around(sketch.position, 5), fill=BLUE)
         image = image.reduce(FINE)
-        ImageDraw.Draw(image).text((6, self._side - 18), name, fill=INK, font_size=12)
+        place = (self._letters / 2, self._side - 1.4 * self._letters)
+        ImageDraw.Draw(image).text(place, name, fill=INK, font_size=self._letters)
         return image
 
 
+def letters(width: int) -> int:
+    """Height of the letters in a picture of a width [pixels], at least 8."""
+    return max(8, round(LETTERS * width))
+
+
 def with_caption(picture: np.ndarray, text: str) -> np.ndarray:
-    """A picture with lines of text in its upper left corner."""
+    """A picture, uint8, shape (height, width, 3), with lines of text in its upper left corner, wrapped at its width."""
     from PIL import Image, ImageDraw
 
     image = Image.fromarray(picture)
-    draw = ImageDraw.Draw(image)
-    box = draw.multiline_textbbox((8, 6), text, font_size=14)
-    draw.rectangle((0, 0, box[2] + 8, box[3] + 6), fill=(255, 255, 255))
-    draw.multiline_text((8, 6), text, fill=(20, 20, 20), font_size=14)
+    draw, size = ImageDraw.Draw(image), letters(image.width)
+    corner = (size / 2, size / 3)
+    columns = max(1, int((image.width - size) / draw.textlength("0", font_size=size)))
+    lines = [textwrap.fill(line, columns, break_on_hyphens=False) for line in text.splitlines()]
+    box = draw.multiline_textbbox(corner, "\n".join(lines), font_size=size)
+    draw.rectangle((0, 0, box[2] + size / 2, box[3] + size / 3), fill=PAPER)
+    draw.multiline_text(corner, "\n".join(lines), fill=INK, font_size=size)
     return np.asarray(image)

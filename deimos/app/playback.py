@@ -14,17 +14,14 @@ import tyro
 from deimos.app import console
 from deimos.app.drawing import Drawing, with_caption
 from deimos.app.findings import percent
+from deimos.app.loading import SavedRun
 from deimos.app.video import pictures, video
 from deimos.checks import RunError, check_at_least, check_positive, check_range
-from deimos.goals.fear_selector import FearSelector, fear_selector
+from deimos.goals.fear_selector import FearSelector
 from deimos.goals.selectors import uniform
-from deimos.learn.policy import Policy, load_policy
-from deimos.run.folder import RunFolder
+from deimos.learn.policy import Policy
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.trainer import TrainConfig
-from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
-from deimos.sim.legged.config import LocomotionConfig
 
 LARGEST = 8192  # [pixels] along a side of a picture
 PACE = 50.0  # steps per second of video, in worlds that have no seconds
@@ -42,7 +39,7 @@ class PlayOptions:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     video: Path | None = None
-    """Video to write: .mp4, .mkv, .mov, .webm or .gif."""
+    """Video to write: .mp4, .mkv, .mov, .webm, .gif or .webp."""
     frames: Path | None = None
     """Folder for single pictures (.png) instead; must not exist."""
     seconds: float = 10.0
@@ -85,18 +82,12 @@ def main(arguments: list[str], program: str) -> None:
     options: PlayOptions = console.parse(PlayOptions, arguments, program)
     console.quiet_warp()
     choose_renderer()
-    folder = RunFolder.open(options.run)
-    config = read_config(folder)
-    if isinstance(config.env, LocomotionConfig):
+    run = SavedRun.open(options.run, options.goal_period)
+    if run.has_robots:
         with rendering():
             import mujoco  # noqa: F401 (it decides now how it will render)
-    policy = load_policy(folder.path)
-    try:
-        env_config = config.env.for_evaluation().with_goal_period(options.goal_period or config.env.goal_period)
-        env = env_config.build(1, torch.device("cpu"), options.seed, options.world)
-    except ValueError as error:
-        raise RunError(str(error)) from error
-    _render(env, policy, _fear(folder, config, env), options)
+    env = run.build(1, options.seed, options.world)
+    _render(env, run.policy(env), run.fear(env), options)
     print(options.target)
 
 
@@ -138,25 +129,13 @@ def rendering() -> Iterator[None]:
         ) from error
 
 
-def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | None:
-    """The selector with the fear network that the run has learnt, if it has one."""
-    afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
-    if afraid is None or afraid.parts:
-        return None
-    state = load_checkpoint(folder)["loop"]["selector"]
-    if "fear" not in state:  # it is a part of another selector
-        return None
-    for name in ("fear", "calibration"):  # what else there is depends on the version that wrote it
-        getattr(afraid, name).load_state_dict(state[name])
-    return afraid if afraid.fear.fitted else None
-
-
 def _caption(env: Env, afraid: FearSelector | None, t: int, crashes: int) -> str:
     goal = env.obs[:, env.goal_slice]
     field = next(field for field in env.layout if field.name == "goal")
-    physical = (goal[0] / torch.as_tensor(field.scale)).tolist()
+    physical = (goal[0] / torch.as_tensor(field.scale)).round(decimals=2) + 0.0  # never "-0.00"
     now = f"{t * env.dt:5.2f} s" if env.has_seconds else f"step {t}"
-    text = f"{now}   crashes {crashes}   goal " + "  ".join(f"{value:+.2f}" for value in physical) + f"  [{field.unit}]"
+    values = "  ".join(f"{value:+.2f}" for value in physical.tolist())
+    text = f"{now}   crashes {crashes}   goal {values}  [{field.unit}]"
     if afraid is None:
         return text
     score = afraid.score(env.state(env.obs), goal, goal.unsqueeze(1))[:, 0]

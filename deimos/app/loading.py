@@ -1,0 +1,97 @@
+"""What the commands that show a policy load of its run: the policy, its worlds, its fear network."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from deimos.checks import RunError
+from deimos.goals.fear_selector import FearSelector, fear_selector
+from deimos.learn.policy import Policy, load_policy
+from deimos.run.folder import RunFolder
+from deimos.run.loop import spaces
+from deimos.run.trainer import TrainConfig
+from deimos.run.training import load_checkpoint, read_config
+from deimos.sim.env import Env
+from deimos.sim.legged.config import LocomotionConfig
+
+
+@dataclass(frozen=True)
+class SavedRun:
+    """A run whose policy is shown."""
+
+    folder: RunFolder
+    """Its folder."""
+    config: TrainConfig
+    """What it was started with; of the environment, what the worlds that are shown are built from."""
+
+    @classmethod
+    def open(cls, path: Path, goal_period: int | None = None, terrain: str | None = None) -> "SavedRun":
+        """Open the folder of a run.
+
+        Args:
+            path: The folder.
+            goal_period: T; ``None`` for that of the training.
+            terrain: What robots stand on; ``None`` for the ground of the training.
+
+        Raises:
+            RunError: If it is no run, or has no robots to put on a terrain.
+        """
+        folder = RunFolder.open(path)
+        config = read_config(folder)
+        env = config.env.for_evaluation().with_goal_period(goal_period or config.env.goal_period)
+        if terrain is not None:
+            if not isinstance(env, LocomotionConfig):
+                raise RunError(f"terrain is for legged robots; {path} is a run of another environment.")
+            env = replace(env, terrain=terrain)
+        return cls(folder, replace(config, env=env))
+
+    @property
+    def has_robots(self) -> bool:
+        """Whether MuJoCo simulates its worlds."""
+        return isinstance(self.config.env, LocomotionConfig)
+
+    def policy(self, env: Env) -> Policy:
+        """The policy as it is now.
+
+        Raises:
+            RunError: If there is none, or it observes other things than ``env`` shows.
+        """
+        policy = load_policy(self.folder.path)
+        if policy.layout != env.layout:
+            has, needs = (
+                ", ".join(f"{field.name} ({field.size})" for field in seen) for seen in (env.layout, policy.layout)
+            )
+            raise RunError(
+                f"The policy in {self.folder.path} is one of another environment: it observes {needs}, here is {has}."
+            )
+        return policy
+
+    def iteration(self) -> int:
+        """The iteration of the training that the run has come to; 0 where it has no log."""
+        rows = self.folder.read_csv("progress.csv")
+        return int(rows[-1]["iteration"]) if rows else 0
+
+    def build(self, num_envs: int, seed: int, world: int) -> Env:
+        """Make worlds on the CPU, the first of the global number ``world``.
+
+        Raises:
+            RunError: If they cannot be made.
+        """
+        try:
+            return self.config.env.build(num_envs, torch.device("cpu"), seed, world)
+        except ValueError as error:
+            raise RunError(str(error)) from error
+
+    def fear(self, env: Env) -> FearSelector | None:
+        """The selector with the fear network that the run has learnt by now, if it has one."""
+        config = self.config
+        afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
+        if afraid is None or afraid.parts:
+            return None
+        state = load_checkpoint(self.folder)["loop"]["selector"]
+        if "fear" not in state:  # it is a part of another selector
+            return None
+        for name in ("fear", "calibration"):  # what else there is depends on the version that wrote it
+            getattr(afraid, name).load_state_dict(state[name])
+        return afraid if afraid.fear.fitted else None

@@ -1,0 +1,193 @@
+"""The page of ``deimos view``, met as a browser meets it, but for the drawing; and who cannot meet it."""
+
+import errno
+import gc
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks import viewer
+from deimos.app.loading import SavedRun
+from deimos.app.view import simulate
+from deimos.app.viewer_panel import Panel
+from deimos.app.viewer_scene import build_scene
+from deimos.app.viewer_session import BY_HAND, Session
+from deimos.app.viewer_web import serve
+from deimos.goals.fear import Fear, FearConfig
+from deimos.run import training
+from deimos.run.attack import argmax_director
+from deimos.run.trainer import TrainConfig
+from deimos.sim.envs.particle import Config
+
+PATIENCE = 120.0  # [s] for frames, on a machine that does other things
+
+# MuJoCo's server leaves the connection between its own halves to the garbage collector.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _collect_garbage():
+    """What a test leaves is collected before another test is blamed for it."""
+    yield
+    gc.collect()
+
+
+def some_fear(env):
+    """A selector with a fear network that nobody has taught: its map is as good as any to be drawn."""
+    fear = Fear(FearConfig(), env.state_dim, env.goal_dim, env.device, seed=0)
+    fear.fitted = True
+    return argmax_director(env, fear)
+
+
+@pytest.fixture(scope="module")
+def particles(tmp_path_factory):
+    """Three particles under a policy that has learnt nothing."""
+    path = tmp_path_factory.mktemp("page") / "run"
+    config = TrainConfig(env=Config(goal_period=10), num_envs=2, device="cpu", threads=1, evaluation=False)
+    _, folder = training.start(config, path)
+    return Session(SavedRun.open(folder.path), 3, seed=5, afraid=some_fear)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    """A Go1 under the policy that walks."""
+    run = SavedRun.open(Path(__file__).parent.parent / "docs" / "results" / "quad_flat")
+    return Session(run, 1, seed=5, afraid=some_fear)
+
+
+def meet(session, during=lambda page, panel: None, frames=4):
+    """Serve a session until a page has received some frames; gives the page, the panel and what the page loaded."""
+    scene = build_scene(session)
+    panel = Panel(scene)
+
+    def leave():
+        end = time.monotonic() + PATIENCE
+        while len(page.states) < frames and time.monotonic() < end:
+            time.sleep(0.02)
+        during(page, panel)
+        panel.ask(interrupt)
+
+    def interrupt(session):
+        raise KeyboardInterrupt
+
+    with serve(panel, 0) as (handle, port), viewer.Page(port) as page:
+        loaded = {path: page.get(path) for path in ("/", "/web_client.js")}
+        watcher = threading.Thread(target=leave)
+        watcher.start()
+        with pytest.raises(KeyboardInterrupt):
+            simulate(session, scene, panel, handle, lambda moment: None, fps=25.0, seconds=None)
+        loaded["/model"] = page.get("/model")
+        watcher.join()
+    return page, panel, loaded
+
+
+def test_a_page_gets_the_model_and_moving_states(robot):
+    """The page, its program and the model are served as browsers need them; states follow, the last as it stands."""
+
+    def during(page, panel):
+        panel.ask(lambda session: setattr(session, "paused", True))
+        end, count = time.monotonic() + PATIENCE, len(page.states)
+        while len(page.states) < count + 20 and time.monotonic() < end:
+            time.sleep(0.02)
+
+    page, panel, loaded = meet(robot, during)
+    robot.paused = False
+    headers, text = loaded["/"]
+    assert b"<canvas" in text
+    assert headers["cross-origin-opener-policy"] == "same-origin"  # else browsers withhold shared memory
+    assert headers["cross-origin-embedder-policy"] == "require-corp"
+    assert len(loaded["/web_client.js"][1]) > 1000
+    model, data = robot.env.scene(0)
+    assert model.names in loaded["/model"][1]
+    assert len({state for _, state in page.states}) >= 3
+    assert data.qpos.tobytes() not in page.states[0][1]
+    assert data.qpos.tobytes() in page.states[-1][1]
+    assert panel.frames >= 3
+    assert page.drawn > 0
+
+
+def test_particles_have_a_page(particles):
+    """Particles, their goals and the map of fear are served like robots."""
+    page, panel, _ = meet(particles)
+    assert len({state for _, state in page.states}) >= 3
+    assert panel.frames >= 3
+
+
+def test_what_a_person_does_reaches_the_worlds(particles):
+    """What is asked for in the panel's thread is done between two steps of the simulation."""
+
+    def during(page, panel):
+        panel.ask(lambda session: session.ask([1.0, 2.0, 3.0]))
+        panel.ask(lambda session: setattr(session, "paused", True))
+
+    meet(particles, during)
+    assert particles.goals.current == BY_HAND
+    assert particles.goal == pytest.approx([1.0, 2.0, 3.0])
+    assert particles.paused
+    particles.paused = False
+
+
+def own_addresses():
+    """Addresses of this machine that are not 127.0.0.1: another one of the loopback's, IPv6's, the network's."""
+    found = {("127.0.0.2", socket.AF_INET), ("::1", socket.AF_INET6)}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing; it is an address of documentation (RFC 5737)
+            found.add((probe.getsockname()[0], socket.AF_INET))
+        except OSError:
+            pass  # there is no network here
+    return sorted(found - {("127.0.0.1", socket.AF_INET)})
+
+
+def test_no_other_address_is_served(robot):
+    """On the same port, this machine's other addresses refuse what 127.0.0.1 accepts."""
+    panel = Panel(build_scene(robot))
+    with serve(panel, 0) as (_, port):
+        with socket.create_connection(("127.0.0.1", port), timeout=10):
+            pass
+        for address, family in own_addresses():
+            with socket.socket(family) as caller:
+                caller.settimeout(10)
+                assert caller.connect_ex((address, port)) in (errno.ECONNREFUSED, errno.EADDRNOTAVAIL), address
+
+
+def test_a_port_is_free_again(robot):
+    """Once it is closed, the page is gone and its port can be had again."""
+    for _ in range(2):
+        with serve(Panel(build_scene(robot)), 18_431) as (_, port):
+            assert port == 18_431
+    with socket.socket() as caller:
+        assert caller.connect_ex(("127.0.0.1", 18_431)) == errno.ECONNREFUSED
+
+
+def test_a_broken_panel_stops_the_simulation(robot, monkeypatch):
+    """A fault in the viewer's thread ends the simulation with it, instead of leaving a page that stands still."""
+
+    def broken(self, viewer):
+        raise ZeroDivisionError("a fault")
+
+    monkeypatch.setattr(Panel, "draw", broken)
+    scene = build_scene(robot)
+    panel = Panel(scene)
+    with pytest.raises(ZeroDivisionError, match="a fault"), serve(panel, 0) as (handle, port), viewer.Page(port):
+        simulate(robot, scene, panel, handle, lambda moment: None, fps=25.0, seconds=PATIENCE)
+    assert torch.isfinite(robot.env.obs).all()
+
+
+def test_the_benchmark_measures_frames_and_cost(capsys):
+    """Frames are counted and trainings run alone and beside the viewer; the table says all of it."""
+    tiny = "--num-envs 16 --env-steps 120 --threads 1 --env.goal-period 5".split()
+    found = viewer.measure(1, seconds=1.0, options=tiny)
+    assert found["state frames per second"] > 0
+    assert set(found["training, FPS"]) == {"alone", "beside the viewer"}
+    alone, beside = found["training, FPS"].values()
+    assert found["beside the viewer / alone"] == pytest.approx(beside / alone)
+    viewer.show(found)
+    assert f"{found['beside the viewer / alone']:.3f}" in capsys.readouterr().out
