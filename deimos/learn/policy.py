@@ -38,8 +38,9 @@ class Policy(nn.Module):
         self.layout = tuple(layout)
         self.action_bound = action_bound
         self.dt = dt
-        like = {"dtype": torch.float32, "device": actor.std.device}
-        self.register_buffer("scale", torch.cat([torch.as_tensor(f.scale, **like).expand(f.size) for f in layout]))
+        device = actor.std.device
+        scale = [torch.as_tensor(f.scale, dtype=torch.float32, device=device).expand(f.size) for f in layout]
+        self.register_buffer("scale", torch.cat(scale))
         self.goal_slice = goal_slice(self.layout)
 
     @torch.no_grad()
