@@ -19,7 +19,7 @@ import warp as wp
 from benchmarks.faults import files, injections, kills, memory, options, tomls
 from benchmarks.faults.trial import Verdict
 from deimos.checks import RunError, check_at_least
-from deimos.files import write_whole
+from deimos.files import write_bytes
 from deimos.run.training import provenance
 
 KINDS = {
@@ -69,7 +69,7 @@ def run(options: FaultOptions) -> list[Verdict]:
         known["seconds"] += time.monotonic() - begin
         known["versions"] = provenance()
         text = json.dumps(results, indent=1) + "\n"
-        write_whole(options.json, lambda file, text=text: file.write(text.encode()))
+        write_bytes(options.json, text.encode())
         if verdict.fault:
             print(f"{number}: {verdict.what}\n  {verdict.fault}: {verdict.said}", flush=True)
     verdicts = [Verdict(**{"said": ""} | attack) for attack in attacks]

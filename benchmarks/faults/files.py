@@ -26,7 +26,7 @@ from deimos.study.folder import StudyFolder
 from deimos.study.results import merge
 from terrain.grid import Terrain, flat
 
-SECONDS = 60.0
+SECONDS = 20.0
 SEALED = {"checkpoint.pt", "policy.pt", "ground.npz", "policies.zip", "fear.pt"}  # have checksums: no other contents
 NESTED = "[" * 100_000 + "]" * 100_000
 

@@ -1,12 +1,13 @@
 """Kills at random moments, some within a save: whatever was killed is resumed bit for bit."""
 
-import functools
 import os
 import shutil
 import signal
 import tempfile
 import time
+from collections import Counter
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,7 @@ def train(path: Path, method: str, engine: str | None, kill_at: int = 0) -> None
     training.train(trainer, folder)
 
 
-@functools.cache
+@cache
 def uninterrupted(method: str, engine: str | None) -> tuple[tuple[bytes, ...], float]:
     """What a run leaves that nobody kills, and how long it takes [s]."""
     with tempfile.TemporaryDirectory() as place:
@@ -80,15 +81,13 @@ def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
     """Kill a run one to three times, and compare what it leaves in the end with what it leaves uninterrupted."""
     method, engine = RUNS[number % COUNT]
     expected, seconds = uninterrupted(method, engine)
-    within, kills = number % SAVES == 0, []
-    for _ in range(rng.integers(1, 4)):
-        if within and not kills:
-            ended = attempt(lambda: train(place / "run", method, engine, int(draw)), place, SECONDS) if (
-                draw := rng.integers(3, 18)) else None  # fmt: skip
-        else:
-            ended = _killed(place, method, engine, float(rng.uniform(0.0, seconds)))
-        assert ended is not None
-        kills.append("in a save" if within and not kills else "at random")
+    kills = []
+    for i in range(rng.integers(1, 4)):
+        within = number % SAVES == 0 and i == 0
+        work = partial(train, place / "run", method, engine, int(rng.integers(3, 18)) if within else 0)
+        moment = SECONDS if within else float(rng.uniform(0.0, seconds))
+        ended = attempt(work, place, moment, signal.SIGKILL)
+        kills.append("too late" if ended.code == 0 else "in a save" if within else "at random")
         if ended.code not in (0, -signal.SIGKILL):
             return Verdict("fault", f"{method} {engine or ''}", ended.said[-2000:], f"exit code {ended.code}")
     ended = attempt(lambda: train(place / "run", method, engine), place, SECONDS)
@@ -100,4 +99,4 @@ def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
     differing = [name for name, a, b in zip(names, found, expected, strict=True) if a != b]
     left = [path.name for path in (place / "run").glob("*.partial")]
     fault = f"differs: {', '.join(differing)}" if differing else f"left {left}" if left else ""
-    return Verdict("fault" if fault else "bit for bit", what, fault=fault)
+    return Verdict("fault" if fault else "bit for bit", what, fault=fault, figures=dict(Counter(kills)))

@@ -82,7 +82,7 @@ def damaged(rng: np.random.Generator) -> str:
         text[:a], text[a:], text[:a] + text[b:], text + text[a:b],
         text[:a] + str(rng.choice(["\0", "\udcff", "\u2028", "]", "[", "{", "=", '"""', "\n[x]\n"])) + text[a:],
         text + "x = " + "[" * depth + "]" * depth, text + "x" + ".x" * depth + " = 1",
-        text + f"seeds_ = {10**5000}\n", "\ufeff" + text, text.replace("seeds = 2", f"seeds = {10 ** int(b)}"),
+        text.replace("seeds = 2", "seeds = 1" + "0" * int(rng.choice([6, 12, 40, 5000]))), "\ufeff" + text,
     ]  # fmt: skip
     return ways[rng.integers(len(ways))]
 
@@ -97,7 +97,7 @@ def _inline(value: Any) -> str:
         return "{" + ", ".join(f"{_text(key)} = {_inline(part)}" for key, part in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_inline, value)) + "]"
-    return _text(value) if isinstance(value, str) else str(value).lower()
+    return _text(value) if isinstance(value, str) else repr(value).lower()
 
 
 def _text(value: str) -> str:

@@ -47,18 +47,19 @@ class Ended:
     said: str
     """What it wrote to stderr."""
     asked: bool
-    """Whether it was asked to end, by SIGTERM, since its time was over."""
+    """Whether it was asked to end since its time was over."""
     hung: bool
     """Whether it did not do so and was killed."""
 
 
-def attempt(work: Callable[[], Any], place: Path, seconds: float) -> Ended:
+def attempt(work: Callable[[], Any], place: Path, seconds: float, stop: int = signal.SIGTERM) -> Ended:
     """Do some work in a copy of this process, which starts at once as everything is loaded.
 
     Args:
         work: Gives the exit code; ``None`` is 0. An error that it raises is a traceback and 1.
         place: The folder that it works in.
         seconds: When it is asked to end [s].
+        stop: The signal that asks.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -73,7 +74,7 @@ def attempt(work: Callable[[], Any], place: Path, seconds: float) -> Ended:
             break
         if time.monotonic() > end:
             hung = asked
-            os.kill(process, signal.SIGKILL if asked else signal.SIGTERM)
+            os.kill(process, signal.SIGKILL if asked else stop)
             asked, end = True, time.monotonic() + GRACE_SECONDS
         time.sleep(POLL_SECONDS)
     said = (place / "stderr.txt").read_text(errors="replace") if (place / "stderr.txt").exists() else ""

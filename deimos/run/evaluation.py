@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from deimos.checks import RunError, check_at_least, check_range
-from deimos.files import open_file
+from deimos.files import read_bytes
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
@@ -204,8 +204,7 @@ def _setting(shared: dict, config: EvalConfig, name: str) -> str:
 
 def _read(path: Path) -> bytes:
     try:
-        with open_file(path) as file:
-            return file.read()
+        return read_bytes(path)
     except OSError as error:
         raise RunError(f"{path} cannot be read ({error.strerror}).") from error
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least, check_range
+from deimos.files import read_bytes
 from deimos.nn.layout import ObsField, goal_slice
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ class EnvConfig(abc.ABC):
 
     def read_file(self, name: str) -> tuple[bytes, str]:
         """What a run keeps of one of ``files``, whole in itself, and the ending of its copy."""
-        return self.files[name].read_bytes(), self.files[name].suffix
+        return read_bytes(self.files[name]), self.files[name].suffix
 
     @final
     def file_hashes(self) -> dict[str, str]:
