@@ -107,7 +107,7 @@ def _prepare_process() -> None:
             null = open(os.devnull, "w" if number else "r")
             os.dup2(null.fileno(), number)
             setattr(sys, name, null)
-        elif isinstance(stream, io.TextIOWrapper):
+        elif number and isinstance(stream, io.TextIOWrapper):  # not what is read, which may have been begun
             stream.reconfigure(errors="backslashreplace")  # a path that this terminal cannot spell
 
 
