@@ -293,6 +293,22 @@ def test_limits_of_a_process_are_one_line(monkeypatch, capfd, error, said):
     assert said in line
 
 
+@pytest.mark.parametrize("gigabytes", [0.2, 0.4, 0.8, 1.0])
+def test_a_process_that_may_not_have_enough_says_so(tmp_path, gigabytes):
+    """Wherever libraries stop loading for want of memory, it is one line with the reason, and no folder is left."""
+    bounded = f'ulimit -v {int(gigabytes * 1e6)}; exec "$@"'
+    done = subprocess.run(
+        ["bash", "-c", bounded, "bash", sys.executable, "-m", "deimos", *FLAGS, "--out", "run"], cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(HOME), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (0, 2)  # a smaller torch may fit
+    assert (tmp_path / "run").exists() == (done.returncode == 0)
+    if done.returncode:
+        assert done.stderr.splitlines()[-1].startswith("deimos: ")
+
+
 def test_other_errors_are_not_hidden(monkeypatch):
     """A fault of the program keeps its traceback."""
 

@@ -109,7 +109,7 @@ def judged(what: str, ended: Ended) -> Verdict:
         fault = "a traceback"
     elif ended.code < 0:
         fault = f"ended by {signal.Signals(-ended.code).name}"
-    elif ended.asked and ended.code not in (0, 128 + signal.SIGTERM):
+    elif ended.asked and ended.code not in (0, 2, 128 + signal.SIGTERM):
         fault = f"exit code {ended.code} after SIGTERM"
     elif not ended.asked and ended.code not in (0, 2):
         fault = f"exit code {ended.code}"

@@ -90,6 +90,8 @@ def _shortage(error: BaseException) -> str:
         return "The system does not let this process start another thread; see ulimit -u, or use fewer --threads."
     if isinstance(error, MemoryError):
         return "There is not enough memory for this, or the limit of this process (ulimit -v) is too low."
+    if isinstance(error.__cause__, OSError):  # how Warp says that one of its libraries did not fit
+        return f"{str(error).rstrip('.')} ({error.__cause__})."
     from deimos.run.memory import is_shortage
 
     return f"There is not enough memory for this ({error})." if is_shortage(error) else ""
