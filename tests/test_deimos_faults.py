@@ -25,6 +25,7 @@ from deimos.run.failure import check_finite
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import particle
+from deimos.study import cli as study_cli
 
 HOME = Path(deimos.__file__).resolve().parent.parent
 CPU = torch.device("cpu")
@@ -142,6 +143,21 @@ def test_a_signal_is_one_line_and_its_exit_code(monkeypatch, capfd, name):
     monkeypatch.setattr(cli, "_run", lambda arguments: signal.raise_signal(number))
     assert cli.main([]) == 128 + number
     assert capfd.readouterr().err == "deimos: Interrupted; files written so far are intact.\n"
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+def test_a_study_ends_by_the_signal_that_came(monkeypatch, tmp_path, name, code):
+    """A study that a cluster ends lets its workers stop, and its exit code says by what."""
+    asked = []
+
+    def run(options, stopped, report):
+        signal.raise_signal(getattr(signal, name))
+        asked.append(stopped())
+        raise SystemExit(130)
+
+    monkeypatch.setattr(study_cli.RunOptions, "run", run)
+    assert cli.main(["study", "run", str(tmp_path)]) == code
+    assert asked == [True]
 
 
 FLAGS = (
