@@ -56,6 +56,12 @@ def open_file(path: Path, mode: str = "rb", **text: Any) -> Any:
     return open(path, mode, opener=opener, **text)
 
 
+def read_bytes(path: Path) -> bytes:
+    """What a file holds; raises as ``open_file`` does."""
+    with open_file(path) as file:
+        return file.read()
+
+
 def save_tensors(path: Path, data: dict) -> None:
     """Write a file of tensors so that at every moment either the old or the new one is complete.
 
@@ -87,6 +93,11 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     finally:  # an interrupt too must not leave half a file
         with contextlib.suppress(OSError):  # nothing can be deleted on a read-only disk
             temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """``write_whole`` for what is there already."""
+    write_whole(path, lambda file: file.write(data))
 
 
 def remove_partial(path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos.files import write_whole
+from deimos.files import write_bytes, write_whole
 
 from .grid import Terrain
 from .mesh import Mesh
@@ -56,7 +56,7 @@ def save(path: Path, terrain: Terrain, mesh: Mesh) -> None:
         _save_grey(path, terrain)
     else:
         data = _mesh_bytes(mesh, ending)
-        write_whole(path, lambda file: file.write(data))
+        write_bytes(path, data)
 
 
 def grey(terrain: Terrain) -> tuple[np.ndarray, float, float]:
@@ -88,8 +88,8 @@ def save_mjcf(folder: Path, terrain: Terrain) -> None:
     )  # fmt: skip
     rows = np.ascontiguousarray((terrain.heights - low).T, "<f4")  # MuJoCo scales them to [0, 1] itself
     header = struct.pack("<ii", *rows.shape)
-    write_whole(folder / MJCF_FILES[1], lambda file: file.write(header + rows.tobytes()))
-    write_whole(folder / MJCF_FILES[0], lambda file: file.write(text.encode()))
+    write_bytes(folder / MJCF_FILES[1], header + rows.tobytes())
+    write_bytes(folder / MJCF_FILES[0], text.encode())
 
 
 def _mesh_bytes(mesh: Mesh, ending: str) -> bytes:

@@ -4,6 +4,8 @@ import tomllib
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from deimos.files import read_bytes
+
 from .catalog import convert, make
 from .grid import Terrain
 from .world import Grid, Share, build
@@ -55,7 +57,7 @@ def read_grid(path: str | Path, **changes: Any) -> Grid:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return tomllib.loads(path.read_text(encoding="utf-8"))
+    return tomllib.loads(read_bytes(path).decode())
 
 
 def _read_preset(name: str) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from deimos.run.failure import check_finite
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import particle
+from deimos.study import cli as study_cli
 
 HOME = Path(deimos.__file__).resolve().parent.parent
 CPU = torch.device("cpu")
@@ -146,6 +147,21 @@ def test_a_signal_is_one_line_and_its_exit_code(monkeypatch, capfd, name):
     monkeypatch.setattr(cli, "_run", lambda arguments: signal.raise_signal(number))
     assert cli.main([]) == 128 + number
     assert capfd.readouterr().err == "deimos: Interrupted; files written so far are intact.\n"
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+def test_a_study_ends_by_the_signal_that_came(monkeypatch, tmp_path, name, code):
+    """A study that a cluster ends lets its workers stop, and its exit code says by what."""
+    asked = []
+
+    def run(options, stopped, report):
+        signal.raise_signal(getattr(signal, name))
+        asked.append(stopped())
+        raise SystemExit(130)
+
+    monkeypatch.setattr(study_cli.RunOptions, "run", run)
+    assert cli.main(["study", "run", str(tmp_path)]) == code
+    assert asked == [True]
 
 
 FLAGS = (
@@ -301,6 +317,22 @@ def test_limits_of_a_process_are_one_line(monkeypatch, capfd, error, said):
     assert cli.main([]) == 2
     (line,) = capfd.readouterr().err.splitlines()
     assert said in line
+
+
+@pytest.mark.parametrize("gigabytes", [0.2, 0.4, 0.8, 1.0])
+def test_a_process_that_may_not_have_enough_says_so(tmp_path, gigabytes):
+    """Wherever libraries stop loading for want of memory, it is one line with the reason, and no folder is left."""
+    bounded = f'ulimit -v {int(gigabytes * 1e6)}; exec "$@"'
+    done = subprocess.run(
+        ["bash", "-c", bounded, "bash", sys.executable, "-m", "deimos", *FLAGS, "--out", "run"], cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(HOME), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (0, 2)  # a smaller torch may fit
+    assert (tmp_path / "run").exists() == (done.returncode == 0)
+    if done.returncode:
+        assert done.stderr.splitlines()[-1].startswith("deimos: ")
 
 
 def test_other_errors_are_not_hidden(monkeypatch):

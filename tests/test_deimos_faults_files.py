@@ -5,6 +5,7 @@ import os
 import resource
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +15,13 @@ from hypothesis import strategies as st
 
 from deimos.checks import RunError
 from deimos.files import file_name, load_arrays, load_tensors, save_tensors, write_whole
+from deimos.run.config import from_dict
 from deimos.run.evaluation import EvalConfig, read_evaluation
 from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig
+from deimos.study import archive, plan
 from deimos.study.document import to_html, to_markdown
+from deimos.study.folder import StudyFolder
 from terrain.grid import Terrain, flat
 
 # Anything that a person, an editor or a disk may leave: the property holds for each, so few examples do.
@@ -253,6 +258,43 @@ def test_options_are_taken_or_refused_in_one_line(capfd, value):
     else:
         assert 1 <= value < 2**31
         assert int(value) == value
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"env": {"kind": ["x"]}}, "must name its 'kind'"),
+        ({"env": {"kind": "particle", "max_speed": 10**400}}, "max_speed must be a number, got 1000"),
+        ({"env": {"kind": "particle", "max_speed": "fast"}}, "max_speed must be a number, got 'fast'"),
+        ({"env": {"kind": "particle", "goal_period": True}}, "goal_period must be a whole number, got True"),
+        ({"env": {"kind": "particle", "variant": 3}}, "variant must be one of"),
+        ({"evaluation": "no"}, "evaluation must be true or false, got 'no'"),
+        ({"ppo": {"clip_value": 1}}, "clip_value must be true or false, got 1"),
+        ({"eval": {"pool": 7}}, "pool must be a path, got 7"),
+        ({"seed": 0.5}, "seed must be a whole number, got 0.5"),
+        ({"method": ["p25"]}, r"method must be a text, got \['p25'\]"),
+        ({"ppo": 3}, "PPOConfig must be a table of its fields, got 3"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_by_its_key(changes, message):
+    """Whatever type a file gives a field, the field is named, and nothing is taken for what it is not."""
+    with pytest.raises(ValueError, match=message):
+        from_dict(TrainConfig, changes)
+
+
+def test_a_pipe_in_a_study_is_refused(tmp_path):
+    """Nobody waits for a pipe in place of a study's file, a table, an archive or a list of failures."""
+    study, cell = StudyFolder(tmp_path), SimpleNamespace(name="a")
+    (tmp_path / "cells" / "a").mkdir(parents=True)
+    for name in ("study.toml", "results.csv", "policies.zip", "cells/a/failures.jsonl"):
+        os.mkfifo(tmp_path / name)
+    for read in (lambda: plan.read(tmp_path / "study.toml"), study.results, lambda: archive.unpack(study)):
+        with pytest.raises(RunError, match="not a regular file"):
+            read()
+    with pytest.raises(OSError, match="not a regular file"):
+        study.failures(cell)
+    with pytest.raises(OSError, match="No such device"):  # the system's word for a pipe that nobody reads
+        study.record_failure(cell, "killed")
 
 
 def test_a_page_holds_no_tags_of_names():

@@ -91,6 +91,8 @@ def _shortage(error: BaseException) -> str:
         return "The system does not let this process start another thread; see ulimit -u, or use fewer --threads."
     if isinstance(error, MemoryError):
         return "There is not enough memory for this, or the limit of this process (ulimit -v) is too low."
+    if isinstance(error.__cause__, OSError):  # how Warp says that one of its libraries did not fit
+        return f"{str(error).rstrip('.')} ({error.__cause__})."
     from deimos.run.memory import is_shortage
 
     return f"There is not enough memory for this ({error})." if is_shortage(error) else ""
@@ -108,7 +110,7 @@ def _prepare_process() -> None:
             null = open(os.devnull, "w" if number else "r")
             os.dup2(null.fileno(), number)
             setattr(sys, name, null)
-        elif isinstance(stream, io.TextIOWrapper):
+        elif number and isinstance(stream, io.TextIOWrapper):  # not what is read, which may have been begun
             stream.reconfigure(errors="backslashreplace")  # a path that this terminal cannot spell
 
 

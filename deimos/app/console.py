@@ -175,6 +175,9 @@ def _refuse(event: Any) -> None:
             raise RunError(f"{name}: {event.message}" if name else event.message)
         case "InvalidChoice":
             raise RunError(f"There is no '{event.value}' for {name}; there are: {', '.join(map(repr, event.choices))}.")
+        case "SubcommandConflict":
+            chosen, flag = event.already_selected, event.trigger_flag
+            raise RunError(f"{event.attempted} must stand before {flag}, which is an option of {chosen}.")
         case "BadValue":
             raise RunError(f"Missing value for argument '{name}'.")
         case "UnrecognizedArgs":

@@ -116,7 +116,7 @@ class GoalDirector:
             self._draw()
         self._clock += 1
         due = self._clock >= self.goal_period
-        reward = torch.zeros(len(state), device=state.device) if tracking is None else tracking.float()
+        reward = torch.zeros_like(terminated, dtype=torch.float32) if tracking is None else tracking.float()
         changes = core.advance(terminated, truncated, due, reward)
         done = terminated | truncated
         goals = torch.where(done.unsqueeze(1), candidates[:, 0], goal)

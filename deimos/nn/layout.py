@@ -28,8 +28,8 @@ ALL = slice(None)
 
 def seen_by(who: Literal["actor", "critic"], layout: Sequence[ObsField], device: torch.device) -> Seen:
     """The components that the actor, or the critic, sees."""
-    seen = torch.cat([torch.full((field.size,), field.seen_by in ("both", who)) for field in layout])
-    return ALL if bool(seen.all()) else seen.nonzero().squeeze(1).to(device)
+    shown = [field.seen_by in ("both", who) for field in layout for _ in range(field.size)]
+    return ALL if all(shown) else torch.tensor(shown, device=device).nonzero().squeeze(1)
 
 
 def count(seen: Seen, obs_dim: int) -> int:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import numbers
 import types
 import typing
 from collections.abc import Mapping
@@ -17,6 +18,11 @@ from deimos.sim import envs
 from deimos.sim.env import EnvConfig
 
 _PLUGINS = {EnvConfig: envs, SelectorConfig: selectors}
+_PLAIN: dict[Any, tuple[str, Any]] = {
+    bool: ("true or false", bool), int: ("a whole number", numbers.Integral), str: ("a text", str),
+    float: ("a number", numbers.Real | str), Path: ("a path", str | Path),  # an infinity is a text in JSON
+}  # fmt: skip
+"""Types of fields: what a value is called that is one, and what it may be before it is converted."""
 
 
 def to_dict(config: Any) -> dict:
@@ -76,7 +82,7 @@ def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
         raise ValueError(f"{cls.__name__} must be a table of its fields, got {data!r}.")
     data = dict(data)
     if cls in _PLUGINS:
-        if "kind" not in data:
+        if not isinstance(data.get("kind"), str):
             raise ValueError(f"A configuration of {_PLUGINS[cls].__name__} must name its 'kind', got {data}.")
         cls = plugins.load(_PLUGINS[cls], data.pop("kind")).Config
     if stored:
@@ -87,19 +93,23 @@ def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
         raise ValueError(
             f"{cls.__module__}.{cls.__name__} has no {', '.join(unknown)}; it has: {', '.join(sorted(names))}."
         )
-    return cls(**{name: _typed(hints[name], value, stored) for name, value in data.items()})
+    return cls(**{name: _typed(name, hints[name], value, stored) for name, value in data.items()})
 
 
-def _typed(hint: Any, value: Any, stored: bool) -> Any:
-    """``value`` as the type that ``hint`` asks for, where JSON cannot say it."""
+def _typed(name: str, hint: Any, value: Any, stored: bool) -> Any:
+    """The value of a field as the type that ``hint`` asks for, where JSON cannot say it."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         if value is None:
             return None
         hint = next(part for part in typing.get_args(hint) if part is not type(None))
     if hint in _PLUGINS or dataclasses.is_dataclass(hint):
         return from_dict(hint, value, stored=stored)
-    if hint is Path:
-        return Path(value)
-    if hint is float:
-        return float(value)
+    if hint in _PLAIN:
+        words, taken = _PLAIN[hint]
+        try:
+            if not isinstance(value, taken) or (isinstance(value, bool) and hint is not bool):
+                raise ValueError
+            return hint(value)
+        except (OverflowError, ValueError) as error:
+            raise ValueError(f"{name} must be {words}, got {value!r:.80}.") from error
     return tuple(value) if isinstance(value, list) else value

@@ -18,11 +18,12 @@ import torch
 from torch import Tensor, nn
 
 from deimos.checks import RunError, check_at_least, check_range
-from deimos.files import open_file
+from deimos.files import read_bytes
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.learn.policy import load_policy
+from deimos.nn.host import own_settings
 from deimos.nn.threads import torch_on_one
 from deimos.run import memory
 from deimos.run.attack import Attack, Policy, Target, attacker, uniform_goals
@@ -99,6 +100,7 @@ def weights_hash(module: nn.Module) -> str:
     return digest.hexdigest()[:16]
 
 
+@own_settings()
 def evaluate_run(
     folder: RunFolder, env_config: EnvConfig, config: EvalConfig, device: torch.device,
     progress: Progress = lambda stage, share: None, *, again: bool = True, once: Once = _at_once,
@@ -213,12 +215,12 @@ def _setting(shared: dict, config: EvalConfig, name: str) -> str:
 
 def _read(path: Path) -> bytes:
     try:
-        with open_file(path) as file:
-            return file.read()
+        return read_bytes(path)
     except OSError as error:
         raise RunError(f"{path} cannot be read ({error.strerror}).") from error
 
 
+@own_settings()
 def evaluate(
     policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device,
     progress: Progress = lambda stage, share: None, *, known: Sequence[dict] = (), once: Once = _at_once,
@@ -322,7 +324,7 @@ def score_scale(
     rest = env.tracking_at_rest()
     if rest is not None:
         return "matching", rest, 1.0
-    nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
+    nothing = torch.zeros(env.num_envs, env.action_dim, dtype=torch.float32, device=env.device)
     reference = env.reference_policy()
     if reference is None:
         return "return_per_step", math.nan, math.nan
@@ -353,7 +355,7 @@ def play(
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)
-    errors = {name: torch.empty(steps, env.num_envs, device=env.device) for name in env.errors}
+    errors = {name: reward.new_empty(steps, env.num_envs, dtype=torch.float32) for name in env.errors}
     for t in range(steps):
         step = env.step(policy(env.obs))
         first = ~loop.interactions.active

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from deimos.checks import RunError
-from deimos.files import first_line, open_file, remove_partial, write_whole
+from deimos.files import first_line, open_file, read_bytes, remove_partial, write_bytes
 from deimos.lock import hold
 
 OF_TRAINING = ("config.json", "checkpoint.pt", "policy.pt", "progress.csv", "timing.csv")
@@ -63,13 +63,12 @@ class RunFolder:
     def write_json(self, name: str, data: Any) -> None:
         """Write a JSON file whole or not at all; NaN becomes null."""
         text = json.dumps(_without_nan(data), indent=2, allow_nan=False) + "\n"
-        write_whole(self.path / name, lambda file: file.write(text.encode()))
+        write_bytes(self.path / name, text.encode())
 
     def read_json(self, name: str) -> Any:
         """Read a JSON file, which must be there and be JSON."""
         try:
-            with open_file(self.path / name) as file:
-                return json.loads(file.read())
+            return json.loads(read_bytes(self.path / name))
         except (OSError, ValueError, RecursionError) as error:  # the last where it is nested too deeply
             raise RunError(f"{self.path / name} cannot be read ({first_line(error)}).") from error
 
@@ -96,7 +95,7 @@ class RunFolder:
             data, ending = read()
         except OSError as error:
             raise RunError(f"{error.filename or name} cannot be read ({error.strerror}).") from error
-        write_whole(self.path / (name + ending), lambda file: file.write(data))
+        write_bytes(self.path / (name + ending), data)
         return name + ending
 
     def read_csv(self, name: str) -> list[dict[str, str]]:
@@ -111,8 +110,7 @@ class RunFolder:
         if not path.exists():
             return []
         try:
-            with open_file(path) as file:
-                return list(_rows(file.read()))
+            return list(_rows(read_bytes(path)))
         except OSError as error:
             raise RunError(f"{path} cannot be read ({error.strerror}).") from error
         except ValueError as error:
@@ -126,7 +124,7 @@ class RunFolder:
         path = self.path / name
         if not kept:
             path.unlink(missing_ok=True)
-        elif len(kept) < len(rows) or not path.read_bytes().endswith(b"\n"):
+        elif len(kept) < len(rows) or not read_bytes(path).endswith(b"\n"):
             self._write_csv(name, kept[0], kept)
 
     def append_csv(self, name: str, row: dict[str, float]) -> None:
@@ -159,7 +157,7 @@ class RunFolder:
         writer = csv.DictWriter(text, [*columns], restval="")
         writer.writeheader()
         writer.writerows(rows)
-        write_whole(self.path / name, lambda file: file.write(text.getvalue().encode()))
+        write_bytes(self.path / name, text.getvalue().encode())
 
 
 def _cell(name: str, value: Any) -> str:

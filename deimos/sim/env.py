@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least, check_range
+from deimos.files import read_bytes
 from deimos.nn.layout import ObsField, goal_slice
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ class EnvConfig(abc.ABC):
 
     def read_file(self, name: str) -> tuple[bytes, str]:
         """What a run keeps of one of ``files``, whole in itself, and the ending of its copy."""
-        return self.files[name].read_bytes(), self.files[name].suffix
+        return read_bytes(self.files[name]), self.files[name].suffix
 
     @final
     def file_hashes(self) -> dict[str, str]:
@@ -311,7 +312,7 @@ class Env(abc.ABC):
     @property
     def action_range(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest value of every component of an action, beyond which it is clipped, on the CPU."""
-        bound = torch.full((self.action_dim,), self.action_bound)
+        bound = torch.full((self.action_dim,), self.action_bound, dtype=torch.float32)
         return -bound, bound
 
     @property

@@ -6,12 +6,11 @@ same files give the same bytes: names are sorted, and there are no times.
 
 import re
 import zipfile
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 from deimos.checks import RunError, one_line
-from deimos.files import UNREADABLE, write_whole
+from deimos.files import UNREADABLE, open_file, read_bytes, write_bytes, write_whole
 from deimos.run.folder import RunFolder
 from deimos.study.folder import FEAR, StudyFolder
 from deimos.study.results import SCHEMA, Results
@@ -38,7 +37,7 @@ def pack(study: StudyFolder) -> tuple[Path, int]:
     for cell in cells:
         home = study.cell_path(cell)
         if cell.digest in finished and (home / "run" / "policy.pt").exists():
-            files |= {f"{cell.name}/{part}": (home / part).read_bytes() for part in PARTS if (home / part).exists()}
+            files |= {f"{cell.name}/{part}": read_bytes(home / part) for part in PARTS if (home / part).exists()}
     if not files:
         raise RunError(f"{study.path} has no finished cell whose policy could be packed.")
 
@@ -71,13 +70,9 @@ def unpack(study: StudyFolder) -> int:
         _put_rows(home, tables)
         for part in reversed(PARTS):  # cell.json is the last: with it the cell is there
             if data := files.get(f"{name}/{part}"):
-                write_whole(home / part, partial(_write, data))
+                write_bytes(home / part, data)
         back += 1
     return back
-
-
-def _write(data: bytes, file: BinaryIO) -> None:
-    file.write(data)
 
 
 def _put_rows(home: Path, tables: Results) -> None:
@@ -91,7 +86,7 @@ def _put_rows(home: Path, tables: Results) -> None:
 def _read(path: Path) -> dict[str, bytes]:
     """The files of an archive by their names."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_file(path) as file, zipfile.ZipFile(file) as archive:
             for info in archive.infolist():
                 if not _NAME.fullmatch(info.filename) or info.file_size > MOST_BYTES:
                     raise ValueError(f"it holds {info.filename!r}, {info.file_size} bytes")

@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from deimos.checks import RunError, one_line
+from deimos.files import open_file, read_bytes
 from deimos.lock import hold
 from deimos.run.config import from_dict, to_dict
 from deimos.run.evaluation import Scale
@@ -133,7 +134,7 @@ class StudyFolder:
         """How a cell's workers have died so far, one line each."""
         path = self.cell_path(cell) / "failures.jsonl"
         found = []
-        for line in path.read_text(errors="replace").splitlines() if path.exists() else []:
+        for line in read_bytes(path).splitlines() if path.exists() else []:
             with contextlib.suppress(ValueError, KeyError, TypeError):  # a kill may leave half a line
                 found.append(str(json.loads(line)["error"]))
         return found
@@ -141,7 +142,7 @@ class StudyFolder:
     def record_failure(self, cell: Cell, error: str) -> None:
         """Write down how a worker died."""
         line = {"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "error": error}
-        with (self.cell_path(cell) / "failures.jsonl").open("a") as file:
+        with open_file(self.cell_path(cell) / "failures.jsonl", "a") as file:
             file.write(json.dumps(line) + "\n")
 
     def forget_failures(self) -> None:

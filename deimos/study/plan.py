@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from deimos.checks import RunError, check_at_least, one_line
+from deimos.files import read_bytes
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets, training
@@ -176,7 +177,7 @@ def _read(path: Path, readers: tuple[Path, ...]) -> dict:
     if path.resolve() in readers:
         raise RunError(f"{path} is a base of itself.")
     try:
-        data = tomllib.loads(path.read_text())
+        data = tomllib.loads(read_bytes(path).decode())
     except RecursionError as error:
         raise RunError(f"{path} is not a study's TOML file (it is nested too deep).") from error
     except (OSError, ValueError) as error:

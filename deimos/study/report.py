@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import sem
 
+from deimos.files import write_bytes
 from deimos.run.config import to_dict
 from deimos.study import figures, stats
 from deimos.study.data import Data, Style, Where
@@ -78,8 +79,8 @@ def write(
         drawn = {name: draw(data, name) for name in single} | {FACTORS: of_factors(data)}
         pictures = {name: figures.write(own, out / FIGURES) for name, own in drawn.items()}
         blocks = page(data, pictures)
-    (out / "report.md").write_text(to_markdown(blocks, FIGURES))
-    (out / "report.html").write_text(to_html(blocks, out / FIGURES))
+    for name, text in (("report.md", to_markdown(blocks, FIGURES)), ("report.html", to_html(blocks, out / FIGURES))):
+        write_bytes(out / name, text.encode())
     return out / "report.html"
 
 

@@ -16,7 +16,7 @@ from statistics import median
 from typing import Any
 
 from deimos.checks import RunError, one_line
-from deimos.files import write_whole
+from deimos.files import first_line, read_bytes, write_bytes
 from deimos.run.evaluation import worst
 from deimos.run.folder import RunFolder
 from deimos.study.plan import Cell
@@ -273,11 +273,11 @@ def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     Raises ``RunError`` if it has other columns, or holds what is no value of its column.
     """
     try:
-        text = path.read_text()
+        text = read_bytes(path).decode()
     except FileNotFoundError:
         return []
-    except ValueError as error:
-        raise RunError(f"{path} cannot be read ({error}).") from error
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} cannot be read ({first_line(error)}).") from error
     lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())  # version 0.1.0 may have left half a line
     names = [FORMER_NAMES.get(name, name) for name in next(lines, columns)]
     missing, unknown = [n for n in columns if n not in {*names, *LATER_COLUMNS}], [n for n in names if n not in columns]
@@ -299,7 +299,7 @@ def write_table(path: Path, columns: dict[str, type], rows: Iterable[Row]) -> No
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows([_text(row.get(name)) for name in columns] for row in rows)
-    write_whole(path, lambda file: file.write(out.getvalue().encode()))
+    write_bytes(path, out.getvalue().encode())
 
 
 def _row(columns: dict[str, type], given: Row) -> Row:
