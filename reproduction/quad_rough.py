@@ -3,6 +3,7 @@
     python train.py --preset quad-walk --seed 1 --out runs/walk    # five minutes of one core
     python -m reproduction.quad_rough runs/rough --init-from runs/walk --seed 1    # an hour; again to continue
     python -m reproduction.quad_rough runs/rough --minutes 0 --figure rough.png    # tables and curves of what is there
+    python -m reproduction.quad_rough runs/pilot --init-from runs/walk --minutes 9 --change '{"num_envs": 1024}'
 
 The run is that of ``python train.py --preset quad-rough --init-from RUN``, on one thread and without the evaluation at
 its end, stopped after ``--minutes`` of processor time. Per-world rewards and levels of every iteration go to worlds.npz
@@ -10,6 +11,7 @@ in the run's folder, for intervals over worlds.
 """
 
 import argparse
+import json
 import resource
 import sys
 import time
@@ -22,10 +24,13 @@ import torch
 
 from deimos.checks import RunError
 from deimos.run import training
+from deimos.run.config import from_dict, to_dict
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.presets import preset
+from deimos.run.trainer import TrainConfig
 from deimos.study import stats
+from deimos.study.factors import merged
 
 RECORDS = ("reward", "level", "invalid", "memory", "seconds")
 EVALUATION = EvalConfig(worlds=1000, steps=1000, attackers=())  # five robots on every tile of the grid
@@ -155,12 +160,14 @@ def main() -> None:
     parser.add_argument("--init-from", type=Path, help="folder of a run whose networks a new run starts with")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=60.0, help="most processor time of the run")
+    parser.add_argument("--change", type=json.loads, default={}, help="fields that differ from the preset's, as JSON")
     parser.add_argument("--figure", type=Path, help="also draw the curves to this file")
     args = parser.parse_args()
     if (args.folder / "config.json").exists():
         trainer, folder = training.resume(args.folder)
     else:
-        config = replace(preset(args.preset), seed=args.seed, threads=1, evaluation=False, device="cpu")
+        base = from_dict(TrainConfig, merged(to_dict(preset(args.preset)), args.change))
+        config = replace(base, seed=args.seed, threads=1, evaluation=False, device="cpu")
         trainer, folder = training.start(config, args.folder, args.init_from)
     recorder = Recorder(trainer, folder.path / "worlds.npz")
     if recorder.before < 60 * args.minutes:
