@@ -15,7 +15,6 @@ import json
 import resource
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,22 +108,17 @@ def tiles(row: dict) -> str:
     Shares of the goals that were survived, with the linear tracking in brackets; the means weigh tiles by their worlds.
     """
     found = {tuple(name.rsplit(" ", 1)): stratum for name, stratum in row["strata"].items()}
-    kinds = sorted({kind for kind, _ in found})
-    levels = sorted({level for _, level in found}, key=int)
+    kinds = [*sorted({kind for kind, _ in found}), "all"]
+    levels = [*sorted({level for _, level in found}, key=int), "all"]
 
-    def cell(belongs: Callable[[str, str], bool]) -> str:
-        rows = [stratum for name, stratum in found.items() if belongs(*name)]
+    def cell(kind: str, level: str) -> str:
+        rows = [stratum for (k, n), stratum in found.items() if kind in (k, "all") and level in (n, "all")]
         worlds = [stratum["worlds"] for stratum in rows]
         success = np.average([stratum["success"] for stratum in rows], weights=worlds)
         return f"{success:.2f} ({np.average([stratum['tracking'][0] for stratum in rows], weights=worlds):.2f})"
 
-    lines = [f"| ground | {' | '.join(levels)} | all |", "|---" * (len(levels) + 2) + "|"]
-    for kind in kinds:
-        cells = [cell(lambda k, n, level=level, kind=kind: (k, n) == (kind, level)) for level in levels]
-        lines.append(f"| {kind} | {' | '.join(cells)} | {cell(lambda k, n, kind=kind: k == kind)} |")
-    cells = [cell(lambda k, n, level=level: n == level) for level in levels]
-    lines.append(f"| all | {' | '.join(cells)} | {cell(lambda k, n: True)} |")
-    return "\n".join(lines)
+    lines = [f"| ground | {' | '.join(levels)} |", "|---" * (len(levels) + 1) + "|"]
+    return "\n".join(lines + [f"| {kind} | {' | '.join(cell(kind, level) for level in levels)} |" for kind in kinds])
 
 
 def draw(path: Path, to: Path) -> None:
