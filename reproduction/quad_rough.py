@@ -1,31 +1,38 @@
-"""Train a committed flat policy on rough ground and print the table of docs/lab/quad.md or docs/lab/quad_arm.md.
+"""Train a policy that walks on rough ground, and print the tables of docs/lab/quad.md.
 
-    python -m reproduction.quad_rough runs/rough    # 20 minutes of one core; again to continue
-    python -m reproduction.quad_rough runs/rough --figure curve.png
-    python -m reproduction.quad_rough runs/rough_arm --preset quad-arm
+    python train.py --preset quad-walk --seed 1 --out runs/walk    # five minutes of one core
+    python -m reproduction.quad_rough runs/rough --init-from runs/walk --seed 1    # an hour; again to continue
+    python -m reproduction.quad_rough runs/rough --minutes 0 --figure rough.png    # tables and curves of what is there
+    python -m reproduction.quad_rough runs/pilot --init-from runs/walk --minutes 9 --change '{"num_envs": 1024}'
 
-Per-world rewards and levels of every iteration go to worlds.npz in the run's folder, for intervals over worlds.
+The run is that of ``python train.py --preset quad-rough --init-from RUN``, on one thread and without the evaluation at
+its end, stopped after ``--minutes`` of processor time. Per-world rewards and levels of every iteration go to worlds.npz
+in the run's folder, for intervals over worlds.
 """
 
 import argparse
+import json
 import resource
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
+import torch
 
 from deimos.checks import RunError
 from deimos.run import training
+from deimos.run.config import from_dict, to_dict
+from deimos.run.evaluation import EvalConfig, evaluate_run
+from deimos.run.folder import RunFolder
 from deimos.run.presets import preset
-from deimos.sim.legged.config import LocomotionConfig
+from deimos.run.trainer import TrainConfig
 from deimos.study import stats
+from deimos.study.factors import merged
 
-RESULTS = Path(__file__).parent.parent / "docs" / "results"
-ORIGINS = {"quad": RESULTS / "quad_flat", "quad-arm": RESULTS / "quad_arm_stand"}
 RECORDS = ("reward", "level", "invalid", "memory", "seconds")
+EVALUATION = EvalConfig(worlds=1000, steps=1000, attackers=())  # five robots on every tile of the grid
 
 
 class Recorder:
@@ -50,7 +57,11 @@ class Recorder:
         np.savez(self.path.with_suffix(".part.npz"), allow_pickle=False, **self.rows)
         self.path.with_suffix(".part.npz").replace(self.path)
         done, total = trainer.iteration, trainer.config.iterations
-        print(f"iteration {done}/{total}, {self.seconds / 60:.1f} min, {fps:.0f} FPS", file=sys.stderr, flush=True)
+        level = self.rows["level"][-1].mean()
+        print(
+            f"iteration {done}/{total}, level {level:.2f}, {self.seconds / 60:.1f} min, {fps:.0f} FPS",
+            file=sys.stderr, flush=True,
+        )  # fmt: skip
 
     @property
     def seconds(self) -> float:
@@ -68,13 +79,13 @@ def table(path: Path) -> str:
     with np.load(path) as saved:
         data = {name: saved[name] for name in RECORDS}
     reward, level = data["reward"], data["level"]
-    quarters = np.array_split(np.arange(len(reward)), 4)
+    quarters = [quarter for quarter in np.array_split(np.arange(len(reward)), 4) if len(quarter)]
     lines = ["| quarter | reward per step | mean level | peak memory [MiB] |", "|---|---|---|---|"]
     lines += [
         f"| {i + 1} | {interval(reward[q].mean(0))} | {level[q].mean():.2f} | {data['memory'][q].max():.0f} |"
         for i, q in enumerate(quarters)
     ]
-    change = reward[quarters[3]].mean(0) - reward[quarters[0]].mean(0)
+    change = reward[quarters[-1]].mean(0) - reward[quarters[0]].mean(0)
     lines += [
         "",
         f"Last quarter less first, over {reward.shape[1]} worlds: {interval(change)}.",
@@ -83,6 +94,31 @@ def table(path: Path) -> str:
         f"{len(reward)} iterations, {data['seconds'][-1] / 60:.1f} minutes.",
     ]
     return "\n".join(lines)
+
+
+def evaluate(path: Path) -> dict:
+    """The row of uniform goals on the terrain, with a goal for as long as in training; it is kept in the folder."""
+    folder = RunFolder.open(path)
+    return evaluate_run(folder, training.read_config(folder).env, EVALUATION, torch.device("cpu"), again=False)[0]
+
+
+def tiles(row: dict) -> str:
+    """How an evaluation went on every level of every kind of ground, as Markdown.
+
+    Shares of the goals that were survived, with the linear tracking in brackets; the means weigh tiles by their worlds.
+    """
+    found = {tuple(name.rsplit(" ", 1)): stratum for name, stratum in row["strata"].items()}
+    kinds = [*sorted({kind for kind, _ in found}), "all"]
+    levels = [*sorted({level for _, level in found}, key=int), "all"]
+
+    def cell(kind: str, level: str) -> str:
+        rows = [stratum for (k, n), stratum in found.items() if kind in (k, "all") and level in (n, "all")]
+        worlds = [stratum["worlds"] for stratum in rows]
+        success = np.average([stratum["success"] for stratum in rows], weights=worlds)
+        return f"{success:.2f} ({np.average([stratum['tracking'][0] for stratum in rows], weights=worlds):.2f})"
+
+    lines = [f"| ground | {' | '.join(levels)} |", "|---" * (len(levels) + 1) + "|"]
+    return "\n".join(lines + [f"| {kind} | {' | '.join(cell(kind, level) for level in levels)} |" for kind in kinds])
 
 
 def draw(path: Path, to: Path) -> None:
@@ -114,25 +150,23 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--preset", choices=ORIGINS, default="quad")
+    parser.add_argument("--preset", default="quad-rough")
+    parser.add_argument("--init-from", type=Path, help="folder of a run whose networks a new run starts with")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=20.0)
-    parser.add_argument("--start-levels", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=60.0, help="most processor time of the run")
+    parser.add_argument("--change", type=json.loads, default={}, help="fields that differ from the preset's, as JSON")
     parser.add_argument("--figure", type=Path, help="also draw the curves to this file")
     args = parser.parse_args()
     if (args.folder / "config.json").exists():
         trainer, folder = training.resume(args.folder)
     else:
-        base = preset(args.preset)
-        env = replace(cast(LocomotionConfig, base.env), terrain="rough", noise=False, start_levels=args.start_levels)
-        config = replace(
-            base, env=env, method="uniform", num_envs=512, env_steps=100_000, seed=args.seed, threads=1,
-            evaluation=False, device="cpu",
-        )  # fmt: skip
-        trainer, folder = training.start(config, args.folder, ORIGINS[args.preset])
+        base = from_dict(TrainConfig, merged(to_dict(preset(args.preset)), args.change))
+        config = replace(base, seed=args.seed, threads=1, evaluation=False, device="cpu")
+        trainer, folder = training.start(config, args.folder, args.init_from)
     recorder = Recorder(trainer, folder.path / "worlds.npz")
-    training.train(trainer, folder, recorder, lambda: recorder.seconds > 60 * args.minutes)
-    print(table(recorder.path))
+    if recorder.before < 60 * args.minutes:
+        training.train(trainer, folder, recorder, lambda: recorder.seconds > 60 * args.minutes)
+    print(f"{table(recorder.path)}\n\n{tiles(evaluate(folder.path))}")
     if args.figure is not None:
         draw(recorder.path, args.figure)
 

@@ -1,6 +1,8 @@
-"""From nothing to a robot that walks: train a preset over seeds, and print the table of docs/lab/quad.md.
+"""From nothing to a robot that walks: train a preset over seeds, and print the tables of docs/lab/quad.md.
 
     python -m reproduction.quad_walk runs/walk --seeds 1 2 3 4 5 --engines native warp    # again to continue
+    python -m reproduction.quad_walk runs/walk --engines native warp --worlds 512    # the policies in both simulators
+    python -m reproduction.quad_walk runs/both --preset quad-arm-walk    # walks and reaches: docs/lab/quad_arm.md
     python -m reproduction.quad_walk runs/pilot --seeds 1 --minutes 3 --change '{"ppo": {"desired_kl": 0.02}}'
 
 Every run is that of ``python train.py --preset NAME --seed SEED``, on one thread and without the evaluation at its
@@ -66,21 +68,23 @@ def train(config: TrainConfig, path: Path, minutes: float) -> float:
     return meter.seconds
 
 
-def evaluate(path: Path, engine: str) -> dict:
-    """The row of uniform goals at T2 on an engine."""
+def evaluate(path: Path, engine: str, worlds: int) -> dict:
+    """The row of uniform goals at T2 on an engine; it is kept in the run's folder."""
     folder = RunFolder.open(path)
     env = cast(LocomotionConfig, training.read_config(folder).env.with_goal_period(GOAL_PERIOD))
     env = replace(env, engine=cast(Any, engine))
-    return evaluate_run(folder, env, EVALUATION, torch.device("cpu"), again=False)[0]
+    setting = replace(EVALUATION, worlds=worlds)
+    return evaluate_run(folder, env, setting, torch.device("cpu"), again=False)[0]
 
 
 def cells(row: dict) -> str:
-    """Linear and yaw tracking, and crashes per robot-minute with their exact 95 % interval."""
+    """Linear and yaw tracking, crashes per robot-minute with their exact 95 % interval, median errors if there are."""
     minutes = row["worlds"] * row["steps"] * PhysicsConfig().control_period / 60
     low = stats.chi2.ppf(0.025, 2 * row["crashes"]) / 2 / minutes if row["crashes"] else 0.0
     high = stats.chi2.ppf(0.975, 2 * row["crashes"] + 2) / 2 / minutes
     linear, yaw = row["tracking"][:2]
-    return f"{linear:.3f} | {yaw:.3f} | {row['crashes'] / minutes:.2f} [{low:.2f}, {high:.2f}]"
+    errors = "".join(f" | {error:.3f}" for error in row["errors"].values())
+    return f"{linear:.3f} | {yaw:.3f} | {row['crashes'] / minutes:.2f} [{low:.2f}, {high:.2f}]{errors}"
 
 
 def main() -> None:
@@ -92,12 +96,13 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="most processor time of a run")
     parser.add_argument("--change", type=json.loads, default={}, help="fields that differ from the preset's, as JSON")
     parser.add_argument("--engines", nargs="*", choices=["native", "warp"], default=["native"])
+    parser.add_argument("--worlds", type=int, default=EVALUATION.worlds, help="robots that a policy is evaluated with")
     args = parser.parse_args()
     base = from_dict(TrainConfig, merged(to_dict(presets.preset(args.preset)), args.change))
     for seed in args.seeds:
         path = args.folder / f"seed_{seed}"
         seconds = train(replace(base, seed=seed, threads=1, evaluation=False, device="cpu"), path, args.minutes)
-        rows = [cells(evaluate(path, engine)) for engine in args.engines]
+        rows = [cells(evaluate(path, engine, args.worlds)) for engine in args.engines]
         print(f"| {seed} | {seconds / 60:.1f} | " + " | ".join(rows) + " |", flush=True)
 
 

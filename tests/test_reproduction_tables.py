@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deimos import terrain
 from deimos.checks import RunError
 from deimos.goals.fear import FearConfig
 from deimos.goals.selectors import director
@@ -14,6 +15,7 @@ from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
+from deimos.run.presets import preset
 from deimos.sim.envs.particle import Config
 from deimos.study import plan
 from deimos.study.results import Results
@@ -120,7 +122,46 @@ def test_table_of_rough_ground_has_quarters(tmp_path):
     assert lines[-1] == "20 iterations, 20.0 minutes."
     quad_rough.draw(path, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 1000
-    assert all((origin / "policy.pt").is_file() for origin in quad_rough.ORIGINS.values())
+
+
+def test_table_of_tiles_weighs_them_by_their_worlds():
+    """Kinds of ground have their levels in order, and means over tiles count every world once."""
+    stratum = {"crashes": 0, "tracking": [0.5, 0.9]}
+    row = {
+        "strata": {
+            "stairs-up 0": stratum | {"worlds": 3, "success": 1.0},
+            "stairs-up 10": stratum | {"worlds": 1, "success": 0.0},
+            "slope-up 0": stratum | {"worlds": 1, "success": 0.5, "tracking": [0.7, 0.9]},
+            "slope-up 10": stratum | {"worlds": 1, "success": 0.25},
+        }
+    }
+    assert quad_rough.tiles(row).splitlines() == [
+        "| ground | 0 | 10 | all |",
+        "|---|---|---|---|",
+        "| slope-up | 0.50 (0.70) | 0.25 (0.50) | 0.38 (0.60) |",
+        "| stairs-up | 1.00 (0.50) | 0.00 (0.50) | 0.75 (0.50) |",
+        "| all | 0.88 (0.55) | 0.12 (0.50) | 0.62 (0.53) |",
+    ]
+
+
+def test_run_on_rough_ground_goes_on(tmp_path, monkeypatch, capsys):
+    """Stopped after an iteration and called again, a run has a row for every iteration, and then is left alone."""
+    grid = terrain.preset("go1", levels=2, columns=2, cell=0.1, tile=4.0)
+    terrain.build(grid).save(tmp_path / "tiles.npz")
+    full, ppo = preset("quad-rough"), PPOConfig(hidden=(8,), num_steps=24, epochs=1)
+    env = replace(full.env, terrain=str(tmp_path / "tiles.npz"), goal_period=10, episode_steps=20)
+    tiny = replace(full, env=env, num_envs=4, env_steps=48, ppo=ppo)
+    monkeypatch.setattr(quad_rough, "preset", {"quad-rough": tiny}.get)
+    monkeypatch.setattr(quad_rough, "EVALUATION", replace(quad_rough.EVALUATION, worlds=4, steps=40))
+    monkeypatch.setattr("sys.argv", ["quad_rough", str(tmp_path / "run"), "--minutes", "0.0001"])
+    quad_rough.main()
+    for minutes, iterations in ((60, 2), (0, 2)):
+        monkeypatch.setattr("sys.argv", ["quad_rough", str(tmp_path / "run"), "--minutes", str(minutes)])
+        capsys.readouterr()
+        quad_rough.main()
+        printed = capsys.readouterr().out
+        assert f"{iterations} iterations, " in printed
+        assert "| ground | 0 | 1 | all |" in printed
 
 
 def test_table_of_the_oracle_asks_every_rule(tmp_path, monkeypatch):

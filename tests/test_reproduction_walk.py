@@ -58,9 +58,10 @@ def test_tracking_is_a_share(tmp_path, small, monkeypatch, capsys):
 
 def test_crashes_have_an_exact_interval():
     """Per robot-minute, with the interval of a Poisson count; ten crashes in ten robot-minutes are 0.48 to 1.84."""
-    row = {"worlds": 30, "steps": 1000, "tracking": [0.81, 0.9], "crashes": 10}
+    row = {"worlds": 30, "steps": 1000, "tracking": [0.81, 0.9], "crashes": 10, "errors": {}}
     assert quad_walk.cells(row) == "0.810 | 0.900 | 1.00 [0.48, 1.84]"
     assert quad_walk.cells(row | {"crashes": 0}) == "0.810 | 0.900 | 0.00 [0.00, 0.37]"
+    assert quad_walk.cells(row | {"errors": {"end effector [m]": 0.0512}}).endswith("[0.48, 1.84] | 0.051")
 
 
 def test_changes_reach_into_nested_fields():

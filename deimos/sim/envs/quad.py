@@ -1,6 +1,7 @@
 """Quad: a Go1 that follows velocity goals over flat and rough ground (thesis, 4.1.2)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -18,6 +19,27 @@ class Config(LocomotionConfig):
         return Locomotion(self, self.make_robot(), (velocity_goal(self.rewards),), num_envs, device, seed, env_offset)
 
 
+# From nothing to walking on flat ground in a few minutes of one core: small networks and rollouts, a short horizon,
+# goals of two seconds, and penalties so light that a robot which has yet to learn to step is not told to stand.
+_WALK: dict[str, Any] = {
+    "env": {
+        "goal_period": 100,
+        "noise": False,
+        "rewards": {
+            "vertical_speed": -1.0, "roll_pitch_rate": -0.02, "torque": -1e-4, "joint_acceleration": -1e-7,
+            "action_rate": -0.005, "collision": -0.25, "air_time": 0.0,
+        },
+    },
+    "method": "uniform",
+    "num_envs": 512,
+    "env_steps": 6000,
+    "ppo": {
+        "hidden": (128, 64, 32), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0,
+        "desired_kl": 0.02, "discount": 0.97, "entropy_coef": 0.002,
+    },
+    "eval": {"worlds": 256, "steps": 1000},
+}  # fmt: skip
+
 PRESETS = {
     # Sizes that two CPU cores can train within the hour.
     "quad": {
@@ -27,25 +49,12 @@ PRESETS = {
         "ppo": {"hidden": (256, 128, 64), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0},
         "eval": {"worlds": 256, "steps": 1000},
     },
-    # From nothing to walking on flat ground in a few minutes of one core: small networks and rollouts, a short horizon,
-    # goals of two seconds, and penalties so light that a robot which has yet to learn to step is not told to stand.
-    "quad-walk": {
-        "env": {
-            "goal_period": 100,
-            "noise": False,
-            "rewards": {
-                "vertical_speed": -1.0, "roll_pitch_rate": -0.02, "torque": -1e-4, "joint_acceleration": -1e-7,
-                "action_rate": -0.005, "collision": -0.25, "air_time": 0.0,
-            },
-        },
-        "method": "uniform",
-        "num_envs": 512,
-        "env_steps": 6000,
-        "ppo": {
-            "hidden": (128, 64, 32), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0,
-            "desired_kl": 0.02, "discount": 0.97, "entropy_coef": 0.002,
-        },
-        "eval": {"worlds": 256, "steps": 1000},
+    "quad-walk": _WALK,
+    # From that policy over slopes, stairs and rectangles: goals of five seconds and episodes of two of them, so that
+    # what a robot achieves says soon which tile is right for it.
+    "quad-rough": _WALK | {
+        "env": _WALK["env"] | {"terrain": "rough", "goal_period": 250, "episode_steps": 500},
+        "env_steps": 40_000,
     },
     # Legged Gym's sizes on rough terrain: 3000 iterations of 24 steps.
     "quad-large": {

@@ -59,5 +59,10 @@ PRESETS = {
         "env_steps": 4800,
         "ppo": _PPO | {"discount": 0.95, "gae_lambda": 0.9},
     },
+    # Both at once, from nothing: as a Quad learns to walk.
+    "quad-arm-walk": quad.PRESETS["quad-walk"] | {
+        "env_steps": 12_000,
+        "ppo": _PPO | {"discount": 0.97, "entropy_coef": 0.002},
+    },
     "quad-arm-large": quad.PRESETS["quad-large"] | {"ppo": _PPO | {"hidden": (512, 256, 128)}},
 }  # fmt: skip
