@@ -16,13 +16,13 @@ from deimos.app.drawing import Drawing, with_caption
 from deimos.app.findings import percent
 from deimos.app.video import pictures, video
 from deimos.checks import RunError, check_at_least, check_positive, check_range
-from deimos.goals.fear_selector import FearSelector, fear_selector
+from deimos.goals.fear_selector import FearSelector
 from deimos.goals.selectors import uniform
 from deimos.learn.policy import Policy, load_policy
+from deimos.run.fear_of_run import load_fear
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.trainer import TrainConfig
-from deimos.run.training import load_checkpoint, read_config
+from deimos.run.training import read_config
 from deimos.sim.env import Env
 from deimos.sim.legged.config import LocomotionConfig
 
@@ -96,7 +96,7 @@ def main(arguments: list[str], program: str) -> None:
         env = env_config.build(1, torch.device("cpu"), options.seed, options.world)
     except ValueError as error:
         raise RunError(str(error)) from error
-    _render(env, policy, _fear(folder, config, env), options)
+    _render(env, policy, load_fear(folder, config, env), options)
     print(options.target)
 
 
@@ -136,19 +136,6 @@ def rendering() -> Iterator[None]:
             f"Nothing can be rendered with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({error}); "
             "install libegl1 or libosmesa6 and set MUJOCO_GL=egl or osmesa."
         ) from error
-
-
-def _fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | None:
-    """The selector with the fear network that the run has learnt, if it has one."""
-    afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
-    if afraid is None or afraid.parts:
-        return None
-    state = load_checkpoint(folder)["loop"]["selector"]
-    if "fear" not in state:  # it is a part of another selector
-        return None
-    for name in ("fear", "calibration"):  # what else there is depends on the version that wrote it
-        getattr(afraid, name).load_state_dict(state[name])
-    return afraid if afraid.fear.fitted else None
 
 
 def _caption(env: Env, afraid: FearSelector | None, t: int, crashes: int) -> str:

@@ -272,6 +272,11 @@ class Locomotion(WarpEnv):
         reverse = torch.where(self.goal[rows, :count] < 0, 1.0, -1.0) * self._seen_range[:count]
         return torch.cat([reverse, goal[:, count:]], dim=1)
 
+    def rest_goal(self) -> tuple[float | None, ...]:
+        """See ``Env.rest_goal``: no velocity, an arm where it is asked to be."""
+        walk, *others = (len(part.range) for part in self.parts)
+        return (0.0,) * walk + (None,) * sum(others)
+
     def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
         """See ``Env.risk_contrast``: as they are, on stairs and on flat ground (thesis, 4.1)."""
         shapes = [shape for shape, _ in self.tiles()]

@@ -1,0 +1,2 @@
+"""x"""
+SHIELD = "shield.json"
