@@ -53,7 +53,9 @@ def check(folder: Path) -> None:
         RunError: If it does not do what was exported.
     """
     sys.stdout.flush()
-    done = subprocess.run([sys.executable, "-I", folder / "controller.py"], check=False, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, "-I", folder / "controller.py"], check=False, stdout=subprocess.PIPE, text=True
+    )
     print(done.stdout, end="")
     if done.returncode:
         raise RunError(f"{folder} does not do what was exported; see above, and do not deploy it.")

@@ -54,7 +54,9 @@ class _Graph:
             if isinstance(module, nn.Linear):
                 weight = self.constant(f"{name}.{number}.weight", module.weight.T)
                 x = self.add("MatMul", x, weight)
-                x = self.add("Add", x, self.constant(f"{name}.{number}.bias", module.bias), out=out if is_last else None)
+                x = self.add(
+                    "Add", x, self.constant(f"{name}.{number}.bias", module.bias), out=out if is_last else None
+                )
             else:
                 x = self.add(_OPERATORS[type(module)], x, out=out if is_last else None)
         return x
@@ -96,9 +98,7 @@ def policy_model(policy: Policy, facts: dict[str, str]) -> bytes:
     if bounded:
         low, high = graph.constant("low", -policy.action_bound), graph.constant("high", policy.action_bound)
         graph.add("Clip", x, low, high, out="action")
-    return graph.model(
-        "policy", {"observation": ["batch", len(seen)]}, {"action": ["batch", len(actor.std)]}, facts
-    )
+    return graph.model("policy", {"observation": ["batch", len(seen)]}, {"action": ["batch", len(actor.std)]}, facts)
 
 
 def fear_model(afraid: FearSelector, scale: Tensor, goal_scale: Tensor, facts: dict[str, str]) -> bytes:

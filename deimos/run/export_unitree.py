@@ -9,7 +9,20 @@ the network gave, ours what the joints took of it; they differ where a target is
 from pathlib import Path
 from typing import Any
 
-UNITREE = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)  # where our leg joints are among those of Unitree's quadrupeds: FR, FL, RR, RL
+UNITREE = (
+    3,
+    4,
+    5,
+    0,
+    1,
+    2,
+    9,
+    10,
+    11,
+    6,
+    7,
+    8,
+)  # where our leg joints are among those of Unitree's quadrupeds: FR, FL, RR, RL
 _TERMS = {
     "linear_velocity": "base_lin_vel", "angular_velocity": "base_ang_vel", "gravity": "projected_gravity",
     "goal": "velocity_commands", "joint_position": "joint_pos_rel", "joint_velocity": "joint_vel_rel",

@@ -14,7 +14,7 @@ def load_fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector 
     Args:
         folder: The run.
         config: Its configuration.
-        env: Worlds of its environment, on the CPU.
+        env: Worlds of its environment, where the network shall be.
     """
     afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
     if afraid is None or afraid.parts:
