@@ -120,9 +120,8 @@ def draw_tradeoff(folder: RunFolder, found: dict) -> Path:
     for axes, goals in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
         rows = [row for row in found["tradeoff"] if row["goals"] == goals]
         axes.axhline(100 * unshielded[goals]["crash_rate"], color="grey", linestyle=":", label="no shield")
-        for shield, colour, marker in zip(
-            dict.fromkeys(row["shield"] for row in rows), (BLUE, *ATTACKED), "os^", strict=False
-        ):
+        shields = dict.fromkeys(row["shield"] for row in rows)
+        for shield, colour, marker in zip(shields, (BLUE, *ATTACKED), "os^", strict=False):
             own = [row for row in rows if row["shield"] == shield]
             # How many of the uniform goals a user would lose, also where an attacker chooses.
             cost = [
@@ -134,7 +133,7 @@ def draw_tradeoff(folder: RunFolder, found: dict) -> Path:
             if shield == "shield":
                 for x, row in zip(cost, own, strict=True):
                     axes.annotate(f"{row['alpha']:g}", (x, 100 * row["crash_rate"]), fontsize=8)
-        axes.set_title("goals by " + " ".join(heading(goals)) if goals == "naive" else f"attacked by {goals}")
+        axes.set_title(" ".join(heading(goals)))
         axes.set_xlabel("uniform goals refused [%]")
         axes.set_ylabel("goals that ended in a crash [%]")
         axes.set_ylim(bottom=0.0)

@@ -86,8 +86,8 @@ def describe(found: dict) -> str:
         "conditional": "with a confidence of 95 %",
     }[name]
     head = (
-        f"Of the goals that would crash the policy, at most {percent(deploy['alpha'])} get through, {promise}: calibrated "
-        f"on {deploy['crashes']:,} crashes. Of {test['crashes']:,} others "
+        f"Of the goals that would crash the policy, at most {percent(deploy['alpha'])} get through, {promise}: "
+        f"calibrated on {deploy['crashes']:,} crashes. Of {test['crashes']:,} others "
         f"{percent(test['miss_rate'][name]) if test['crashes'] else 'none'} got through, and "
         f"{percent(test['refused'][name])} of {test['goals']:,} uniform goals were refused."
     )

@@ -1,10 +1,10 @@
 """A shield: refuses goals that a fear network gives too much risk, at a threshold with a guarantee.
 
 The threshold is that of split conformal prediction [1]_. Take crashes that the network has not learnt from, one from
-each world; a *miss* is a goal that would crash the policy and is let through. With the k-th lowest score of n crashes as
-the threshold, the miss rate is at most k / (n + 1) on average over calibrations: the *marginal* guarantee. Of a single
-calibration the miss rate is, where scores do not tie, distributed as Beta(k, n + 1 - k), so a smaller k keeps it below
-alpha with a given confidence: the *training-conditional* guarantee [2]_.
+each world; a *miss* is a goal that would crash the policy and is let through. With the k-th lowest score of n crashes
+as the threshold, the miss rate is at most k / (n + 1) on average over calibrations: the *marginal* guarantee. Of a
+single calibration the miss rate is, where scores do not tie, distributed as Beta(k, n + 1 - k), so a smaller k keeps it
+below alpha with a given confidence: the *training-conditional* guarantee [2]_.
 
 Both hold for goals that are exchangeable with those of the calibration, which are uniform, and for this policy in these
 worlds. Whoever chooses goals by what the shield does is no such source, and neither are states that only a shielded
@@ -134,21 +134,23 @@ class Shield:
         self._untested, self._warned = 0, False
 
     @classmethod
-    def from_dict(
-        cls, data: dict[str, Any], mode: Mode | None = None, guarantee: Guarantee = "conditional"
-    ) -> "Shield":
+    def from_dict(cls, data: dict[str, Any], mode: Mode | None = None, guarantee: Guarantee | None = None) -> "Shield":
         """The shield that ``deimos shield`` has stored in a run or in an export.
 
         Args:
             data: The entry ``shield`` of ``deploy.json``.
             mode: Another mode than the one that it was tried in.
-            guarantee: Which of its two thresholds.
+            guarantee: Another of its two thresholds than the one that it was tried with.
 
         Raises:
             KeyError: If something is missing in it.
         """
         return cls(
-            data["threshold"][guarantee], mode or data["mode"], data["safe_goal"], data["goal_range"], data["scores"]
+            data["threshold"][guarantee or data["guarantee"]],
+            mode or data["mode"],
+            data["safe_goal"],
+            data["goal_range"],
+            data["scores"],
         )
 
     @torch.no_grad()
@@ -191,7 +193,7 @@ class Shield:
         return torch.where(none, torch.where(fixed, safe, goal), picks.take(tried, away.argmin(1)))
 
     def _watch(self, fear: Tensor) -> None:
-        """Keep the last scores, test each ``window`` of them, and say once that they are not those of the calibration."""
+        """Keep the last scores, test each ``window`` of them, and say once that they are not the calibration's."""
         if not len(self._reference):
             return
         self._recent = torch.cat([self._recent, fear.double().cpu()])[-self.window :]
@@ -207,7 +209,7 @@ class Shield:
             )  # fmt: skip
 
     def drift(self) -> float:
-        """p-value, in [0, 1], of the last ``window`` scores being drawn as the calibration's were; 1 where none is known.
+        """p-value, in [0, 1], of the last ``window`` scores being drawn as the calibration's; 1 where none is known.
 
         By the largest distance D of the two distribution functions: 2 exp(-2 D^2 n m / (n + m)), the first term of
         Kolmogorov's series for two samples of n and m.

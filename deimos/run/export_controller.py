@@ -1,4 +1,4 @@
-"""A controller for an exported policy, and its check. It stands alone: Python, NumPy and onnxruntime, for the check MuJoCo.
+"""A controller for an exported policy, and its check, on NumPy and onnxruntime alone; its simulation needs MuJoCo.
 
 ``deimos export`` copies this file to the folder that it writes, as ``controller.py``. There it reads ``deploy.json``,
 ``policy.onnx``, ``fear.onnx`` and ``robot.xml``, and nothing else::

@@ -51,13 +51,13 @@ class ShieldConfig:
     """What becomes of a goal that is refused: ignore keeps the active goal, project takes the nearest acceptable one,
     stop the safe one."""
     guarantee: Guarantee = "conditional"
-    """What holds alpha: marginal, the mean over calibrations; conditional, this calibration with a confidence of 95 %."""
+    """What holds alpha: marginal, the mean over calibrations; conditional, this one with a confidence of 95 %."""
     worlds: int = 20_000
     """Worlds that it is calibrated and tested in, half of them each, one goal of each; at least 2."""
     candidates: int = 100
     """Uniform goals that project may take, at least 1."""
-    alphas: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
-    """Other miss rates that are tried under Naive and ``argmax``, for the trade-off; none of them needs to be possible."""
+    alphas: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
+    """Miss rates that are tried under Naive and ``argmax`` for the trade-off, as far as the crashes allow."""
 
     def __post_init__(self) -> None:
         for alpha in (self.alpha, *self.alphas):
@@ -123,7 +123,7 @@ def fear_rule(afraid: FearSelector) -> Rule:
 
 
 def random_rule(env: Env, rows: Tensor, goals: Tensor) -> Tensor:
-    """A uniform number in [0, 1) for every decision, whatever the goal is: the one that neither Naive nor an attacker uses."""
+    """A uniform number in [0, 1) for every decision, one that neither Naive nor an attacker uses."""
     return env.draw(rows)[:, 3:].clone().expand(goals.shape[:2])
 
 
