@@ -98,7 +98,7 @@ def measure(options: SplitOptions) -> dict[str, Any]:
         raise RunError(f"{need:,} crashes are needed, got {len(score):,} in {goals:,} goals; raise --most or --worlds.")
     rows = {}
     for guarantee in GUARANTEES:
-        rates = split(score, options.alpha, options.calibration, options.splits, guarantee)  # type: ignore[arg-type]
+        rates = split(score, options.alpha, options.calibration, options.splits, guarantee)
         error = rates.std().item() / math.sqrt(options.splits)
         rows[guarantee] = {
             "mean": rates.mean().item(), "standard_error": error, "above_alpha": int((rates > options.alpha).sum()),

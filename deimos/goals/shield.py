@@ -29,9 +29,9 @@ from deimos.checks import check_at_least, check_choice
 from deimos.goals import picks
 
 Mode = Literal["ignore", "project", "stop"]
-MODES = ("ignore", "project", "stop")
+MODES: tuple[Mode, ...] = ("ignore", "project", "stop")
 Guarantee = Literal["marginal", "conditional"]
-GUARANTEES = ("marginal", "conditional")
+GUARANTEES: tuple[Guarantee, ...] = ("marginal", "conditional")
 CONFIDENCE = 0.95  # of the training-conditional guarantee
 SHRINKS = 10  # goals between the wanted one and the safe one, which is the last, that project looks at
 SCORES = 1001  # of the calibration that are kept to tell a drift by
@@ -144,9 +144,15 @@ class Shield:
 
         Raises:
             KeyError: If something is missing in it.
+            ValueError: If it was calibrated on too few crashes for the guarantee.
         """
+        guarantee = guarantee or data["guarantee"]
+        if data["threshold"][guarantee] is None:
+            raise ValueError(
+                f"guarantee must be another than {guarantee}: {data['crashes']} crashes are too few for it."
+            )
         return cls(
-            data["threshold"][guarantee or data["guarantee"]],
+            data["threshold"][guarantee],
             mode or data["mode"],
             data["safe_goal"],
             data["goal_range"],
@@ -219,6 +225,6 @@ class Shield:
             return 1.0
         n, m = len(recent), len(reference)
         places = torch.cat([recent, reference])
-        ours, theirs = (torch.searchsorted(x, places, side="right") / len(x) for x in (recent, reference))
+        ours, theirs = (torch.searchsorted(x, places, side="right").double() / len(x) for x in (recent, reference))
         distance = (ours - theirs).abs().max().item()
         return min(1.0, 2.0 * math.exp(-2.0 * distance**2 * n * m / (n + m)))

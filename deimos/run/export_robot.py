@@ -85,11 +85,12 @@ def _to_xml(spec: "mujoco.MjSpec") -> str:
 
 
 def _numbers(model: "mujoco.MjModel") -> list[str]:
-    """Names of a model's arrays that physics depends on: all but looks, places of text, and what is 0 wide."""
+    """Names of a model's arrays that physics depends on: all but looks and where texts are."""
     looks = ("vis", "mat_", "tex_", "light_", "cam_", "geom_rgba", "site_rgba", "name", "paths", "text_")
     return [
         name for name in dir(model)
-        if not name.startswith(("_", *looks)) and isinstance(getattr(model, name), np.ndarray)
+        if not name.startswith(("_", *looks)) and not name.endswith("pathadr")
+        and isinstance(getattr(model, name), np.ndarray)
     ]  # fmt: skip
 
 

@@ -202,15 +202,19 @@ class Trial:
         self.outcomes = collect(target, afraid, config.worlds, eval_config.steps, seed, report)
         self._calibration, self._test = self.outcomes.half(False), self.outcomes.half(True)
 
-    def threshold(self, alpha: float, guarantee: Guarantee | None = None) -> float:
+    def threshold(self, alpha: float) -> float:
         """The threshold of a miss rate; ``ValueError`` as ``goals.shield.threshold`` has it."""
-        return threshold(self._crashes, alpha, guarantee or self.config.guarantee)
+        return threshold(self._crashes, alpha, self.config.guarantee)
+
+    def _is_possible(self, alpha: float) -> bool:
+        """Whether there are crashes enough for a miss rate."""
+        return len(self._crashes) >= crashes_needed(alpha, self.config.guarantee)
 
     def _shield(self, score: float) -> Shield:
         return Shield(score, self.config.mode, self._safe, self._range.tolist())
 
     def _guard(self, rule: Rule, score: float) -> Callable[[Env], Guard]:
-        """Makes the guard of some worlds; a shield by a rule that sees no goals can only stop."""
+        """Makes the guard of some worlds; by a rule that tells no goals apart, project stops."""
         return lambda env: Guard(env, self._shield(score), rule, self.config.candidates)
 
     def run(self) -> dict[str, Any]:
@@ -224,21 +228,17 @@ class Trial:
         Raises:
             RunError: If there are too few crashes to calibrate on; the message says how many it takes.
         """
+        attackers = self._eval.attackers
         try:
-            limits = {name: self.threshold(self.config.alpha, name) for name in GUARANTEES}  # type: ignore[arg-type]
+            limit = self.threshold(self.config.alpha)
         except ValueError as error:
             raise RunError(self._too_few(error)) from error
-        attackers = self._eval.attackers
-        trials = self.measure("no shield", None, attackers)
-        trials += self._beside(limits[self.config.guarantee], attackers)
+        trials = self.measure("no shield", None, attackers) + self._beside(limit, attackers)
         few, tradeoff = tuple(name for name in attackers if name == "argmax"), []
-        for alpha in self.config.alphas:
-            if len(self._crashes) < crashes_needed(alpha, self.config.guarantee):
-                continue
-            tradeoff += [row | {"alpha": alpha} for row in self._beside(self.threshold(alpha), few)]
+        for other in filter(self._is_possible, self.config.alphas):
+            tradeoff += [row | {"alpha": other} for row in self._beside(self.threshold(other), few)]
         return {
-            "deploy": self._for_deployment(limits), "test": self._tested(limits), "trials": trials,
-            "tradeoff": tradeoff,
+            "deploy": self._for_deployment(), "test": self._tested(limit), "trials": trials, "tradeoff": tradeoff
         }  # fmt: skip
 
     @property
@@ -314,23 +314,27 @@ class Trial:
             })  # fmt: skip
         return rows
 
-    def _for_deployment(self, limits: dict[str, float]) -> dict[str, Any]:
-        """What a deployment needs, with goals in physical units."""
+    def _for_deployment(self) -> dict[str, Any]:
+        """What a deployment needs, with goals in physical units; a guarantee that takes more crashes has no limit."""
+        alpha, known = self.config.alpha, self._crashes
+        limits: dict[str, float | None] = {
+            name: threshold(known, alpha, name) if len(known) >= crashes_needed(alpha, name) else None
+            for name in GUARANTEES
+        }
         scores = self._calibration.score.double().sort().values
         kept = torch.linspace(0, len(scores) - 1, min(SCORES, len(scores)), dtype=torch.float64).round().long()
         safe = zip(self._safe, self._scale.tolist(), strict=True)
         return {
-            "alpha": self.config.alpha, "mode": self.config.mode, "guarantee": self.config.guarantee,
-            "threshold": limits, "goal_period": self._goal_period, "crashes": len(self._crashes), "goals": len(scores),
+            "alpha": alpha, "mode": self.config.mode, "guarantee": self.config.guarantee,
+            "threshold": limits, "goal_period": self._goal_period, "crashes": len(known), "goals": len(scores),
             "safe_goal": [None if value is None else value / scale for value, scale in safe],
             "goal_range": (self._range / self._scale).tolist(), "scores": scores[kept.to(scores.device)].tolist(),
         }  # fmt: skip
 
-    def _tested(self, limits: dict[str, float]) -> dict[str, Any]:
-        """Misses among crashes of worlds that it was not calibrated on, and refusals, by guarantee."""
+    def _tested(self, limit: float) -> dict[str, Any]:
+        """Misses among the crashes of worlds that it was not calibrated on, and refused goals."""
         score, crashed = self._test.score, self._test.crashed
-        missed = {name: (score[crashed] < limit).double().mean().item() for name, limit in limits.items()}
-        refused = {name: (score >= limit).double().mean().item() for name, limit in limits.items()}
+        missed, refused = (score[crashed] < limit).double().mean().item(), (score >= limit).double().mean().item()
         return {"crashes": int(crashed.sum()), "goals": len(score), "miss_rate": missed, "refused": refused}
 
 
