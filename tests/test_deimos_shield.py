@@ -146,7 +146,7 @@ def test_the_p_value_of_a_drift_is_scipys():
     shield.choose(total, scores, scores)
     found = stats.ks_2samp(recent, reference, method="asymp")
     assert shield.drift() == pytest.approx(2 * np.exp(-2 * found.statistic**2 * 200 * 1000 / 1200))
-    assert shield.drift() == pytest.approx(found.pvalue, rel=0.05)
+    assert shield.drift() == pytest.approx(found.pvalue, rel=0.1)  # SciPy minds how many there are
 
 
 def test_the_guard_has_the_last_word_and_the_asker_learns_of_the_asked():
@@ -251,7 +251,8 @@ def test_what_cannot_be_shielded_is_refused_in_a_line(run, tmp_path, capsys):
     assert cli.main(["shield", str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
     budget = "--method uniform --no-evaluation --num-envs 16 --env-steps 24 --threads 1 --device cpu --ppo.hidden 8"
-    assert cli.main(["train", *budget.split(), "--out", str(tmp_path / "uniform")]) == 0
+    uniform = ["--env.goal-period", "10", "--out", str(tmp_path / "uniform")]
+    assert cli.main(["train", *budget.split(), *uniform]) == 0
     assert cli.main(["shield", str(tmp_path / "uniform"), *SMALL]) == 2
     assert "has no fear network that has learnt" in capsys.readouterr().err
     assert not (RunFolder.open(tmp_path / "uniform").path / "shield.json").exists()

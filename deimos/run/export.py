@@ -73,7 +73,7 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
         _write(folder, config, policy, env, afraid, out)
         if check:
             facts = _play(env, policy, afraid, steps)
-            write_whole(out / "check.npz", lambda file: np.savez(file, **facts))
+            write_whole(out / "check.npz", lambda file: np.savez(file, **facts))  # type: ignore[arg-type]
     except BaseException:
         shutil.rmtree(out, ignore_errors=True)  # half a folder would be taken for a whole one
         raise
@@ -179,7 +179,8 @@ def _plain(values: Tensor) -> list[float | None]:
 def _play(env: Env, policy: Policy, afraid: FearSelector | None, steps: int) -> dict[str, np.ndarray]:
     """Let the policy act from where the worlds are, each under one goal: what the exported files have to repeat."""
     walk = export_robot.Walk(env) if isinstance(env, Locomotion) else None
-    rows, kept = torch.arange(env.num_envs), []
+    rows = torch.arange(env.num_envs)
+    kept: list[tuple[Tensor, Tensor]] = []
     for t in range(steps):
         if t % (steps // ROBOTS) == 0 and len(kept) < ROBOTS:
             kept.append((env.obs.clone(), env.sample_goals(rows, CANDIDATES).clone()))

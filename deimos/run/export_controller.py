@@ -219,7 +219,7 @@ def track(measured: dict[str, np.ndarray], variance: float) -> np.ndarray:
 
 def compare_networks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -> bool:
     """Print how far the networks' outputs are from those of the export; gives whether all are the same."""
-    jobs = [("policy", ("observation",), ("action",))]
+    jobs: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = [("policy", ("observation",), ("action",))]
     if deploy["fear"]:
         jobs.append(("fear", ("state", "goal", "candidates"), ("logit", "probability")))
     passed = True
