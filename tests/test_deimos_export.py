@@ -268,7 +268,7 @@ def test_particles_with_fear_and_shield(particles, tmp_path, capsys):
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsys):
-    """A folder that exists, one that is no run, and a policy of another environment; a run without fear is told."""
+    """A folder that exists, no run, a policy or a shield of another one, each in a line; a run without fear is told."""
     assert cli.main(["export", str(particles), str(tmp_path)]) == 2
     assert "exists and is not overwritten" in capsys.readouterr().err
     assert cli.main(["export", str(tmp_path), str(tmp_path / "out")]) == 2
@@ -280,6 +280,11 @@ def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsy
     (other / "policy.pt").write_bytes((WALK / "policy.pt").read_bytes())
     assert cli.main(["export", str(other), str(tmp_path / "out")]) == 2
     assert "observes other things than its environment" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    (other / "policy.pt").write_bytes((particles / "policy.pt").read_bytes())
+    (other / "shield.json").write_text('{"deploy": {"weights": "0123456789abcdef"}}')
+    assert cli.main(["export", str(other), str(tmp_path / "out")]) == 2
+    assert "was made for an earlier policy; make it again by deimos shield" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert cli.main(["export", str(WALK), str(tmp_path / "go1")]) == 0
     assert "This run has learnt no fear network, so there is no fear.onnx." in capsys.readouterr().err

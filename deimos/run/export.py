@@ -32,6 +32,7 @@ from deimos.run.shield import SHIELD
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import provenance, read_config
 from deimos.sim.env import Env
+from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.task import Locomotion
 
 SCHEMA = 1  # of deploy.json
@@ -57,7 +58,9 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
     config = read_config(folder)
     policy = load_policy(folder.path)
     try:
-        steps = STEPS if not hasattr(config.env, "physics") else round(SECONDS / config.env.physics.control_period)
+        steps = STEPS
+        if isinstance(config.env, LocomotionConfig):
+            steps = round(SECONDS / config.env.physics.control_period)
         env_config = config.env.for_evaluation().resolved(torch.device("cpu"))
         env = env_config.with_goal_period(steps).build(ROBOTS, torch.device("cpu"), config.eval.seed)
     except ValueError as error:
@@ -117,7 +120,6 @@ def _describe(
         state = [_entry(field) for field in policy.layout if field.name != "goal"]
         calibration = afraid.calibration.state_dict()
         fear = files["fear"] | {"goal_period": config.env.goal_period, "calibration": calibration, "state": state}
-    shield = folder.read_json(SHIELD) if (folder.path / SHIELD).exists() else None
     return {
         "schema": SCHEMA,
         "environment": kind(config.env),
@@ -131,9 +133,25 @@ def _describe(
         "action": {"size": env.action_dim, "low": low, "high": high},
         "goal": _describe_goal(env, config.env.goal_period),
         "fear": fear,
-        "shield": shield["deploy"] if shield else None,
+        "shield": _shield(folder, files["policy"]["weights"]),
         "robot": None,
     }
+
+
+def _shield(folder: RunFolder, weights: str) -> dict[str, Any] | None:
+    """The shield that the run has, if it has one; ``RunError`` if that was made for a policy of other weights."""
+    if not (folder.path / SHIELD).exists():
+        return None
+    try:
+        shield = folder.read_json(SHIELD)["deploy"]
+        known = shield["weights"]
+    except (KeyError, TypeError) as error:
+        raise RunError(f"{folder.path / SHIELD} is not that of a shield; make it again by deimos shield.") from error
+    if known != weights:
+        raise RunError(
+            f"{folder.path / SHIELD} was made for an earlier policy; make it again by deimos shield, or delete it."
+        )
+    return shield
 
 
 def _entry(field: ObsField) -> dict[str, Any]:
@@ -182,7 +200,7 @@ def _play(env: Env, policy: Policy, afraid: FearSelector | None, steps: int) -> 
     rows = torch.arange(env.num_envs)
     kept: list[tuple[Tensor, Tensor]] = []
     for t in range(steps):
-        if t % (steps // ROBOTS) == 0 and len(kept) < ROBOTS:
+        if t % max(1, steps // ROBOTS) == 0 and len(kept) < ROBOTS:
             kept.append((env.obs.clone(), env.sample_goals(rows, CANDIDATES).clone()))
         step = env.step(policy.scaled(env.obs))
         if walk is not None:

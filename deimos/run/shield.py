@@ -24,7 +24,7 @@ from deimos.learn.policy import load_policy
 from deimos.nn.seeds import generator
 from deimos.nn.threads import torch_on_one
 from deimos.run.attack import Attack, Target, attacker, names, uniform_goals
-from deimos.run.evaluation import EvalConfig, Progress, make_target, play, weights_hash
+from deimos.run.evaluation import EvalConfig, Progress, check_memory, make_target, play, weights_hash
 from deimos.run.fear_of_run import load_fear
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop
@@ -368,10 +368,13 @@ def shield_run(
         See ``Trial.run``.
 
     Raises:
-        RunError: If the run has no fear network, or there are too few crashes to calibrate on.
+        RunError: If the run has no fear network, there are too few crashes to calibrate on, or too many worlds for the
+            memory.
     """
     policy = load_policy(folder.path, str(device))
     env_config = config.env.resolved(device)
+    check_memory(env_config, replace(eval_config, worlds=shield.worlds, attackers=()), device)
+    check_memory(env_config, eval_config, device)
     afraid = load_fear(folder, config, env_config.build(1, device, config.seed))
     if afraid is None:
         raise RunError(
