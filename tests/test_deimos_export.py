@@ -226,6 +226,27 @@ def test_what_the_controller_measures_is_what_the_policy_saw(stairs, tmp_path):
         np.testing.assert_allclose(np.clip(value, -bound, bound), known[name], atol=2e-4, err_msg=name)
 
 
+def test_an_actor_without_what_a_robot_cannot_measure(tmp_path, capsys):
+    """What the critic alone sees, the export does not ask for, and its robots move as they did in training."""
+    budget = "--preset quad-walk --no-evaluation --num-envs 8 --env-steps 24 --threads 1 --device cpu --ppo.hidden 16"
+    hidden = "--env.engine native --env.privileged linear_velocity heights"
+    assert cli.main(["train", *budget.split(), *hidden.split(), "--out", str(tmp_path / "run")]) == 0
+    assert cli.main(["export", str(tmp_path / "run"), str(tmp_path / "out"), "--check"]) == 0
+    assert "It is what was exported." in capsys.readouterr().out
+    deploy = json.loads((tmp_path / "out" / "deploy.json").read_text())
+    names = [entry["name"] for entry in deploy["observation"]]
+    assert names == ["angular_velocity", "gravity", "goal", "joint_position", "joint_velocity", "last_action"]
+    with np.load(tmp_path / "out" / "check.npz") as file:
+        assert file["policy.observation"].shape[1] == 45
+
+
+def test_only_what_there_is_can_be_privileged():
+    """An entry that does not exist, and the goal, are refused by name."""
+    for name in ("speed", "goal"):
+        with pytest.raises(ValueError, match=f"privileged must be some of linear_velocity, .*, got {name}"):
+            quad.Config(engine="native", privileged=(name,)).build(1, CPU, seed=0)
+
+
 def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
     """Other actions, a robot that falls, and a file that was exchanged are found."""
     folder = tmp_path / "changed"

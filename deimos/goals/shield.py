@@ -126,7 +126,7 @@ class Shield:
         if not min(goal_range) > 0.0:
             raise ValueError(f"goal_range must be positive, got {tuple(goal_range)}.")
         self.threshold, self.mode, self.window = threshold, mode, window
-        self._fixed = torch.tensor([value is not None for value in safe_goal])
+        self._fixed = torch.tensor([value is not None for value in safe_goal], dtype=torch.bool)
         self._safe = torch.tensor([value or 0.0 for value in safe_goal], dtype=torch.float32)
         self._range = torch.tensor(goal_range, dtype=torch.float32)
         self._reference = torch.tensor(reference, dtype=torch.float64).sort().values
