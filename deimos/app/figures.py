@@ -132,13 +132,19 @@ def draw_tradeoff(folder: RunFolder, found: dict) -> Path:
             )
             if shield == "shield":
                 for x, row in zip(cost, own, strict=True):
-                    axes.annotate(f"{row['alpha']:g}", (x, 100 * row["crash_rate"]), fontsize=8)
+                    axes.annotate(
+                        f"{row['alpha']:g}",
+                        (x, 100 * row["crash_rate"]),
+                        (3, 4),
+                        textcoords="offset points",
+                        fontsize=8,
+                    )
         axes.set_title(" ".join(heading(goals)))
         axes.set_xlabel("uniform goals refused [%]")
         axes.set_ylabel("goals that ended in a crash [%]")
         axes.set_ylim(bottom=0.0)
         axes.grid(alpha=0.3)
-        axes.legend(frameon=False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return _save(figure, folder.path / "shield.png")
 
 
