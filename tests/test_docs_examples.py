@@ -65,6 +65,8 @@ ELSEWHERE = {
     r"pip install torch==": "it fetches from another host; no test does",
     r"deimos pool |.* --pool ": "tests/test_deimos_attackers.py, with policies that crash",
     r"python examples/\w+\.py$": "tests/test_examples.py",
+    r"deimos shield ": "tests/test_deimos_shield.py, with policies that crash",
+    r"deimos export docs/.* --check|python deploy/go1/|python examples/deploy/": "tests/test_deimos_export.py",
     r"reproduction/freeze ": "tests/test_reproduction_studies.py, in a repository of its own",
 }
 """Commands that are run elsewhere, and where."""

@@ -27,6 +27,8 @@ COMMANDS = {
     "study": ("deimos.app.study", "train and compare populations of policies"),
     "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
     "view": ("deimos.app.view", "watch a policy in the browser, and drive it, also while it trains"),
+    "shield": ("deimos.app.shield", "calibrate a shield against goals that would crash a policy, and try it"),
+    "export": ("deimos.app.export", "write a policy as ONNX, with all that a robot's controller needs"),
     "robot": ("deimos.app.robot", "check a robot of your own, and draft its file from an MJCF"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }
@@ -35,6 +37,7 @@ COMMANDS = {
 EXTRAS = {
     "warp": "sim", "tyro": "sim", "rich": "sim", "tensorboard": "sim", "matplotlib": "sim", "PIL": "legged",
     "mujoco": "legged", "mujoco_warp": "legged", "trimesh": "legged", "imageio_ffmpeg": "legged", "scipy": "study",
+    "onnx": "export", "onnxruntime": "export", "yaml": "export",
 }  # fmt: skip
 """The extra of ``deimos-rl`` that installs a package."""
 

@@ -102,6 +102,52 @@ def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor
     return _save(figure, folder.path / "calibration.png")
 
 
+def draw_tradeoff(folder: RunFolder, found: dict) -> Path:
+    """Draw ``shield.png``: crashes over refused goals, for several thresholds of a shield and of the baselines.
+
+    Args:
+        folder: The run.
+        found: What ``deimos.run.shield.shield_run`` gives.
+
+    Raises:
+        RunError: If it cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    unshielded = {row["goals"]: row for row in found["trials"] if row["shield"] == "no shield"}
+    names = list(dict.fromkeys(row["goals"] for row in found["tradeoff"])) or ["naive"]
+    figure = Figure(figsize=(5.5 * len(names), 4.4), layout="constrained")
+    for axes, goals in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        rows = [row for row in found["tradeoff"] if row["goals"] == goals]
+        axes.axhline(100 * unshielded[goals]["crash_rate"], color="grey", linestyle=":", label="no shield")
+        shields = dict.fromkeys(row["shield"] for row in rows)
+        for shield, colour, marker in zip(shields, (BLUE, *ATTACKED), "os^", strict=False):
+            own = [row for row in rows if row["shield"] == shield]
+            # How many of the uniform goals a user would lose, also where an attacker chooses.
+            cost = [
+                100 * row["refused"] for row in found["tradeoff"] if (row["shield"], row["goals"]) == (shield, "naive")
+            ]
+            axes.plot(
+                cost, [100 * row["crash_rate"] for row in own], color=colour, marker=marker, markersize=4, label=shield
+            )
+            if shield == "shield":
+                for x, row in zip(cost, own, strict=True):
+                    axes.annotate(
+                        f"{row['alpha']:g}",
+                        (x, 100 * row["crash_rate"]),
+                        (3, 4),
+                        textcoords="offset points",
+                        fontsize=8,
+                    )
+        axes.set_title(" ".join(heading(goals)))
+        axes.set_xlabel("uniform goals refused [%]")
+        axes.set_ylabel("goals that ended in a crash [%]")
+        axes.set_ylim(bottom=0.0)
+        axes.grid(alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    return _save(figure, folder.path / "shield.png")
+
+
 def _save(figure: "Figure", path: Path) -> Path:
     write_whole(path, lambda file: figure.savefig(file, format="png", dpi=120))
     return path

@@ -6,12 +6,12 @@ from pathlib import Path
 import torch
 
 from deimos.checks import RunError
-from deimos.goals.fear_selector import FearSelector, fear_selector
+from deimos.goals.fear_selector import FearSelector
 from deimos.learn.policy import Policy, load_policy
+from deimos.run.fear import load_fear
 from deimos.run.folder import RunFolder
-from deimos.run.loop import spaces
 from deimos.run.trainer import TrainConfig
-from deimos.run.training import load_checkpoint, read_config
+from deimos.run.training import read_config
 from deimos.sim.env import Env
 from deimos.sim.legged.config import LocomotionConfig
 
@@ -85,13 +85,4 @@ class SavedRun:
 
     def fear(self, env: Env) -> FearSelector | None:
         """The selector with the fear network that the run has learnt by now, if it has one."""
-        config = self.config
-        afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
-        if afraid is None or afraid.parts:
-            return None
-        state = load_checkpoint(self.folder)["loop"]["selector"]
-        if "fear" not in state:  # it is a part of another selector
-            return None
-        for name in ("fear", "calibration"):  # what else there is depends on the version that wrote it
-            getattr(afraid, name).load_state_dict(state[name])
-        return afraid if afraid.fear.fitted else None
+        return load_fear(self.folder, self.config, env)

@@ -163,6 +163,12 @@ class Env(abc.ABC):
     """What each of them is called."""
     goal_group_weights: tuple[float, ...] = ()
     """How much each of them counts in the score, at least 0; empty where all count alike."""
+    goal_range: Tensor | None = None
+    """Half side of the box that goals are drawn from, in physical units, shape (goal_dim,); ``None`` for no box."""
+    guard: Callable[[Tensor, Tensor], Tensor] | None = None
+    """Has the last word on the goals of ``set_goals``: of the worlds, int64, shape (B,), and the goals, shape
+    (B, goal_dim), that they are to get, it gives those that they do get. ``None`` for nobody. What selectors and
+    attackers learn from are the goals that they asked for."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
     """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
     shape (num_envs,). Empty where ``Step.tracking`` says enough."""
@@ -256,6 +262,14 @@ class Env(abc.ABC):
             The lowest and the highest value of every component, as the policy sees it, shape (B, goal_dim) each.
         """
         return None
+
+    def rest_goal(self) -> tuple[float | None, ...]:
+        """The goal that asks a world to stay where it is, as the policy sees it.
+
+        By default all zeros: no speed, no way to go, the middle of the box. ``None`` for components that stay as they
+        are.
+        """
+        return (0.0,) * self.goal_dim
 
     def scripted_goals(self, rows: Tensor, goal: Tensor) -> Tensor | None:
         """What a person would ask of the listed worlds to make them crash, for the attacker ``scripted``.

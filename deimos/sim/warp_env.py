@@ -46,6 +46,8 @@ class WarpEnv(Env):
     """What all environments have for their worlds, for the kernels."""
     action: Shared
     """The actions of the step: ``worlds.action``."""
+    goal_range: Tensor
+    """See ``Env.goal_range``."""
     beyond_obs: Tensor
     """Memory behind ``obs`` that no kernel may write, for ``check_env``."""
     launch_step: Callable[[], None]
@@ -85,7 +87,7 @@ class WarpEnv(Env):
         self._step = Step(**step | {"tracking": views["tracking"] if groups > 1 else None})
         self.obs, self.episode_step = views["obs"], views["episode_step"]
         self.action = Shared(self.worlds.action, views["action"])
-        self._whole_range = torch.tensor(goal_range, dtype=torch.float32, device=device)
+        self.goal_range = torch.tensor(goal_range, dtype=torch.float32, device=device)
         seen = [half_side * scale for half_side, scale in zip(goal_range, scales, strict=True)]
         self._seen_range = torch.tensor(seen, dtype=torch.float32, device=device)
         self._row = Shared.zeros(num_envs, wp.int32, device)
@@ -168,7 +170,7 @@ class WarpEnv(Env):
         """See ``Env.reset``."""
         self._views["mask"].copy_(mask)
         share = 1.0 if goal_scale is None else goal_scale.detach()
-        torch.mul(self._whole_range, share, out=self._views["first_range"])
+        torch.mul(self.goal_range, share, out=self._views["first_range"])
         self._launch_reset()
 
     @final
@@ -192,7 +194,7 @@ class WarpEnv(Env):
             return None
         middle = torch.zeros(len(rows), self.goal_dim, dtype=torch.float32, device=self.device)
         if self.worlds.origin.shape[0]:
-            middle -= wp.to_torch(self.worlds.origin)[rows] * (self._seen_range / self._whole_range)
+            middle -= wp.to_torch(self.worlds.origin)[rows] * (self._seen_range / self.goal_range)
         return middle - self._seen_range, middle + self._seen_range
 
     @final
@@ -214,6 +216,7 @@ class WarpEnv(Env):
     @final
     def set_goals(self, rows: Tensor, goal: Tensor) -> None:
         """See ``Env.set_goals``."""
+        goal = goal if self.guard is None else self.guard(rows, goal)
         self._set_rows(rows)
         self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))

@@ -53,6 +53,9 @@ class LocomotionConfig(EnvConfig):
     """Bound of the horizontal velocity that a push sets [m/s], at least 0."""
     noise: bool = True
     """Whether observations are noisy."""
+    privileged: tuple[str, ...] = ()
+    """Entries of the observation that the critic alone sees, such as linear_velocity and heights: what the robot itself
+    cannot measure."""
     stagger: bool = True
     """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
     stiffness: float | None = None

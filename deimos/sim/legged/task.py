@@ -5,7 +5,7 @@ rise and fall with the reward.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any
@@ -94,7 +94,8 @@ class Locomotion(WarpEnv):
         """What the reward is the sum of: the legs' terms, what clipping adds, and the terms of the goal's parts."""
         super().__init__(
             config, num_envs, device, seed, env_offset,
-            layout=_layout(robot, parts, len(self.points)), goal_range=[half for part in parts for half in part.range],
+            layout=_layout(robot, parts, len(self.points), config.privileged),
+            goal_range=[half for part in parts for half in part.range],
             action_dim=len(robot.joints), dt=config.physics.control_period, time_limit=config.episode_steps,
             action_bound=max(abs(end) for joint in robot.joints for end in joint.action_range),
         )  # fmt: skip
@@ -274,6 +275,11 @@ class Locomotion(WarpEnv):
         reverse = torch.where(self.goal[rows, :count] < 0, 1.0, -1.0).float() * self._seen_range[:count]
         return torch.cat([reverse, goal[:, count:]], dim=1)
 
+    def rest_goal(self) -> tuple[float | None, ...]:
+        """See ``Env.rest_goal``: no velocity, an arm where it is asked to be."""
+        walk, *others = (len(part.range) for part in self.parts)
+        return (0.0,) * walk + (None,) * sum(others)
+
     def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
         """See ``Env.risk_contrast``: as they are, on stairs and on flat ground (thesis, 4.1)."""
         shapes = [shape for shape, _ in self.tiles()]
@@ -336,12 +342,18 @@ def _require_room(ground: Terrain) -> None:
         )
 
 
-def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[ObsField, ...]:
-    """Legged Gym's observation, with the fields of the goal's parts before the heights."""
+def _layout(
+    robot: Robot, parts: Sequence[GoalPart], num_points: int, privileged: Sequence[str]
+) -> tuple[ObsField, ...]:
+    """Legged Gym's observation, with the fields of the goal's parts before the heights.
+
+    Raises:
+        ValueError: If something is to be privileged that is not there, or the goal, which the actor has to see.
+    """
     joints = len(robot.joints)
     units = [unit for part in parts for unit in part.units]
     scale = tuple(scale for part in parts for scale in part.scale)
-    return (
+    layout = (
         ObsField("linear_velocity", 3, "m/s", VELOCITY_SCALE),
         ObsField("angular_velocity", 3, "rad/s", RATE_SCALE),
         ObsField("gravity", 3, "1", 1.0),
@@ -352,6 +364,10 @@ def _layout(robot: Robot, parts: Sequence[GoalPart], num_points: int) -> tuple[O
         *(field for part in parts for field in part.fields),
         ObsField("heights", num_points, "m", HEIGHT_SCALE),
     )
+    possible = [field.name for field in layout if field.name != "goal"]
+    if unknown := sorted(set(privileged) - set(possible)):
+        raise ValueError(f"privileged must be some of {', '.join(possible)}, got {', '.join(unknown)}.")
+    return tuple(replace(field, seen_by="critic") if field.name in privileged else field for field in layout)
 
 
 def _noise(layout: Sequence[ObsField], parts: Sequence[GoalPart]) -> list[float]:

@@ -19,6 +19,16 @@ def build_model(robot: Robot, terrain: Terrain | None, config: PhysicsConfig) ->
     Raises:
         ValueError: If the terrain's cells are finer than ``FINEST_CELL``.
     """
+    spec = build_spec(robot, terrain, config)
+    model = spec.compile()
+    plain = spec.copy()
+    for geom in [geom for geom in plain.geoms if geom.group == VISUAL_GROUP]:
+        plain.delete(geom)
+    return model, plain
+
+
+def build_spec(robot: Robot, terrain: Terrain | None, config: PhysicsConfig) -> "mujoco.MjSpec":
+    """The specification of the model with its visual geoms; raises ``ValueError`` as ``build_model`` does."""
     if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
         raise ValueError(
             f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
@@ -27,11 +37,7 @@ def build_model(robot: Robot, terrain: Terrain | None, config: PhysicsConfig) ->
         )
     spec = _with_ground(robot.spec, terrain)
     _set_options(spec, config)
-    model = spec.compile()
-    plain = spec.copy()
-    for geom in [geom for geom in plain.geoms if geom.group == VISUAL_GROUP]:
-        plain.delete(geom)
-    return model, plain
+    return spec
 
 
 def _with_ground(robot: "mujoco.MjSpec", terrain: Terrain | None) -> "mujoco.MjSpec":

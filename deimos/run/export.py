@@ -1,0 +1,220 @@
+"""A trained policy as a folder that a robot's own software reads, without Deimos and without torch.
+
+``policy.onnx`` and ``fear.onnx`` are the networks, ``deploy.json`` says all that a deployment has to know about them,
+``controller.py`` is an example of one and checks the others. A legged robot has ``robot.xml`` too, and ``deploy.yaml``
+in the shape of Unitree's tools. No number is rounded.
+"""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deimos.checks import RunError
+from deimos.files import write_whole
+from deimos.goals.fear_selector import FearSelector
+from deimos.learn.policy import Policy, load_policy
+from deimos.nn.layout import ObsField
+from deimos.nn.threads import torch_on_one
+from deimos.run import export_controller, export_onnx, export_robot, export_unitree
+from deimos.run.config import kind
+from deimos.run.evaluation import weights_hash
+from deimos.run.fear import load_fear
+from deimos.run.folder import RunFolder
+from deimos.run.shield import SHIELD
+from deimos.run.trainer import TrainConfig
+from deimos.run.training import provenance, read_config
+from deimos.sim.env import Env
+from deimos.sim.legged.config import LocomotionConfig
+from deimos.sim.legged.task import Locomotion
+
+SCHEMA = 1  # of deploy.json
+ROBOTS = 64  # that walk in the check, and times that their observations are kept
+SECONDS = 10.0  # that they walk
+STEPS = 512  # of a check in worlds that have no seconds
+CANDIDATES = 5  # for every decision of the fear network in the check
+
+
+@torch.no_grad()
+@torch_on_one()
+def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
+    """Write the folder of a run's policy.
+
+    Args:
+        folder: The run.
+        out: The folder, which must not exist.
+        check: Whether it gets ``check.npz``, what ``controller.py`` compares with.
+
+    Raises:
+        RunError: If ``out`` exists, the run is broken, or something cannot be written.
+    """
+    config = read_config(folder)
+    policy = load_policy(folder.path)
+    try:
+        steps = STEPS
+        if isinstance(config.env, LocomotionConfig):
+            steps = round(SECONDS / config.env.physics.control_period)
+        env_config = config.env.for_evaluation().resolved(torch.device("cpu"))
+        env = env_config.with_goal_period(steps).build(ROBOTS, torch.device("cpu"), config.eval.seed)
+    except ValueError as error:
+        raise RunError(str(error)) from error
+    if policy.layout != env.layout:
+        raise RunError(f"The policy of {folder.path} observes other things than its environment: {policy.layout}.")
+    afraid = load_fear(folder, config, env)
+    try:
+        out.mkdir(parents=True)
+    except FileExistsError as error:
+        raise RunError(f"{out} exists and is not overwritten; choose another folder.") from error
+    try:
+        _write(folder, config, policy, env, afraid, out)
+        if check:
+            facts = _play(env, policy, afraid, steps)
+            write_whole(out / "check.npz", lambda file: np.savez(file, **facts))  # type: ignore[arg-type]
+    except BaseException:
+        shutil.rmtree(out, ignore_errors=True)  # half a folder would be taken for a whole one
+        raise
+
+
+def _write(
+    folder: RunFolder, config: TrainConfig, policy: Policy, env: Env, afraid: FearSelector | None, out: Path
+) -> None:
+    """Write everything but what the check compares with."""
+    weights = weights_hash(policy.actor)
+    facts = {"weights": weights, "environment": kind(config.env), "units": "physical; see deploy.json"}
+    goal = policy.goal_slice
+    models = {"policy": export_onnx.policy_model(policy, facts)}
+    if afraid is not None:
+        scale = policy.scale.cpu()
+        models["fear"] = export_onnx.fear_model(afraid, env.state(scale), scale[goal], facts)
+    files = {}
+    for name, data in models.items():
+        (out / f"{name}.onnx").write_bytes(data)
+        files[name] = {"file": f"{name}.onnx", "sha256": hashlib.sha256(data).hexdigest(), "weights": weights}
+    deploy = _describe(folder, config, policy, env, afraid, files)
+    if isinstance(env, Locomotion):
+        export_robot.write_model(env, out)
+        deploy["robot"] = export_robot.describe_robot(env)
+        export_unitree.write(deploy, out / "deploy.yaml")
+    (out / "deploy.json").write_text(json.dumps(deploy, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    shutil.copyfile(export_controller.__file__, out / "controller.py")
+
+
+def _describe(
+    folder: RunFolder, config: TrainConfig, policy: Policy, env: Env, afraid: FearSelector | None, files: dict
+) -> dict[str, Any]:
+    """``deploy.json``, but for the entry ``robot``."""
+    stored = folder.read_json("config.json")
+    sees = torch.zeros(env.obs_dim, dtype=torch.bool)
+    sees[policy.actor.seen] = True
+    shown = dict(zip(policy.layout, sees.split([field.size for field in policy.layout]), strict=True))
+    low, high = (_plain(bound) for bound in env.action_range)
+    fear = None
+    if afraid is not None:
+        state = [_entry(field) for field in policy.layout if field.name != "goal"]
+        calibration = afraid.calibration.state_dict()
+        fear = files["fear"] | {"goal_period": config.env.goal_period, "calibration": calibration, "state": state}
+    return {
+        "schema": SCHEMA,
+        "environment": kind(config.env),
+        "goals_chosen_by": config.label,
+        "seed": config.seed,
+        "versions": {"training": stored.get("versions"), "export": provenance() | {"onnx": version("onnx")}},
+        "control_period": policy.dt,
+        "control_period_unit": "s" if env.has_seconds else "step",
+        "policy": files["policy"],
+        "observation": [_entry(field) for field, seen in shown.items() if bool(seen.all())],
+        "action": {"size": env.action_dim, "low": low, "high": high},
+        "goal": _describe_goal(env, config.env.goal_period),
+        "fear": fear,
+        "shield": _shield(folder, files["policy"]["weights"]),
+        "robot": None,
+    }
+
+
+def _shield(folder: RunFolder, weights: str) -> dict[str, Any] | None:
+    """The shield that the run has, if it has one; ``RunError`` if that was made for a policy of other weights."""
+    if not (folder.path / SHIELD).exists():
+        return None
+    try:
+        shield = folder.read_json(SHIELD)["deploy"]
+        known = shield["weights"]
+    except (KeyError, TypeError) as error:
+        raise RunError(f"{folder.path / SHIELD} is not that of a shield; make it again by deimos shield.") from error
+    if known != weights:
+        raise RunError(
+            f"{folder.path / SHIELD} was made for an earlier policy; make it again by deimos shield, or delete it."
+        )
+    return shield
+
+
+def _entry(field: ObsField) -> dict[str, Any]:
+    """An entry of an observation: what the networks' files expect, in physical units, and what they make of it."""
+    bound = export_robot.CLIPS.get(field.name)
+    return {
+        "name": field.name, "size": field.size, "unit": field.unit,
+        "scale": _plain(torch.as_tensor(field.scale, dtype=torch.float64).expand(field.size)),
+        "clip": None if bound is None else [-bound, bound], "source": export_robot.SOURCES.get(field.name),
+    }  # fmt: skip
+
+
+def _describe_goal(env: Env, goal_period: int) -> dict[str, Any]:
+    """Components of the goal with units and the box that training drew them from."""
+    field = next(field for field in env.layout if field.name == "goal")
+    names = [
+        group if part.stop - part.start == 1 else f"{group} {'xyz'[number] if number < 3 else number}"
+        for group, part in zip(env.goal_group_names, _parts(env), strict=True)
+        for number in range(part.stop - part.start)
+    ]
+    units = field.unit.split(", ") if ", " in field.unit else [field.unit] * field.size
+    half = [None] * field.size if env.goal_range is None else _plain(env.goal_range)
+    return {
+        "period": goal_period,
+        "groups": list(env.goal_group_names),
+        "components": [
+            {"name": name, "unit": unit, "low": None if side is None else -side, "high": side}
+            for name, unit, side in zip(names, units, half, strict=True)
+        ],
+    }
+
+
+def _parts(env: Env) -> Sequence[slice]:
+    """The groups of the goal's components, with both ends."""
+    return [slice(*part.indices(env.goal_dim)[:2]) for part in env.goal_groups]
+
+
+def _plain(values: Tensor) -> list[float | None]:
+    """Numbers for JSON, which has no infinity."""
+    return [None if not np.isfinite(value) else value for value in values.tolist()]
+
+
+def _play(env: Env, policy: Policy, afraid: FearSelector | None, steps: int) -> dict[str, np.ndarray]:
+    """Let the policy act from where the worlds are, each under one goal: what the exported files have to repeat."""
+    walk = export_robot.Walk(env) if isinstance(env, Locomotion) else None
+    rows = torch.arange(env.num_envs)
+    kept: list[tuple[Tensor, Tensor]] = []
+    for t in range(steps):
+        if t % max(1, steps // ROBOTS) == 0 and len(kept) < ROBOTS:
+            kept.append((env.obs.clone(), env.sample_goals(rows, CANDIDATES).clone()))
+        step = env.step(policy.scaled(env.obs))
+        if walk is not None:
+            assert step.tracking is not None
+            walk.note(step.terminated, step.truncated, step.tracking)
+    obs, candidates = (torch.cat(parts) for parts in zip(*kept, strict=True))
+    physical, goal_scale = obs / policy.scale, policy.scale[policy.goal_slice]
+    seen = physical * policy.scale  # what the division has rounded is rounded for both
+    facts = {"policy.observation": physical[:, policy.actor.seen], "policy.action": policy.scaled(seen)}
+    if afraid is not None:
+        goals = candidates / goal_scale
+        logit = afraid.score(env.state(seen), seen[:, policy.goal_slice], goals * goal_scale)
+        facts |= {
+            "fear.state": env.state(physical), "fear.goal": physical[:, policy.goal_slice], "fear.candidates": goals,
+            "fear.logit": logit, "fear.probability": afraid.calibration.probability(logit),
+        }  # fmt: skip
+    return {name: value.numpy() for name, value in facts.items()} | (walk.facts() if walk else {})

@@ -1,0 +1,29 @@
+"""A shield at run time: an exported fear network decides over every goal. Usage: python shield.py FOLDER."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import torch
+
+from deimos.goals.shield import Shield
+
+folder = Path(sys.argv[1])  # of `deimos export`, after `deimos shield`
+deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
+shield, network = Shield.from_dict(deploy["shield"]), onnxruntime.InferenceSession(folder / "fear.onnx")
+state = np.zeros((1, sum(entry["size"] for entry in deploy["fear"]["state"])), np.float32)  # what the robot measures
+active = np.zeros((1, len(deploy["goal"]["components"])), np.float32)  # what it pursues
+wanted = np.array([[component["high"] for component in deploy["goal"]["components"]]], np.float32)  # what comes next
+
+
+def score(goals: torch.Tensor) -> torch.Tensor:
+    """Fear of some goals in this state."""
+    inputs = {"state": state, "goal": active, "candidates": goals.numpy()}
+    return torch.from_numpy(network.run(["logit"], inputs)[0])
+
+
+given = shield.choose(score, torch.from_numpy(active), torch.from_numpy(wanted))
+print(f"wanted {wanted[0]}, fear {given.score.item():.2f}, {'refused' if given.refused.item() else 'let through'}")
+print(f"pursue {given.goal.numpy()[0]}")

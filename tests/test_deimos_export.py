@@ -1,0 +1,312 @@
+"""Exported policies: the same numbers in onnxruntime and MuJoCo alone, and nothing rounded."""
+
+import ast
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+import yaml
+from deimos.terrain.shapes.stairs import Shape as Stairs
+
+from deimos import terrain
+from deimos.app import cli
+from deimos.app.export import check
+from deimos.checks import RunError
+from deimos.goals.selector import Spaces
+from deimos.goals.selectors import director
+from deimos.learn.policy import Policy
+from deimos.nn.layout import ObsField, seen_by
+from deimos.nn.networks import Actor
+from deimos.run import export, export_controller, export_robot
+from deimos.run.export_onnx import IR_VERSION, OPSET, fear_model, policy_model
+from deimos.run.folder import RunFolder
+from deimos.sim.envs import quad, quad_arm
+
+HOME = Path(__file__).resolve().parent.parent
+WALK = HOME / "docs" / "results" / "quad_flat"
+CPU = torch.device("cpu")
+LAYOUT = (
+    ObsField("speed", 2, "m/s", (2.0, 0.5), seen_by="critic"),
+    ObsField("goal", 3, "m", 0.25),
+    ObsField("angle", 4, "rad", 3.0),
+)
+
+
+def run_model(data, **inputs):
+    """Outputs of an ONNX model for tensors."""
+    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+    return [torch.from_numpy(out) for out in session.run(None, {key: value.numpy() for key, value in inputs.items()})]
+
+
+def make_policy(activation, normalize, bound, layout=LAYOUT):
+    """A policy of random weights."""
+    random = torch.Generator().manual_seed(0)
+    size = sum(field.size for field in layout)
+    seen = seen_by("actor", layout, CPU)
+    actor = Actor(size, (32, 16), 5, activation, 1.0, random, seen, normalize=normalize)
+    if normalize:
+        actor.normalizer.update(torch.randn(500, size, generator=random) * 3 + 1, torch.ones(500))
+    return Policy(actor, (32, 16), activation, layout, bound, 0.02)
+
+
+@pytest.fixture(scope="module")
+def afraid():
+    """A fear network of random weights, with a calibration of its own."""
+    selector = director.Config(rule="argmax").build(Spaces(1, 6, 3, 10, CPU), 0)
+    selector.calibration.prior, selector.calibration.temperature = -1.25, 1.75
+    return selector
+
+
+@pytest.fixture(scope="module")
+def particles(tmp_path_factory):
+    """Folder of a run in Particle Gym that has hardly learnt anything, with a fear network."""
+    path = tmp_path_factory.mktemp("export") / "run"
+    budget = "--no-evaluation --num-envs 256 --env-steps 96 --threads 1 --device cpu --ppo.hidden 16 --ppo.init-std 100"
+    fast = "--env.goal-period 10 --env.max-speed 200 --env.max-force 100"
+    assert cli.main(["train", *budget.split(), *fast.split(), "--out", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def walker(tmp_path_factory):
+    """The committed policy, exported with a check of 16 robots that walk for a second."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(export, "ROBOTS", 16)
+    patch.setattr(export, "SECONDS", 1.0)
+    out = tmp_path_factory.mktemp("export") / "go1"
+    export.export_run(RunFolder.open(WALK), out, check=True)
+    patch.undo()
+    return out
+
+
+@pytest.mark.parametrize("batch", [1, 7, 4096])
+@pytest.mark.parametrize("bound", [0.5, float("inf")])
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("activation", ["relu", "elu", "tanh"])
+def test_a_policy_gives_the_same_actions(activation, normalize, bound, batch):
+    """Physical observations of what the actor sees give its actions to 1e-5, for any batch."""
+    policy = make_policy(activation, normalize, bound)
+    obs = torch.randn(batch, 9, generator=torch.Generator().manual_seed(1))
+    (action,) = run_model(policy_model(policy, {}), observation=obs[:, 2:].contiguous())
+    torch.testing.assert_close(action, policy(obs), rtol=0, atol=1e-5)
+    assert (action.abs() <= bound).all()
+
+
+def test_the_privileged_is_not_asked_for():
+    """An observation that only the critic sees changes no action, and the file does not want it."""
+    model = onnx.load_from_string(policy_model(make_policy("elu", True, 1.0), {"weights": "abc"}))
+    assert [dim.dim_value or dim.dim_param for dim in model.graph.input[0].type.tensor_type.shape.dim] == ["batch", 7]
+    assert {entry.key: entry.value for entry in model.metadata_props} == {"weights": "abc"}
+    assert (model.ir_version, model.opset_import[0].version) == (IR_VERSION, OPSET)
+    assert not any(constant.external_data for constant in model.graph.initializer)
+
+
+@pytest.mark.parametrize("count", [1, 100])
+@pytest.mark.parametrize("blind", [False, True])
+def test_a_fear_network_gives_the_same_fear(afraid, blind, count):
+    """Logits and calibrated probabilities of physical states and goals are those of the selector."""
+    control = "state-blind" if blind else "none"
+    selector = director.Config(rule="argmax", control=control).build(Spaces(1, 6, 3, 10, CPU), 0)
+    selector.calibration.load_state_dict(afraid.calibration.state_dict())
+    random = torch.Generator().manual_seed(1)
+    state, goal, goals = (torch.randn(*shape, generator=random) for shape in ((50, 6), (50, 3), (50, count, 3)))
+    scale, goal_scale = torch.tensor([2.0, 0.5, 3.0, 3.0, 3.0, 3.0]), torch.full((3,), 0.25)
+    found = run_model(fear_model(selector, scale, goal_scale, {}), state=state, goal=goal, candidates=goals)
+    logit = selector.score(state * scale, goal * goal_scale, goals * goal_scale)
+    torch.testing.assert_close(found[0], logit, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found[1], selector.calibration.probability(logit), rtol=0, atol=1e-5)
+    assert len(found[0].unique()) > 1
+
+
+def test_the_controller_stands_alone():
+    """The exported script imports the standard library, NumPy, onnxruntime and MuJoCo, and nothing of ours."""
+    tree = ast.parse(Path(export_controller.__file__).read_text(encoding="utf-8"))
+    found = {
+        name.partition(".")[0]
+        for node in ast.walk(tree)
+        for name in ([alias.name for alias in node.names] if isinstance(node, ast.Import) else [])
+        + ([node.module] if isinstance(node, ast.ImportFrom) else [])
+    }
+    assert found - set(sys.stdlib_module_names) == {"numpy", "onnxruntime", "mujoco"}
+
+
+def test_robots_walk_alone_as_they_did_at_the_export(walker, capfd):
+    """Its own check, in a process without ours, finds the same actions and the same walk."""
+    check(walker)
+    said = capfd.readouterr().out
+    assert "16 robots walk 1 s: 0 fall, at the export 0" in said
+    assert "It is what was exported." in said
+
+
+def test_numbers_are_those_of_the_robot(walker):
+    """Joints, gains, limits, scales and hashes of ``deploy.json`` are the robot's and the policy's to the last bit."""
+    deploy = json.loads((walker / "deploy.json").read_text())
+    robot = quad.Config().make_robot()
+    for entry, joint in zip(deploy["robot"]["joints"], robot.joints, strict=True):
+        assert (entry["name"], entry["default_position"]) == (joint.name, joint.pose)
+        assert (entry["stiffness"], entry["damping"]) == (joint.stiffness, joint.damping)
+        assert (entry["max_torque"], tuple(entry["range"])) == (joint.max_torque, joint.range)
+    data = (walker / "policy.onnx").read_bytes()
+    assert deploy["policy"]["sha256"] == hashlib.sha256(data).hexdigest()
+    assert deploy["control_period"] == 0.02
+    assert [entry["name"] for entry in deploy["observation"]][:4] == [
+        "linear_velocity", "angular_velocity", "gravity", "goal",
+    ]  # fmt: skip
+    assert all(entry["source"] for entry in deploy["observation"])
+    assert [entry["name"] for entry in deploy["goal"]["components"]] == ["velocity x", "velocity y", "yaw rate"]
+    assert [entry["unit"] for entry in deploy["goal"]["components"]] == ["m/s", "m/s", "rad/s"]
+    assert deploy["versions"]["training"]["deimos"]
+    assert deploy["fear"] is deploy["shield"] is None
+
+
+def test_unitrees_tools_find_their_order(walker):
+    """``deploy.yaml`` lists gains by Unitree's motors, right legs first, and everything else in the policy's order."""
+    deploy = json.loads((walker / "deploy.json").read_text())
+    found = yaml.safe_load((walker / "deploy.yaml").read_text())
+    names = [joint["name"] for joint in deploy["robot"]["joints"]]
+    motors = [None] * 12
+    for name, motor in zip(names, found["joint_ids_map"], strict=True):
+        motors[motor] = name
+    assert [name[:2] for name in motors[::3]] == ["FR", "FL", "RR", "RL"]
+    assert motors[:3] == ["FR_hip", "FR_thigh", "FR_calf"]
+    assert found["default_joint_pos"] == [joint["default_position"] for joint in deploy["robot"]["joints"]]
+    assert found["actions"]["JointPositionAction"]["scale"] == [0.25] * 12
+    assert found["commands"]["base_velocity"]["ranges"]["ang_vel_z"] == [-1.0, 1.0]
+    assert list(found["observations"])[:4] == [
+        "base_lin_vel", "base_ang_vel", "projected_gravity", "velocity_commands",
+    ]  # fmt: skip
+
+
+def test_a_model_that_would_be_rounded_is_refused(tmp_path, monkeypatch):
+    """With the six digits that MuJoCo writes by itself, the export fails instead of writing another robot."""
+    env = quad.Config(engine="native").for_evaluation().build(1, CPU, seed=0)
+    monkeypatch.setattr(export_robot, "_to_xml", lambda spec: spec.to_xml())
+    with pytest.raises(RunError, match=r"differs from this robot's in .*armature"):
+        export_robot.write_model(env, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def stairs(tmp_path_factory):
+    """A file of steep stairs."""
+    path = tmp_path_factory.mktemp("ground") / "stairs.npz"
+    grid = terrain.Grid(
+        shapes=(terrain.Share(shape=Stairs()),), levels=1, columns=1, tile=6.0, border=2.0, hardest=0.7, easiest=0.7
+    )
+    terrain.build(grid).save(path)
+    return path
+
+
+def test_what_the_controller_measures_is_what_the_policy_saw(stairs, tmp_path):
+    """On stairs, heights, end effector and all else in MuJoCo alone are the environment's observation."""
+    env = quad_arm.Config(terrain=str(stairs), engine="native").for_evaluation().build(8, CPU, seed=3)
+    export_robot.write_model(env, tmp_path)
+    deploy = {"robot": export_robot.describe_robot(env)}
+    (tmp_path / "deploy.json").write_text(json.dumps(deploy))
+    action = torch.zeros(8, env.action_dim)
+    for _ in range(20):
+        env.step(action)
+    worlds = export_controller.Simulation(
+        tmp_path, env.tensors["qpos"].double().numpy(), env.tensors["qvel"].double().numpy()
+    )
+    scale = torch.cat([torch.as_tensor(field.scale).expand(field.size) for field in env.layout])
+    seen = (env.obs / scale).split([field.size for field in env.layout], dim=1)
+    known = {field.name: part.numpy() for field, part in zip(env.layout, seen, strict=True)}
+    measured = worlds.measure(known["goal"])
+    assert measured.keys() == known.keys() - {"last_action"}
+    assert np.ptp(measured["heights"]) > 0.1
+    for name, value in measured.items():
+        bound = export_robot.CLIPS.get(name, np.inf)
+        np.testing.assert_allclose(np.clip(value, -bound, bound), known[name], atol=2e-4, err_msg=name)
+
+
+def test_an_actor_without_what_a_robot_cannot_measure(tmp_path, capsys):
+    """What the critic alone sees, the export does not ask for, and its robots move as they did in training."""
+    budget = "--preset quad-walk --no-evaluation --num-envs 8 --env-steps 24 --threads 1 --device cpu --ppo.hidden 16"
+    hidden = "--env.engine native --env.privileged linear_velocity heights"
+    assert cli.main(["train", *budget.split(), *hidden.split(), "--out", str(tmp_path / "run")]) == 0
+    assert cli.main(["export", str(tmp_path / "run"), str(tmp_path / "out"), "--check"]) == 0
+    assert "It is what was exported." in capsys.readouterr().out
+    deploy = json.loads((tmp_path / "out" / "deploy.json").read_text())
+    names = [entry["name"] for entry in deploy["observation"]]
+    assert names == ["angular_velocity", "gravity", "goal", "joint_position", "joint_velocity", "last_action"]
+    with np.load(tmp_path / "out" / "check.npz") as file:
+        assert file["policy.observation"].shape[1] == 45
+
+
+def test_only_what_there_is_can_be_privileged():
+    """An entry that does not exist, and the goal, are refused by name."""
+    for name in ("speed", "goal"):
+        with pytest.raises(ValueError, match=f"privileged must be some of linear_velocity, .*, got {name}"):
+            quad.Config(engine="native", privileged=(name,)).build(1, CPU, seed=0)
+
+
+def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
+    """Other actions, a robot that falls, and a file that was exchanged are found."""
+    folder = tmp_path / "changed"
+    folder.mkdir()
+    for path in walker.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    with np.load(folder / "check.npz") as file:
+        known = dict(file)
+    np.savez(folder / "check.npz", **known | {"policy.action": known["policy.action"] + 2e-5})
+    assert not export_controller.main(folder)
+    start = known["walk.qpos"].copy()
+    start[0, 3:7] = 0.0, 1.0, 0.0, 0.0  # upside down
+    np.savez(folder / "check.npz", **known | {"walk.qpos": start})
+    assert not export_controller.main(folder)
+    assert "1 fall, at the export 0" in capsys.readouterr().out
+    (folder / "policy.onnx").write_bytes((walker / "policy.onnx").read_bytes() + b" ")
+    with pytest.raises(ValueError, match=r"policy.onnx is not the file that deploy.json describes"):
+        export_controller.main(folder)
+
+
+def test_particles_with_fear_and_shield(particles, tmp_path, capsys):
+    """A run's fear network and shield leave with it, the check holds, and the run-time example decides over a goal."""
+    small = "--worlds 1000 --eval.worlds 64 --eval.steps 100 --alphas 0.5 --attackers scripted --device cpu".split()
+    assert cli.main(["shield", str(particles), "--alpha", "0.3", *small]) == 0
+    out = tmp_path / "particles"
+    assert cli.main(["export", str(particles), str(out), "--check"]) == 0
+    assert "fear.onnx" not in capsys.readouterr().err
+    deploy = json.loads((out / "deploy.json").read_text())
+    assert deploy["robot"] is None
+    assert not (out / "robot.xml").exists()
+    assert deploy["fear"]["goal_period"] == 10
+    assert [entry["name"] for entry in deploy["fear"]["state"]] == ["velocity", "position", "last_action"]
+    assert deploy["shield"] == json.loads((particles / "shield.json").read_text())["deploy"]
+    example = HOME / "examples" / "deploy" / "shield.py"
+    done = subprocess.run([sys.executable, example, out], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert first.startswith("wanted [200. 200. 200.], fear ")
+    assert ("let through" in first) == (second == "pursue [200. 200. 200.]")
+
+
+def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsys):
+    """A folder that exists, no run, a policy or a shield of another one, each in a line; a run without fear is told."""
+    assert cli.main(["export", str(particles), str(tmp_path)]) == 2
+    assert "exists and is not overwritten" in capsys.readouterr().err
+    assert cli.main(["export", str(tmp_path), str(tmp_path / "out")]) == 2
+    assert "is not a run folder" in capsys.readouterr().err
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("config.json", "checkpoint.pt"):
+        (other / name).write_bytes((particles / name).read_bytes())
+    (other / "policy.pt").write_bytes((WALK / "policy.pt").read_bytes())
+    assert cli.main(["export", str(other), str(tmp_path / "out")]) == 2
+    assert "observes other things than its environment" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    (other / "policy.pt").write_bytes((particles / "policy.pt").read_bytes())
+    (other / "shield.json").write_text('{"deploy": {"weights": "0123456789abcdef"}}')
+    assert cli.main(["export", str(other), str(tmp_path / "out")]) == 2
+    assert "was made for an earlier policy; make it again by deimos shield" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert cli.main(["export", str(WALK), str(tmp_path / "go1")]) == 0
+    assert "This run has learnt no fear network, so there is no fear.onnx." in capsys.readouterr().err
+    assert not (tmp_path / "go1" / "check.npz").exists()
