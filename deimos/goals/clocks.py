@@ -126,7 +126,7 @@ class GoalClocks(Stateful):
             )  # fmt: skip
             self._count[some] += 1
         self._goal[rows], self._given[rows] = goals, ours
-        self._first[rows], self._open_ended[rows] = False, open_ended
+        self._open_ended[rows] = open_ended
         self._age[rows] = 0
         self.asked[rows] += 1
         return goals
