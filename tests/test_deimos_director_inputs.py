@@ -1,6 +1,7 @@
 """What other people's loops may hand to the Director, and what it says of the rest."""
 
 import re
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,11 +19,22 @@ N = 64
 NO = torch.zeros(N, dtype=torch.bool)
 
 
-def drive(goals, cast, steps=48, **options):
+def plain(numbers):
+    """Tensors as they are."""
+    return numbers
+
+
+def nothing(candidates):
+    """No candidates: the Director draws its own."""
+    return None
+
+
+def drive(goals, cast, offer=None, flag=None, host=nullcontext):
     """Walkers that crash far out, in a loop whose numbers ``cast`` has made; returns the last assignment."""
+    offer, flag = offer or cast, flag or cast
     generator = torch.Generator().manual_seed(0)
     state, goal = torch.zeros(N, 2), cast(torch.zeros(N, 2))
-    for _ in range(steps):
+    for _ in range(48):
         last = goal.detach().float() if isinstance(goal, torch.Tensor) else torch.tensor(goal)
         state = 0.8 * state + 0.5 * last
         crashed = state.norm(dim=1) > 1.2
@@ -46,9 +58,9 @@ WAYS = {
     "arrays that must not be written to": {"cast": lambda x: np.broadcast_to(x.numpy(), x.shape)},
     "float64": {"cast": lambda x: x.double() if x.is_floating_point() else x},
     "gradients": {"cast": lambda x: x.clone().requires_grad_() if x.is_floating_point() else x},
-    "int dones": {"cast": lambda x: x, "flag": lambda x: x.int()},
-    "float dones": {"cast": lambda x: x, "flag": lambda x: x.float()},
-    "candidates by need": {"cast": lambda x: x, "offer": lambda x: lambda rows: x[rows]},
+    "int dones": {"cast": plain, "flag": lambda x: x.int()},
+    "float dones": {"cast": plain, "flag": lambda x: x.float()},
+    "candidates by need": {"cast": plain, "offer": lambda x: lambda rows: x[rows]},
     "arrays by need": {"cast": lambda x: x.numpy().copy(), "offer": lambda x: lambda rows: x.numpy()[rows]},
 }
 
@@ -57,12 +69,12 @@ WAYS = {
 def test_every_way_to_say_it_is_the_same(way):
     """Arrays, tensors of any precision, flags of any type and candidates by need give the same, bit for bit."""
     expected, found = (GoalDirector(AFRAID, 4, learn_every=12) for _ in range(2))
-    plain = drive(expected, lambda x: x)
+    ordinary = drive(expected, plain)
     given = drive(found, **WAYS[way])
     assert expected.selector.fear.fitted
     for ours, theirs in zip(tensors(expected), tensors(found), strict=True):
         assert torch.equal(ours, theirs)
-    assert torch.equal(plain.goal, torch.as_tensor(given.goal, dtype=torch.float32))
+    assert torch.equal(ordinary.goal, torch.as_tensor(given.goal, dtype=torch.float32))
     arrays = way.startswith("arrays")
     assert all(isinstance(x, np.ndarray) == arrays for x in (given.goal, given.changed, given.weight))
     assert given.goal.dtype == (torch.float64 if way == "float64" else np.float32 if arrays else torch.float32)
@@ -77,29 +89,21 @@ HOSTS = {
 
 @pytest.mark.parametrize("host", HOSTS)
 def test_what_the_host_prefers_changes_nothing(host):
-    """Steps, updates, fear and a reload are those of a host without autocast and other devices."""
-    expected, found = (GoalDirector(AFRAID, 4, learn_every=12, goal_box=([-1, -1], [1, 1])) for _ in range(2))
-    drive(expected, lambda x: x, offer=lambda x: None)
-    at, now, new = torch.tensor([[1.0, 0.0]]), torch.zeros(1, 2), torch.tensor([[1.0, 0.0]])
-
-    def offer(_):
-        return None
-
-    state, step = torch.zeros(N, 2), found.step
-    found.step = lambda *args: _under(HOSTS[host], step, *args)
-    drive(found, lambda x: x, offer=offer)
-    del found.step, state
+    """Steps, updates, a reload and fear are those of a host without autocast and other devices."""
+    known = {"num_envs": N, "state_dim": 2, "goal_dim": 2, "device": "cpu"}
+    options = known | {"learn_every": 12, "goal_box": ([-1, -1], [1, 1])}
+    expected = GoalDirector(AFRAID, 4, **options)
+    drive(expected, plain, offer=nothing)
+    at, now, new = np.array([[1.0, 0.0]]), np.zeros((1, 2)), np.array([[1.0, 0.0]])
+    with HOSTS[host]():
+        found = GoalDirector(AFRAID, 4, **options)
+    drive(found, plain, offer=nothing, host=HOSTS[host])
     with HOSTS[host]():
         found.load_state_dict(found.state_dict())
         told = found.fear(at, now, new).probability
     for ours, theirs in zip(tensors(expected), tensors(found), strict=True):
         assert torch.equal(ours, theirs)
     assert torch.equal(told, expected.fear(at, now, new).probability)
-
-
-def _under(host, function, *arguments):
-    with host():
-        return function(*arguments)
 
 
 def test_candidates_are_asked_for_where_they_are_needed():
@@ -194,7 +198,7 @@ def test_selectors_learn_from_the_learners_transitions(config, caplog):
 def test_a_risk_map_is_fear_over_a_grid():
     """Every cell is the fear of the new goal whose two components are the cell's, the others those of the goal."""
     goals = GoalDirector(AFRAID, 4, learn_every=12, goal_box=([-1, -1], [1, 1]))
-    drive(goals, lambda x: x, offer=lambda x: None)
+    drive(goals, plain, offer=nothing)
     state, goal = torch.tensor([0.5, 0.1]), torch.tensor([0.2, -0.3])
     x, y = np.linspace(-1, 1, 5), np.linspace(0, 1, 3)
     found = goals.risk_map(state, goal, {1: x, 0: y})
@@ -261,9 +265,14 @@ def test_bad_input_is_named(changes, message):
 
 
 def test_worlds_that_are_done_need_no_state():
-    """Nothing is chosen in the state of a world that is done: it may be anything."""
-    goals, ended = GoalDirector("uniform", 1), torch.tensor([False, True])
-    assert goals.step(**good(state=NAN.expand(2, 3), truncated=ended)).changed.all()
+    """Nothing is chosen in the state of a world that is done: it may be anything, unless first goals are chosen."""
+    ended = torch.tensor([False, True])
+    for autoreset in ("SameStep", "NextStep"):
+        goals = GoalDirector("uniform", 1, autoreset=autoreset)
+        goals.step(**good(state=NAN.expand(2, 3), truncated=ended))
+    goals = GoalDirector("uniform", 1, first_goals="chosen")  # where the next episode begins
+    with pytest.raises(ValueError, match="state of world 1 must be finite"):
+        goals.step(**good(state=NAN.expand(2, 3), truncated=ended))
 
 
 def test_a_world_that_is_both_due_and_done_begins_anew():
