@@ -39,10 +39,9 @@ def drive(goals, cast, offer=None, flag=None, host=nullcontext):
         state = 0.8 * state + 0.5 * last
         crashed = state.norm(dim=1) > 1.2
         candidates = 2 * torch.rand(N, 20, 2, generator=generator) - 1
-        offered = options.get("offer", cast)(candidates)
-        given = goals.step(
-            cast(state), goal, options.get("flag", cast)(crashed), options.get("flag", cast)(NO), offered
-        )
+        arguments = cast(state), goal, flag(crashed), flag(NO), offer(candidates)
+        with host():
+            given = goals.step(*arguments)
         goal = given.goal
         state[crashed] = 0.0
     return given
