@@ -58,7 +58,8 @@ def periods(way: str, num_envs: int, period: int, device: torch.device) -> Calla
         way.split(",")[0], period, num_envs=num_envs, state_dim=STATE, goal_dim=GOAL, device=device, goal_box=box
     )
     states, goal = [draw(STATE) for _ in range(8)], draw(GOAL)
-    candidates = None if box else draw(CANDIDATES, GOAL)
+    offered = draw(CANDIDATES, GOAL)
+    candidates = None if box else offered
     never = torch.zeros(num_envs, dtype=torch.bool, device=device)
     clock = torch.zeros(num_envs, dtype=torch.int64, device=device)
 
@@ -71,7 +72,7 @@ def periods(way: str, num_envs: int, period: int, device: torch.device) -> Calla
         rows = (crashed | (clock >= period)).nonzero().squeeze(1)
         clock[rows] = 0
         if len(rows):
-            goal[rows] = director.propose(rows, states[t % 8][rows], goal[rows], lambda rows: candidates[rows])
+            goal[rows] = director.propose(rows, states[t % 8][rows], goal[rows], lambda rows: offered[rows])
 
     advance = observe if OBSERVED in way else step
 
