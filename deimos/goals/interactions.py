@@ -195,6 +195,11 @@ class Interactions(Stateful):
         return torch.cat([pending, env]), state, goal, next_goal
 
     @property
+    def horizon(self) -> Tensor:
+        """Steps that the pending interaction is to last, int64, shape (num_envs,)."""
+        return self._horizon
+
+    @property
     def latest_state(self) -> Tensor:
         """State at the latest decision of every world, on the step ``issued_at``, shape (num_envs, state_dim)."""
         return self._pending[:, : self._sizes[0]]
