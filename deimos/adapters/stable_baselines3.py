@@ -1,0 +1,59 @@
+"""A Director in Stable-Baselines3's training loops."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from deimos.adapters.goal_slot import GoalSlot, Observation, Reward
+from deimos.goals.director import GoalDirector
+
+
+class DirectedVecEnv(VecEnvWrapper):
+    """Worlds whose goals a Director chooses: it overwrites the goal in every observation, and the reward follows it.
+
+    Args:
+        venv: The worlds. What terminates is a crash; ``TimeLimit.truncated`` in an info is not.
+        director: Who chooses the goals.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``.
+        goals: What goals are drawn from; see ``GoalSlot``.
+        reward: Rewards for the goals in force; see ``Reward``. ``None`` asks the worlds' own ``compute_reward``, which
+            takes achieved goals, desired goals and infos, as in gymnasium-robotics.
+        seed: Seed of the candidates and of the first goals.
+
+    Raises:
+        ValueError: See ``GoalSlot``; also if there is no ``reward`` where observations have no ``achieved_goal``.
+    """
+
+    def __init__(
+        self, venv: VecEnv, director: GoalDirector, where: slice | str = "desired_goal", goals: Box | None = None,
+        reward: Reward | None = None, seed: int = 0,
+    ) -> None:  # fmt: skip
+        super().__init__(venv)
+        self.slot = GoalSlot(director, venv.observation_space, self.num_envs, where, goals, seed)
+        if reward is None and "achieved_goal" not in getattr(venv.observation_space, "spaces", {}):
+            raise ValueError("reward must be a function where observations have no achieved_goal, got None.")
+        self._reward = reward
+
+    def reset(self) -> Observation:
+        """See ``VecEnv.reset``; first goals are uniform."""
+        return self.slot.begin(self.venv.reset())
+
+    def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """See ``VecEnv.step_wait``; the terminal observation of a world that is done holds the goal that was in force.
+
+        The reward is for that goal, too.
+        """
+        obs, reward, dones, infos = self.venv.step_wait()
+        last = {int(world): infos[world]["terminal_observation"] for world in np.flatnonzero(dones)}
+        ended = self.slot.ended(obs, last)
+        for world, observation in last.items():
+            infos[world]["terminal_observation"] = observation
+        if self._reward is None:
+            desired = ended[self.slot.where]
+            (reward,) = self.env_method("compute_reward", ended["achieved_goal"], desired, np.array(infos), indices=[0])
+        else:
+            reward = self._reward(ended, reward)
+        truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        return self.slot.advance(obs, dones & ~truncated, truncated), reward, dones, infos
