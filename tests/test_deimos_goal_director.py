@@ -148,7 +148,7 @@ def test_it_resumes_bit_for_bit():
     state = torch.load(saved, weights_only=True)
     second = Theirs(GoalDirector(AFRAID, PERIOD, learn_every=12), candidates=20)
     second.env.load_state_dict(state["env"])
-    second.goals.load_state_dict(state["goals"], second.env.state, second.env.goal)
+    second.goals.load_state_dict(state["goals"])
     for _ in range(40):
         (one, done), (two, _) = first.step(), second.step()
         assert torch.equal(one.goal, two.goal)
@@ -178,7 +178,7 @@ def test_a_loop_without_gradients_may_continue_with_them():
         for _ in range(30):
             theirs.step()
     assert goals.selector.fear.fitted
-    goals.load_state_dict(goals.state_dict(), theirs.env.state, theirs.env.goal)
+    goals.load_state_dict(goals.state_dict())
     theirs.step()
 
 

@@ -33,17 +33,21 @@ class GoalCore(Stateful):
         selector: Who chooses.
         spaces: The worlds.
         window: Steps that resolved interactions are kept for; ``None`` for 2 T.
+        capacity: Resolved interactions that are kept per world within the window, at least 1; ``None`` for as many as
+            there can be where every goal lasts T steps and first goals are not chosen.
     """
 
     saved = ("selector", "interactions", "weight", "percentile", "_delivered", "_steps")
     unknown = ("percentile", "_delivered")
 
-    def __init__(self, selector: GoalSelector, spaces: Spaces, window: int | None = None) -> None:
+    def __init__(
+        self, selector: GoalSelector, spaces: Spaces, window: int | None = None, capacity: int | None = None
+    ) -> None:
         self.selector = selector
         self.goal_period = spaces.goal_period
         window = window or 2 * self.goal_period
         # No world resolves more within the window, since a crash is followed by a first goal of T steps.
-        capacity = math.ceil(window / self.goal_period) + 1
+        capacity = capacity or math.ceil(window / self.goal_period) + 1
         self.interactions = Interactions(
             spaces.num_envs, spaces.state_dim, spaces.goal_dim, capacity, window, spaces.device,
             groups=0 if spaces.groups == (slice(None),) else len(spaces.groups),
@@ -91,18 +95,23 @@ class GoalCore(Stateful):
         return changes
 
     @torch.no_grad()
-    def choose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Tensor:
+    def choose(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor,
+        horizon: Tensor | None = None,
+    ) -> Tensor:  # fmt: skip
         """Choose the next goals of the listed worlds, and begin their interactions.
 
         For the arguments see ``GoalSelector.propose``; each world is listed once, and nothing is pending in it.
+        ``horizon`` holds the steps that each goal is to last, int64, shape (B,); ``None`` for T.
 
         Returns:
             Goals, shape (B, goal_dim).
         """
         chosen = self.selector.propose(rows, state, goal, candidates, draws)
         self.interactions.open(
-            rows, state, goal, chosen.goal, chosen.score, self.goal_period, probe=chosen.probe, note=chosen.note
-        )
+            rows, state, goal, chosen.goal, chosen.score, self.goal_period if horizon is None else horizon,
+            probe=chosen.probe, note=chosen.note,
+        )  # fmt: skip
         self.weight[rows] = 1.0 if chosen.weight is None else chosen.weight
         self.percentile[rows] = torch.nan if chosen.percentile is None else chosen.percentile
         return chosen.goal

@@ -1,28 +1,40 @@
 """A goal selector in other people's loops: one object, which needs only torch and NumPy."""
 
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_range
+from deimos.checks import check_at_least, check_choice, check_range
+from deimos.goals import given
+from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore
 from deimos.goals.fear_selector import FearEstimate, fear_selector
+from deimos.goals.given import Array, Candidates, GoalBox, Inputs, Rows
 from deimos.goals.interactions import Interactions
 from deimos.goals.methods import method
-from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces
-from deimos.nn.random import Purpose, uniforms
+from deimos.goals.risk_map import RiskMap, grid
+from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces, Transitions
+from deimos.nn.host import own_settings
+
+SPARE = 8  # resolved interactions that are kept per world where there may be any number within 2 T steps
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """What every world pursues next."""
+    """What every world pursues next; arrays if the goals of the step were one, else tensors."""
 
-    goal: Tensor
+    goal: Array
     """Goals, shape (num_envs, goal_dim): the given ones but where ``changed``."""
-    changed: Tensor
+    changed: Array
     """True where the goal is a new one, bool, shape (num_envs,)."""
-    weight: Tensor
+    weight: Array
     """Weight of the transitions under the goal in everything that the learner learns, at least 0, shape (num_envs,);
     1 under most selectors."""
 
@@ -30,176 +42,418 @@ class Assignment:
 class GoalDirector:
     """Chooses the goals of any vectorised environment, and learns from their outcomes.
 
-    It keeps the goal clocks and the interactions, and lets the selector learn. Call ``step`` once after
-    every step of the worlds, and make the goals that it returns the active ones. It keeps copies, without gradients.
+    There are two ways to drive it, and both give the same interactions where their periods are the same:
 
-    Selectors that learn from the learner's transitions (``vds``, ``plr``) need Deimos' own loop.
+    * *Its own clock*: ``step`` once after every step of the worlds; the goals that it returns become the active ones.
+    * *Your clock*: ``observe`` once after every step, then ``propose`` for the worlds that get a new goal. A goal's
+      interaction lasts up to the next proposal, or as long as was announced.
+
+    All arguments may be NumPy arrays or torch tensors; results are of the kind and the dtype of ``goal``. It computes
+    in float32, and keeps copies without gradients.
 
     Args:
         selector: Who chooses: a selector's ``Config``, or the name of a method such as ``p25``.
-        goal_period: T: steps that a goal is active, at least 1.
+        goal_period: T: steps that a goal is active, at least 1; ``None`` on a clock of yours whose periods vary.
+        num_envs: Worlds, at least 1. This and the two sizes may be left to the first call.
+        state_dim: Components of a state, at least 1.
+        goal_dim: Components of a goal, at least 1.
+        device: Where its tensors lie, and yours; ``None`` for that of the first call, the CPU for arrays.
+        max_horizon: The most steps that a goal lasts, where ``goal_period`` is ``None``.
+        horizon_input: Whether the fear network sees how long a goal is to last: a component ``horizon / max_horizon``
+            behind the state, in ``interactions`` too.
+        first_goals: ``uniform``, or ``chosen`` from the start state and a null goal of zeros; only chosen ones are
+            interactions. ``state`` must then be that after the reset.
+        goal_box: Lowest and highest goal, shape (goal_dim,) each. Candidates must then lie within, and need not be
+            given: they are drawn uniformly.
+        groups: Components of a goal that are met or missed together, as slices, for ``tracking`` by group.
+        autoreset: gymnasium's ``AutoresetMode`` or its value: ``SameStep``, also for loops that reset before the next
+            step by hand (``Disabled``), or ``NextStep``, where a step of its own resets a world after its end.
         learn_every: Steps between two updates of the selector, at least 1; a rollout of the learner is a good choice.
+            Selectors that learn from transitions (``vds``, ``plr``) are updated by ``learn`` alone.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
         seed: Seed of the selector's networks and of every choice, in [0, 2^32).
+
+    Raises:
+        ValueError: If an option is not valid, here or at the first call where sizes are left to it.
     """
 
     def __init__(
-        self, selector: SelectorConfig | str, goal_period: int, *, learn_every: int = 24, total_steps: int = 0,
-        seed: int = 0,
+        self, selector: SelectorConfig | str, goal_period: int | None = None, *, num_envs: int | None = None,
+        state_dim: int | None = None, goal_dim: int | None = None, device: torch.device | str | None = None,
+        max_horizon: int | None = None, horizon_input: bool = False,
+        first_goals: Literal["uniform", "chosen"] = "uniform", goal_box: tuple[Array, Array] | None = None,
+        groups: Sequence[slice] = (slice(None),), autoreset: object = "SameStep", learn_every: int = 24,
+        total_steps: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
-        check_at_least("goal_period", goal_period, 1)
+        counts = {"goal_period": goal_period, "max_horizon": max_horizon}
+        for name, value in (counts | {"num_envs": num_envs, "state_dim": state_dim, "goal_dim": goal_dim}).items():
+            if value is not None:
+                check_at_least(name, value, 1)
+        if (goal_period is None) == (max_horizon is None):
+            raise ValueError(
+                "goal_period must be the steps that a goal is active or, where these vary, max_horizon the most that "
+                f"they can be; got {goal_period} and {max_horizon}."
+            )
+        mode = getattr(autoreset, "value", autoreset)
+        check_choice("autoreset", mode, ["SameStep", "NextStep", "Disabled"])
+        check_choice("first_goals", first_goals, ["uniform", "chosen"])
         check_at_least("learn_every", learn_every, 1)
         check_at_least("total_steps", total_steps, 0)
         check_range("seed", seed, 0, 2**32 - 1)
         self.goal_period, self.learn_every = goal_period, learn_every
+        self.max_horizon: int = goal_period or max_horizon  # type: ignore[assignment]  # one of them is given
         self.metrics: dict[str, float] = {}
         """What the selector's last update had to say."""
         self._config = method(selector) if isinstance(selector, str) else selector
-        self._total_steps, self._seed = total_steps, seed
-        self._core: GoalCore | None = None
-        self._sizes: tuple[int, int, int] | None = None  # worlds, components of a state, of a goal
+        self._choose_first, self._next_step = first_goals == "chosen", mode == "NextStep"
+        self._horizon_input, self._goal_box = horizon_input, goal_box
+        self._box: GoalBox | None = None
+        self._groups, self._total_steps, self._seed = tuple(groups), total_steps, seed
+        self._made_with = {
+            "selector": type(self._config).__module__, **counts, "horizon_input": horizon_input,
+            "first_goals": first_goals, "next_step": self._next_step, "groups": len(self._groups),
+        }  # fmt: skip
+        self._learnt_at = 0  # step of the last update
+        self._device = None if device is None else torch.empty(0, dtype=torch.float32, device=device).device
+        self._clocks: GoalClocks | None = None
+        self._sizes: tuple[int | None, int | None, int | None] = (num_envs, state_dim, goal_dim)
+        if self._device is not None and None not in self._sizes:
+            self._begin(self._expected(np.zeros(0), None, None, None))
 
     @property
     def selector(self) -> GoalSelector:
         """Who chooses.
 
         Raises:
-            RuntimeError: Before the first step, which tells how many worlds and components there are.
+            RuntimeError: Before the first call, where sizes and device are left to it.
         """
-        return self._known.selector
+        return self._known.core.selector
 
     @property
     def interactions(self) -> Interactions:
         """The outcomes of its goals; see ``selector`` for when it is known."""
-        return self._known.interactions
+        return self._known.core.interactions
 
     @property
-    def _known(self) -> GoalCore:
-        if self._core is None:
-            raise RuntimeError("The GoalDirector knows its worlds only after the first call of step().")
-        return self._core
+    def weight(self) -> Tensor:
+        """Weight of the transitions under the active goals in everything that the learner learns, at least 0, shape
+        (num_envs,); 1 under most selectors."""
+        return self._known.core.weight
+
+    @property
+    def _known(self) -> GoalClocks:
+        if self._clocks is None:
+            raise RuntimeError(
+                "The GoalDirector knows its worlds only after the first call of step() or propose(), unless num_envs, "
+                "state_dim, goal_dim and device are given."
+            )
+        return self._clocks
 
     @property
     def goal_range(self) -> Tensor | None:
-        """Share of the goal range to draw candidates from, shape (goal_dim,); ``None`` for all of it.
+        """Share of the goal range to draw candidates from, around its middle, shape (goal_dim,); ``None`` for all of
+        it.
 
-        Only a curriculum of the range (``cl``) has one, and only from the first step on.
+        Only a curriculum of the range (``cl``) has one, and only from the first call on.
         """
-        return None if self._core is None else self._core.selector.goal_range()
+        return None if self._clocks is None else self._clocks.core.selector.goal_range()
 
+    @own_settings()
     @torch.no_grad()
     def step(
-        self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor,
-        tracking: Tensor | None = None,
+        self, state: Array, goal: Array, terminated: Array, truncated: Array, candidates: Candidates = None,
+        tracking: Array | None = None, executed: Array | None = None,
     ) -> Assignment:  # fmt: skip
-        """Resolve what the last step decided, and choose the goals that are due.
+        """Resolve what the last step decided, and choose the goals that are due after T steps.
 
-        Worlds that are done get a uniform first goal, their first candidate.
+        Worlds that are done get a first goal; under ``NextStep`` after the step that reset them.
 
         Args:
-            state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be
-                that from before or after its reset: nothing is chosen for it.
-            goal: Goals that were active during the step, shape (num_envs, goal_dim).
-            terminated: True where the world crashed, bool, shape (num_envs,).
-            truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
-            candidates: Independent uniform valid goals, from within ``goal_range``, shape
-                (num_envs, N, goal_dim), N at least 1.
-            tracking: How well the goal is met, in [0, 1], shape (num_envs,), for curricula; ``None`` for 0.
+            state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be that from
+                before or after its reset, unless first goals are chosen.
+            goal: Goals that were active during the step, shape (num_envs, goal_dim): those that were given last.
+            terminated: True where the world crashed, shape (num_envs,): bool, or 0 and 1.
+            truncated: True where its episode was cut off without a crash, shape (num_envs,): bool, or 0 and 1.
+            candidates: Independent uniform valid goals, from within ``goal_range``: shape (num_envs, N, goal_dim), N at
+                least 1, or a function that returns (m, N, goal_dim) for the m worlds that need one, whose indices it is
+                given; ``None`` to draw them from ``goal_box``.
+            tracking: How well the goal is met, in [0, 1], for curricula: shape (num_envs,), or (num_envs, groups);
+                ``None`` for 0.
+            executed: What the worlds really pursued where that was not ``goal`` (headings, standing, limits), shape
+                (num_envs, goal_dim): fear is learnt of what a goal became in its first step. ``None`` for ``goal``.
 
         Raises:
-            ValueError: If a shape does not fit the others or those of the first call, or, on the first call, if
-                the selector needs the learner's rollout.
+            ValueError: If a shape, a device or a number does not fit, or a goal is another one than was given.
         """
-        self._check(state, goal, terminated, truncated, candidates)
-        core = self._core or self._begin(state, goal)
-        if core.interactions.now % self.goal_period == 0:  # no world's goal is due twice within T steps
-            self._draw()
-        self._clock += 1
-        due = self._clock >= self.goal_period
-        reward = torch.zeros(len(state), device=state.device) if tracking is None else tracking.float()
-        changes = core.advance(terminated, truncated, due, reward)
-        done = terminated | truncated
-        goals = torch.where(done.unsqueeze(1), candidates[:, 0], goal)
-        rows = changes.due
+        if self.goal_period is None:
+            raise ValueError(
+                "goal_period must be given for step(), got None; on your clock use observe() and propose()."
+            )
+        num_envs, state_dim = given.matrix("state", state, "state_dim")
+        inputs = self._expected(state, num_envs, state_dim, given.matrix("goal", goal, "goal_dim")[1])
+        states, goals = inputs.states(state, inputs.num_envs), inputs.goals(goal, inputs.num_envs)
+        ends = inputs.ends(terminated, truncated, tracking, executed)
+        if candidates is not None and not callable(candidates):
+            candidates = inputs.candidates(candidates, inputs.num_envs)
+        clocks = self._clocks or self._begin(inputs)
+        given.refuse_not_finite("state", states, but=ends[0] | ends[1])
+        given.refuse_not_finite("goal", goals)
+        if executed is None:
+            self._refuse_changed(goals)
+        rows, new = clocks.advance(*ends, own=True), goals[:0]
         if len(rows):
-            goals[rows] = core.choose(rows, state[rows], goal[rows], candidates[rows], self._draws[rows])
-            self._count[rows] += 1
-        self._clock.masked_fill_(due | done, 0)
-        core.weight.masked_fill_(done, 1.0)
-        if core.interactions.now % self.learn_every == 0:
-            self.metrics = core.learn(None)
-        return Assignment(goals, due | done, core.weight.clone())
+            offered = self._candidates(candidates[rows] if isinstance(candidates, Tensor) else candidates, rows, goal)
+            new = clocks.propose(rows, self._seen(states[rows], None), goals[rows], offered, own=True)
+        self._learn_if_due()
+        changed = torch.zeros(inputs.num_envs, dtype=torch.bool, device=inputs.device).index_fill_(0, rows, True)
+        weight = given.like(clocks.core.weight.clone(), goal)
+        return Assignment(given.replaced(goal, rows, new), given.like(changed, goal), weight)
 
-    @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
-    def _begin(self, state: Tensor, goal: Tensor) -> GoalCore:
-        self._sizes = len(state), state.shape[1], goal.shape[1]
-        spaces = Spaces(*self._sizes, self.goal_period, state.device, total_steps=self._total_steps)
-        selector = self._config.build(spaces, self._seed)
-        if selector.needs_rollout:
-            raise ValueError(f"selector must need no rollout of the learner, as vds and plr do; got {self._config}.")
-        # Steps that the goal of every world has been active, and goals that were chosen for it: its draws' addresses.
-        self._clock, self._count = torch.zeros(2, len(state), dtype=torch.int64, device=state.device)
-        self._core = GoalCore(selector, spaces)
-        return self._core
-
-    def _draw(self) -> None:
-        """Draw for the next decision of every world; many worlds at once cost what one does."""
-        worlds = torch.arange(len(self._count), device=self._count.device)
-        self._draws = uniforms(self._seed, Purpose.GOAL, worlds, self._count)
-
-    def _check(self, state: Tensor, goal: Tensor, terminated: Tensor, truncated: Tensor, candidates: Tensor) -> None:
-        given = {"state": state, "goal": goal, "terminated": terminated, "truncated": truncated}
-        for name, value in (given | {"candidates": candidates}).items():
-            if not isinstance(value, Tensor):
-                kind = f"{type(value).__module__}.{type(value).__qualname__}"
-                raise ValueError(f"{name} must be a tensor, got {kind}; torch.as_tensor makes one.")
-        for name, components in (("state", "state_dim"), ("goal", "goal_dim")):
-            if given[name].dim() != 2:
-                shape = tuple(given[name].shape)
-                raise ValueError(f"{name} must have the shape (num_envs, {components}), got {shape}.")
-        n, state_dim, goal_dim = self._sizes or (len(state), state.shape[1], goal.shape[1])
-        sizes = {"state": (n, state_dim), "goal": (n, goal_dim), "terminated": (n,), "truncated": (n,)}
-        for name, shape in sizes.items():
-            if given[name].shape != shape:
-                raise ValueError(f"{name} must have the shape {shape}, got {tuple(given[name].shape)}.")
-        for name in ("terminated", "truncated"):
-            if given[name].dtype != torch.bool:
-                raise ValueError(f"{name} must be bool, got {given[name].dtype}.")
-        if candidates.dim() != 3 or candidates.shape[::2] != goal.shape or candidates.shape[1] < 1:
-            expected = f"({n}, N, {goal_dim}) with N at least 1"
-            raise ValueError(f"candidates must have the shape {expected}, got {tuple(candidates.shape)}.")
-
+    @own_settings()
     @torch.no_grad()
-    def fear(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> FearEstimate:
-        """Calibrated probability that the policy crashes within T steps of getting ``new_goal``, and its quality.
+    def observe(
+        self, terminated: Array, truncated: Array, tracking: Array | None = None, executed: Array | None = None
+    ) -> None:
+        """Resolve what the last step decided, on your clock; call it once after every step, before ``propose``.
+
+        For the arguments and errors see ``step``. A world that lives through the horizon of its goal has survived it.
+        """
+        shape = np.shape(terminated)
+        inputs = self._expected(terminated, shape[0] if len(shape) == 1 else None, None, None)
+        ends = inputs.ends(terminated, truncated, tracking, executed)
+        clocks = self._clocks or self._begin(inputs)
+        self._learn_if_due()  # all proposals of the step before have been made by now
+        clocks.advance(*ends, own=False)
+
+    @own_settings()
+    @torch.no_grad()
+    def propose(
+        self, rows: Rows, state: Array, goal: Array, candidates: Candidates = None, horizon: Array | int | None = None
+    ) -> Array:
+        """Give the listed worlds their next goals, on your clock or, to begin with, on its own.
+
+        What was pending there ends: survived where the horizon was not announced, dropped where it was longer. Worlds
+        that have begun an episode, or never lived through a step, get a first goal.
+
+        Args:
+            rows: Worlds: indices, each once, a mask, a slice, or ``None`` for all.
+            state: Their states, shape (m, state_dim).
+            goal: Their active goals, shape (m, goal_dim).
+            candidates: As in ``step``, for these worlds: shape (m, N, goal_dim), a function or ``None``.
+            horizon: Steps that each goal is to last, at least 1 and at most ``max_horizon``, one number or shape (m,);
+                ``None`` for ``goal_period`` or, without one, up to the next proposal.
+
+        Returns:
+            Goals, shape (m, goal_dim).
+
+        Raises:
+            ValueError: See ``step``; also if a world does not exist or is listed twice, or the horizon is missing where
+                it is an input.
+        """
+        count, state_dim = given.matrix("state", state, "state_dim")
+        num_envs = count if rows is None else None
+        inputs = self._expected(state, num_envs, state_dim, given.matrix("goal", goal, "goal_dim")[1])
+        listed = given.worlds(rows, inputs.num_envs, inputs.device)
+        states, goals = inputs.states(state, len(listed)), inputs.goals(goal, len(listed))
+        lasts = self._lasts(horizon, len(listed), inputs)
+        if candidates is not None and not callable(candidates):
+            candidates = inputs.candidates(candidates, len(listed))
+        clocks = self._clocks or self._begin(inputs)
+        if not len(listed):
+            return given.like(goals, goal)
+        given.refuse_not_finite("state", states, listed)
+        given.refuse_not_finite("goal", goals, listed)
+        self._refuse_changed(goals, listed)
+        offered = self._candidates(candidates, listed, goal)
+        clocks.end(listed)
+        open_ended = horizon is None and self.goal_period is None
+        new = clocks.propose(listed, self._seen(states, lasts), goals, offered, lasts, open_ended=open_ended)
+        return given.like(new, goal)
+
+    @own_settings()
+    def learn(self, rollout: Transitions | None = None) -> dict[str, float]:
+        """Update the selector now, besides every ``learn_every`` steps.
+
+        Args:
+            rollout: The learner's transitions since the last call, the observations being the state and behind it the
+                goal, for selectors that learn from them (``vds``, ``plr``).
+
+        Returns:
+            ``metrics``.
+
+        Raises:
+            ValueError: If the selector needs a rollout and gets none, or it lacks something.
+        """
+        core = self._known.core
+        given.check_transitions(rollout)
+        self.metrics, self._learnt_at = core.learn(rollout), core.interactions.now
+        return self.metrics
+
+    @own_settings()
+    @torch.no_grad()
+    def fear(self, state: Array, goal: Array, new_goal: Array, horizon: Array | int | None = None) -> FearEstimate:
+        """Calibrated probability that the policy crashes before the next goal after ``new_goal``, and its quality.
 
         Args:
             state: States, shape (B, state_dim).
             goal: Active goals, shape (B, goal_dim).
             new_goal: Goals to evaluate, shape (B, goal_dim).
+            horizon: Steps that they are to last, where that is an input; ``None`` for the most.
+
+        Returns:
+            Tensors, whatever the arguments are.
 
         Raises:
-            ValueError: If the selector has no fear network.
+            ValueError: If the selector has no fear network, or a shape does not fit.
             RuntimeError: If it has not learnt anything yet.
         """
         afraid = fear_selector(self.selector)
         if afraid is None:
             raise ValueError(f"The selector must have a fear network, as a Director has; got {self._config}.")
-        return afraid.estimate(state, goal, new_goal)
+        inputs, count = self._expected(state, None, None, None), len(state)
+        states, goals = inputs.states(state, count), inputs.goals(goal, count)
+        new_goals = inputs.goals(new_goal, count, "new_goal")
+        for name, numbers in (("state", states), ("goal", goals), ("new_goal", new_goals)):
+            given.refuse_not_finite(name, numbers, what="row")
+        lasts = self._lasts(self.max_horizon if horizon is None else horizon, count, inputs)
+        return afraid.estimate(self._seen(states, lasts), goals, new_goals)
 
-    def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs; see ``load_state_dict``."""
-        return {"core": self._known.state_dict(), "clock": self._clock.clone(), "count": self._count.clone()}
-
-    def load_state_dict(self, state: dict, observed: Tensor, goal: Tensor) -> None:
-        """Continue from ``state_dict()``.
+    def risk_map(
+        self, state: Array, goal: Array, axes: Mapping[int, Array] | tuple[int, int], horizon: int | None = None
+    ) -> RiskMap:
+        """Fear over a grid of two components of the new goal.
 
         Args:
-            state: What it returned.
-            observed: Any states, shape (num_envs, state_dim), to tell the sizes.
-            goal: Any goals, shape (num_envs, goal_dim).
+            state: One state, shape (state_dim,).
+            goal: The goal that is active in it, shape (goal_dim,): its other components are those of all new goals.
+            axes: The two components and their values, as ``{0: np.linspace(-1, 1, 41), 2: np.linspace(-2, 2, 41)}``;
+                the components alone for 41 values over the whole ``goal_box``.
+            horizon: See ``fear``.
+
+        Raises:
+            ValueError: If there are not two different components, or as in ``fear``.
+            RuntimeError: If it has not learnt anything yet.
         """
-        self._begin(observed, goal).load_state_dict(state["core"])
-        self._clock.copy_(state["clock"])
-        self._count.copy_(state["count"])
-        self._draw()
+        device = self.weight.device
+        states, goals = (given.tensor(name, value, device) for name, value in (("state", state), ("goal", goal)))
+        x, y, new = grid(goals.cpu().numpy(), axes, self._box)
+        repeated = (values.expand(len(new), *values.shape) for values in (states, goals))
+        told = self.fear(*repeated, torch.from_numpy(new).to(device), horizon)
+        return RiskMap(x, y, told.probability.view(len(y), len(x)).cpu().numpy(), told.auroc, told.age)
+
+    def state_dict(self) -> dict:
+        """Everything that a bit-exact resume needs, at any time; ``torch.load(weights_only=True)`` reads it."""
+        known = self._clocks
+        return {
+            "made_with": self._made_with, "learnt_at": self._learnt_at, "sizes": None if known is None else [*self._sizes],
+            "goals": None if known is None else known.state_dict(),
+        }  # fmt: skip
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from ``state_dict()``, before the first call or later.
+
+        Args:
+            state: What it returned, for a GoalDirector that was made with the same options.
+
+        Raises:
+            ValueError: If it belongs to another selector or to worlds of another number or size.
+        """
+        try:
+            made_with, sizes, goals, learnt_at = (state[name] for name in ("made_with", "sizes", "goals", "learnt_at"))
+        except KeyError as error:
+            raise ValueError(f"state must be what state_dict() of this version returned; it lacks {error}.") from error
+        if made_with != self._made_with:
+            raise ValueError(f"state must come from a GoalDirector with {self._made_with}, got one with {made_with}.")
+        if sizes is None:  # it had not begun
+            self._clocks, self._learnt_at = None, learnt_at
+            return
+        try:
+            clocks = self._clocks or self._begin(self._expected(goals["goal"], *sizes))
+            if [*self._sizes] != sizes:
+                raise ValueError(f"state must be that of {[*self._sizes]} worlds and components, got {sizes}.")
+            clocks.load_state_dict(goals)
+        except KeyError as error:
+            raise ValueError(f"state must be what state_dict() of this version returned; it lacks {error}.") from error
+        self._learnt_at = learnt_at
+
+    def _expected(self, sample: Array, num_envs: int | None, state_dim: int | None, goal_dim: int | None) -> Inputs:
+        """What arguments must be like: as is known, or else as the call itself tells; ``sample`` is one of them."""
+        told = zip(self._sizes, (num_envs, state_dim, goal_dim), strict=True)
+        worlds, states, goals = (theirs if ours is None else ours for ours, theirs in told)
+        if worlds is None or states is None or goals is None:
+            raise ValueError(
+                "num_envs, state_dim and goal_dim must be given to GoalDirector where its first call does not tell "
+                f"them all, got {worlds}, {states} and {goals}."
+            )
+        for name, value in (("num_envs", worlds), ("state_dim", states), ("goal_dim", goals)):
+            check_at_least(name, value, 1)
+        device = self._device or (sample.device if isinstance(sample, Tensor) else torch.device("cpu"))
+        columns = () if self._groups == (slice(None),) else (len(self._groups),)
+        return Inputs(worlds, states, goals, device, columns)
+
+    @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
+    def _begin(self, inputs: Inputs) -> GoalClocks:
+        spaces = Spaces(
+            inputs.num_envs, inputs.state_dim + self._horizon_input, inputs.goal_dim, self.max_horizon, inputs.device,
+            groups=self._groups, total_steps=self._total_steps,
+        )  # fmt: skip
+        box = None if self._goal_box is None else GoalBox(*self._goal_box, inputs.goal_dim, inputs.device)
+        any_number = self._choose_first or self.goal_period is None  # of goals within 2 T steps
+        core = GoalCore(self._config.build(spaces, self._seed), spaces, capacity=SPARE if any_number else None)
+        self._clocks = GoalClocks(core, spaces, self._seed, self._choose_first, self._next_step)
+        self._box, self._device = box, inputs.device
+        self._sizes = inputs.num_envs, inputs.state_dim, inputs.goal_dim
+        return self._clocks
+
+    def _refuse_changed(self, goals: Tensor, rows: Tensor | None = None) -> None:
+        """Raise ``ValueError`` if a world, of all or the listed ones, pursues another goal than it was given."""
+        other = self._known.not_given(goals, slice(None) if rows is None else rows)
+        if bool(other.any()):
+            row = int(other.nonzero()[0])
+            raise ValueError(
+                f"goal of world {row if rows is None else int(rows[row])} must be the one that it was given, got "
+                f"{goals[row].tolist()}; report what a world really pursues by executed=."
+            )
+
+    def _candidates(self, candidates: Candidates, rows: Tensor, model: Array) -> Tensor:
+        """Candidates of the listed worlds, shape (m, N, goal_dim): the given ones, made or drawn."""
+        clocks, share = self._known, self.goal_range
+        if candidates is None:
+            if self._box is None:
+                raise ValueError("candidates must be given where GoalDirector was made without a goal_box, got None.")
+            return self._box.draw(self._seed, rows, clocks.asked[rows], clocks.core.selector.num_candidates, share)
+        if callable(candidates):
+            candidates = candidates(given.like(rows, model))
+        offered = self._expected(rows, None, None, None).candidates(candidates, len(rows))
+        given.refuse_not_finite("candidates", offered, rows)
+        if self._box is not None:
+            self._box.check(offered, rows, share)
+        return offered
+
+    def _lasts(self, horizon: Array | int | None, count: int, inputs: Inputs) -> Tensor | None:
+        """Announced steps, int64, shape (count,); the most where nobody knows, ``None`` where it is always T."""
+        if horizon is None:
+            if self.goal_period is not None:
+                return None
+            if self._horizon_input:
+                raise ValueError("horizon must be given where it is an input of the fear network, got None.")
+            horizon = self.max_horizon
+        return inputs.horizons(horizon, count, self.max_horizon)
+
+    def _seen(self, states: Tensor, lasts: Tensor | None) -> Tensor:
+        """What the selector sees of states, shape (m, state_dim): also how long the goal is to last, if it may."""
+        if not self._horizon_input:
+            return states
+        share = torch.ones_like(states[:, :1]) if lasts is None else lasts.unsqueeze(1) / self.max_horizon
+        return torch.cat([states, share], dim=1)
+
+    def _learn_if_due(self) -> None:
+        """The update of every ``learn_every`` steps, once."""
+        core = self._known.core
+        now = core.interactions.now
+        if now % self.learn_every or now == self._learnt_at:
+            return
+        if not core.selector.needs_rollout:
+            self.learn()
+        elif not self._learnt_at and now == self.learn_every:
+            _log.warning("%s learns from the learner's transitions: call learn(rollout).", self._made_with["selector"])

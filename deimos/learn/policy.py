@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from deimos.checks import RunError
 from deimos.files import load_tensors, save_tensors
+from deimos.nn.host import own_settings
 from deimos.nn.layout import ObsField, goal_slice, seen_by
 from deimos.nn.networks import Activation, Actor, weights_of
 
@@ -37,19 +38,20 @@ class Policy(nn.Module):
         self.layout = tuple(layout)
         self.action_bound = action_bound
         self.dt = dt
-        scale = [torch.as_tensor(field.scale, dtype=torch.float32).expand(field.size) for field in layout]
-        self.register_buffer("scale", torch.cat(scale).to(actor.std.device))
+        like = {"dtype": torch.float32, "device": actor.std.device}
+        self.register_buffer("scale", torch.cat([torch.as_tensor(f.scale, **like).expand(f.size) for f in layout]))
         self.goal_slice = goal_slice(self.layout)
 
     @torch.no_grad()
     def forward(self, obs: Tensor) -> Tensor:
-        """Actions, shape (n, action_dim), for observations in physical units, shape (n, obs_dim)."""
-        return self.scaled(obs * self.scale)
+        """Actions, float32, shape (n, action_dim), for observations in physical units, shape (n, obs_dim)."""
+        return self.scaled(obs.float() * self.scale)
 
+    @own_settings()
     @torch.no_grad()
     def scaled(self, obs: Tensor) -> Tensor:
         """Actions for observations as the environment gives them, already scaled."""
-        return self.actor(obs).clamp(-self.action_bound, self.action_bound)
+        return self.actor(obs.float()).clamp(-self.action_bound, self.action_bound)
 
 
 def save_policy(path: Path, policy: Policy) -> None:
@@ -69,6 +71,7 @@ def save_policy(path: Path, policy: Policy) -> None:
     })  # fmt: skip
 
 
+@own_settings()
 def load_policy(path: Path | str, device: str = "cpu") -> Policy:
     """Read a policy.
 

@@ -334,12 +334,12 @@ class PPO(Stateful):
         mean_over_ranks(self._critic.grad)
         self._critic.clip_gradient(self.config.max_grad_norm)
         self.optimizer.step(self._critic_part)
-        return torch.stack([loss[0, 0], *torch.full((2,), math.nan, device=loss.device)])
+        return torch.stack([loss[0, 0], *loss.new_full((2,), math.nan)])
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Divide by 1.5 above twice the desired divergence, multiply below half of it; no host round trip."""
         rate, desired = self.learning_rate, self.config.desired_kl
-        factor = torch.where(kl > 2 * desired, 1 / 1.5, torch.where((kl < desired / 2) & (kl > 0), 1.5, 1.0))
+        factor = torch.where(kl > 2 * desired, 1 / 1.5, torch.where((kl < desired / 2) & (kl > 0), 1.5, 1.0)).float()
         low, high = LEARNING_RATE_RANGE
         raised, lowered = (rate * factor).clamp(max=high), (rate * factor).clamp(min=low)
         rate.copy_(torch.where(factor > 1, raised, torch.where(factor < 1, lowered, rate)))

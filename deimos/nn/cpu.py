@@ -50,7 +50,7 @@ class Kernel:
         columns = 2 * units[-1] + 3  # of the largest loss
         self._block_rows = max(STEP, min(BLOCK_ROWS, BLOCK_SIZE // (sum(units) + columns)) // STEP * STEP)
         self._memory = torch.zeros(self._threads, (sum(units) + columns) * self._block_rows, dtype=torch.float32)
-        self._gradient = torch.zeros(0)
+        self._gradient = torch.zeros(0, dtype=torch.float32)
         self._counter = ctypes.c_int32()
         jobs = wp.zeros(1, dtype=Job, device="cpu")
         self._job: Any = jobs.numpy()

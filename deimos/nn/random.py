@@ -23,6 +23,7 @@ class Purpose(IntEnum):
     EXPLORATION = 16
     AUDIT = 17  # exploration in the audits of a fear network
     AUDIT_CONTEXT = 18  # which of the contexts are audited
+    CANDIDATES = 19  # the candidates that a GoalDirector draws itself
 
 
 def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[int, int]) -> tuple[Tensor, ...]:

@@ -253,7 +253,7 @@ def audit_choices(trainer: Trainer, worlds: int, clones: Clones) -> Choices:
             wanted[rows] = False
         loop.advance(step)
     if not decisions:
-        nothing = torch.zeros(0, env.goal_dim, device=env.device)
+        nothing = torch.zeros(0, env.goal_dim, dtype=torch.float32, device=env.device)
         return Choices([], [], nothing, nothing)
     return _judge(trainer, clones, decisions)
 

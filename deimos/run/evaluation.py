@@ -23,6 +23,7 @@ from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector
 from deimos.learn.policy import load_policy
+from deimos.nn.host import own_settings
 from deimos.nn.threads import torch_on_one
 from deimos.run import memory
 from deimos.run.attack import Attack, Policy, Target, attacker, uniform_goals
@@ -89,6 +90,7 @@ def weights_hash(module: nn.Module) -> str:
     return digest.hexdigest()[:16]
 
 
+@own_settings()
 def evaluate_run(
     folder: RunFolder, env_config: EnvConfig, config: EvalConfig, device: torch.device,
     progress: Progress = lambda stage, share: None, *, again: bool = True,
@@ -208,6 +210,7 @@ def _read(path: Path) -> bytes:
         raise RunError(f"{path} cannot be read ({error.strerror}).") from error
 
 
+@own_settings()
 def evaluate(
     policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device,
     progress: Progress = lambda stage, share: None, *, known: Sequence[dict] = (),
@@ -308,7 +311,7 @@ def score_scale(
     rest = env.tracking_at_rest()
     if rest is not None:
         return "matching", rest, 1.0
-    nothing = torch.zeros(env.num_envs, env.action_dim, device=env.device)
+    nothing = torch.zeros(env.num_envs, env.action_dim, dtype=torch.float32, device=env.device)
     reference = env.reference_policy()
     if reference is None:
         return "return_per_step", math.nan, math.nan
@@ -339,7 +342,7 @@ def play(
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)
-    errors = {name: torch.empty(steps, env.num_envs, device=env.device) for name in env.errors}
+    errors = {name: reward.new_empty(steps, env.num_envs, dtype=torch.float32) for name in env.errors}
     for t in range(steps):
         step = env.step(policy(env.obs))
         first = ~loop.interactions.active

@@ -11,6 +11,7 @@ from deimos.checks import RunError, SimulationError, check_at_least, check_choic
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
+from deimos.nn.host import own_settings
 from deimos.nn.layout import seen_by
 from deimos.nn.threads import torch_on_one
 from deimos.run.config import from_dict, kind, to_dict
@@ -92,6 +93,7 @@ class TrainConfig:
 class Trainer:
     """Everything that a run holds in memory, and one iteration of it."""
 
+    @own_settings()
     @torch_on_one()  # sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.config = config
@@ -115,6 +117,7 @@ class Trainer:
         self.synchronise = False
         """Whether to wait for the device at the end of every part, to tell their times apart; for benchmarks."""
 
+    @own_settings()
     @torch.no_grad()
     def collect(self) -> None:
         """Let the policy act for one rollout."""
@@ -136,6 +139,7 @@ class Trainer:
             clock.lap("goals")
         rollout.obs[-1] = env.obs
 
+    @own_settings()
     @torch_on_one()
     def iterate(self) -> dict[str, float]:
         """One rollout and what is learnt from it.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import SimulationError
+from deimos.nn.host import own_settings
 from deimos.sim.env import Env, EnvConfig, Step
 
 WORLDS = 6
@@ -24,6 +25,7 @@ Claims = Iterator[tuple[bool | Tensor, str]]
 """What must hold, everywhere where it is a tensor, and what to say where it does not."""
 
 
+@own_settings()
 def check_env(env: Env) -> None:
     """Raise ``ValueError`` if an environment breaks the contract of ``deimos.sim.env``; name what it forgot.
 
@@ -73,7 +75,8 @@ def _raises(kind: type[Exception], call: Callable[[], object]) -> bool:
 
 def _actions(env: Env, count: int, seed: int = 0) -> Tensor:
     """Random actions within the bounds, shape (count, num_envs, action_dim)."""
-    noise = 2 * torch.rand(count, env.num_envs, env.action_dim, generator=torch.Generator().manual_seed(seed)) - 1
+    shape, draws = (count, env.num_envs, env.action_dim), torch.Generator().manual_seed(seed)
+    noise = 2 * torch.rand(shape, generator=draws, dtype=torch.float32) - 1
     return (noise * min(env.action_bound, 1.0)).to(env.device)
 
 
@@ -163,7 +166,7 @@ def _check_start(env: Env, build: Build) -> Claims:
     env.restart()
     yield from _are_equal(env.state_dict(), first, "restart must begin the first episodes again, but {name} differs.")
     yield (env.goal != build(seed=1).goal).any(), "first goals must depend on the seed."
-    env.restart(torch.full((env.goal_dim,), 0.25, device=env.device))
+    env.restart(torch.full((env.goal_dim,), 0.25, dtype=torch.float32, device=env.device))
     changed = (env.obs[:, env.goal_slice] != first["obs"][:, env.goal_slice]).any()
     yield changed, "first goals must heed goal_scale: reset must use the range that it is given."
 
@@ -222,7 +225,7 @@ def _check_candidates(env: Env, build: Build) -> Claims:
 
 def _check_step(env: Env, build: Build) -> Claims:
     """A step gives what it promises, never resets and never changes a goal."""
-    wide = torch.zeros(WORLDS, env.action_dim + 1, device=env.device)
+    wide = torch.zeros(WORLDS, env.action_dim + 1, dtype=torch.float32, device=env.device)
     yield _raises(ValueError, lambda: env.step(wide)), f"step must refuse actions of shape {tuple(wide.shape)}."
     groups = len(env.goal_groups)
     counts = {name: env.tensors[name].clone() for name in COUNTS}

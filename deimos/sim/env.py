@@ -337,7 +337,7 @@ class Env(abc.ABC):
     @property
     def action_range(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest value of every component of an action, beyond which it is clipped, on the CPU."""
-        bound = torch.full((self.action_dim,), self.action_bound)
+        bound = torch.full((self.action_dim,), self.action_bound, dtype=torch.float32)
         return -bound, bound
 
     @property

@@ -190,7 +190,7 @@ class WarpEnv(Env):
         """See ``Env.goal_bounds``."""
         if self._valid_goals is not None:
             return None
-        middle = torch.zeros(len(rows), self.goal_dim, device=self.device)
+        middle = torch.zeros(len(rows), self.goal_dim, dtype=torch.float32, device=self.device)
         if self.worlds.origin.shape[0]:
             middle -= wp.to_torch(self.worlds.origin)[rows] * (self._seen_range / self._whole_range)
         return middle - self._seen_range, middle + self._seen_range

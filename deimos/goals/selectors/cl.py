@@ -45,7 +45,7 @@ class Curriculum(GoalSelector):
     def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config
         self._groups = spaces.groups
-        self._range = torch.full((spaces.goal_dim,), config.start, device=spaces.device)
+        self._range = torch.full((spaces.goal_dim,), config.start, dtype=torch.float32, device=spaces.device)
         groups = len(spaces.groups)
         self.share = [config.start] * groups
         """Share of the range of every group, in (0, 1]."""

@@ -62,8 +62,10 @@ class Grid(GoalSelector):
         if largest > 2**20:
             raise ValueError(f"bins must give at most 2^20 cells per group, got {config.bins} bins: {largest} cells.")
         self._weights = tuple(self._initial(len(group), device) for group in self._groups)
-        self._seen = torch.zeros(spaces.goal_dim, device=device)  # largest candidate so far, per component
-        self._half = torch.zeros(spaces.goal_dim, device=device)  # what the cells are cut from
+        self._seen = torch.zeros(
+            spaces.goal_dim, dtype=torch.float32, device=device
+        )  # largest candidate so far, per component
+        self._half = torch.zeros(spaces.goal_dim, dtype=torch.float32, device=device)  # what the cells are cut from
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
         """Whether the range of goals is known."""
@@ -73,7 +75,7 @@ class Grid(GoalSelector):
         bins = self.config.bins
         middle = (torch.arange(bins, device=device) + 0.5) * (2.0 / bins) - 1.0
         inside = (middle.abs() <= self.config.start).float()
-        weights = torch.ones([], device=device)
+        weights = torch.ones([], dtype=torch.float32, device=device)
         for _ in range(dims):
             weights = weights.unsqueeze(-1) * inside
         return weights
@@ -84,7 +86,7 @@ class Grid(GoalSelector):
         if not self.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         cell = self._cells(candidates)
-        weight = torch.ones(candidates.shape[:2], device=candidates.device)
+        weight = torch.ones(candidates.shape[:2], dtype=torch.float32, device=candidates.device)
         for i, group in enumerate(self._groups):
             weight *= self._weights[i][cell[..., group].unbind(-1)]
         pick = picks.in_proportion(weight, draws[:, 0])
@@ -115,7 +117,7 @@ class Grid(GoalSelector):
         """Add ``growth`` for each of ``cells``, shape (n, dims), to everything within reach of it."""
         weights, dims = self._weights[i], cells.shape[1]
         hits = torch.zeros_like(weights)
-        hits.index_put_(cells.unbind(1), torch.ones(len(cells), device=hits.device), accumulate=True)
+        hits.index_put_(cells.unbind(1), hits.new_ones(len(cells)), accumulate=True)
         places = torch.arange(self.config.bins, device=hits.device)
         near = ((places.unsqueeze(0) - places.unsqueeze(1)).abs() <= self.config.reach).float()
         for _ in range(dims):  # the neighbourhood is a box, so it is summed along one component after another

@@ -62,11 +62,17 @@ class PLR(GoalSelector):
         self.config = config
         self.num_candidates = config.candidates
         device = spaces.device
-        self._level = torch.zeros(config.capacity, spaces.goal_dim, device=device)
-        self._score = torch.full((config.capacity,), -torch.inf, device=device)  # -inf marks a free place
+        self._level = torch.zeros(config.capacity, spaces.goal_dim, dtype=torch.float32, device=device)
+        self._score = torch.full(
+            (config.capacity,), -torch.inf, dtype=torch.float32, device=device
+        )  # -inf marks a free place
         self._made, self._seen = torch.zeros(2, config.capacity, dtype=torch.int64, device=device)  # steps
-        self._upto = torch.zeros(config.capacity, device=device)  # cumulated chance of being replayed
-        self._carry = torch.zeros(spaces.num_envs, device=device)  # of the pending interaction, up to the last rollout
+        self._upto = torch.zeros(
+            config.capacity, dtype=torch.float32, device=device
+        )  # cumulated chance of being replayed
+        self._carry = torch.zeros(
+            spaces.num_envs, dtype=torch.float32, device=device
+        )  # of the pending interaction, up to the last rollout
         self._learnt_at = 0  # step of the last call of learn
         self.replaying = False
         """Whether the buffer holds enough."""

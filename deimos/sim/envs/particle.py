@@ -12,6 +12,7 @@ from torch import Tensor
 from deimos.checks import check_at_least, check_choice, check_positive, check_range
 from deimos.kernels.particle import BROKEN, PARTICLES, ParticleParams, reset_particles, step_particles
 from deimos.kernels.particle_rewards import RewardName, RewardShape, reward_distances
+from deimos.nn.host import own_settings
 from deimos.sim.env import EnvConfig, ObsField, Sketch
 from deimos.sim.warp_env import WarpEnv
 
@@ -109,6 +110,7 @@ class Particle(WarpEnv):
     config: Config
     quantities = BROKEN
 
+    @own_settings()
     def __init__(self, config: Config, num_envs: int, device: torch.device, seed: int, env_offset: int = 0) -> None:
         params = config.params()
         goal_unit, goal_scale = ("u", params.position_scale)
@@ -180,7 +182,7 @@ class Particle(WarpEnv):
         A particle at the origin itself is sent along the diagonal.
         """
         position = self.tensors["position"][rows]
-        outward = torch.where(position < 0, -1.0, 1.0)
+        outward = torch.where(position < 0, -1.0, 1.0).float()
         if not self.config.has_velocity_goals:
             reach = position.abs().amax(1, keepdim=True)
             outward = torch.where(reach > 0, position / reach, outward)

@@ -35,6 +35,7 @@ from deimos.kernels.legged.state import (
 )
 from deimos.kernels.legged.step import apply_actions, evaluate_step
 from deimos.kernels.random import Purpose, draw_uniforms
+from deimos.nn.host import own_settings
 from deimos.sim.env import ObsField
 from deimos.sim.legged import engines
 from deimos.sim.legged.config import LocomotionConfig
@@ -79,6 +80,7 @@ class Locomotion(WarpEnv):
     may_go_on_invalid = True
     quantities = BROKEN
 
+    @own_settings()
     def __init__(
         self, config: LocomotionConfig, robot: Robot, parts: Sequence[GoalPart], num_envs: int, device: torch.device,
         seed: int, env_offset: int = 0,
@@ -231,7 +233,7 @@ class Locomotion(WarpEnv):
     @property
     def action_range(self) -> tuple[Tensor, Tensor]:
         """See ``Env.action_range``: what takes the joints' targets to the ends of their ranges."""
-        low, high = torch.tensor([joint.action_range for joint in self.robot.joints]).T
+        low, high = torch.tensor([joint.action_range for joint in self.robot.joints], dtype=torch.float32).T
         return low, high
 
     def describe_fault(self, world: int) -> str:
@@ -269,7 +271,7 @@ class Locomotion(WarpEnv):
     def scripted_goals(self, rows: Tensor, goal: Tensor) -> Tensor:
         """See ``Env.scripted_goals``: the reverse of the active velocity at its limits; the rest is left to chance."""
         count = len(self.parts[0].range)
-        reverse = torch.where(self.goal[rows, :count] < 0, 1.0, -1.0) * self._seen_range[:count]
+        reverse = torch.where(self.goal[rows, :count] < 0, 1.0, -1.0).float() * self._seen_range[:count]
         return torch.cat([reverse, goal[:, count:]], dim=1)
 
     def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
@@ -288,7 +290,7 @@ class Locomotion(WarpEnv):
         """
         if not sum(self.goal_group_weights) > 0.0:
             return None
-        nothing = torch.zeros(self.num_envs, self.action_dim, device=self.device)
+        nothing = torch.zeros(self.num_envs, self.action_dim, dtype=torch.float32, device=self.device)
         for _ in range(round(SETTLED / self.dt)):
             self.step(nothing)
         everyone, count = torch.arange(self.num_envs, device=self.device), -(-GOALS_AT_REST // self.num_envs)

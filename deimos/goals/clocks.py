@@ -1,0 +1,157 @@
+"""When goals are due in other people's loops, by our clock or by theirs; tensors only, one per world."""
+
+import torch
+from torch import Tensor
+
+from deimos.goals.core import GoalCore
+from deimos.goals.selector import Spaces
+from deimos.nn.random import Purpose, uniforms
+from deimos.nn.stateful import Stateful
+
+
+class GoalClocks(Stateful):
+    """The goal core of somebody else's worlds, and what tells it when a goal ends.
+
+    Whoever owns the worlds calls ``advance`` after every step, and ``propose`` for the worlds that get a goal.
+
+    Args:
+        core: Who chooses, and the interactions.
+        spaces: The worlds.
+        seed: Seed of every choice, in [0, 2^32).
+        choose_first: Whether first goals are chosen, and so are interactions.
+        next_step: Whether a world that is done is reset in a step of its own, after that of its end.
+    """
+
+    saved = ("core", "_age", "_count", "asked", "_first", "_over", "_open_ended", "_given", "_goal")
+
+    def __init__(self, core: GoalCore, spaces: Spaces, seed: int, choose_first: bool, next_step: bool) -> None:
+        self.core = core
+        self._seed, self._choose_first, self._next_step = seed, choose_first, next_step
+        count, device = spaces.num_envs, spaces.device
+        # Steps of the active goal, and goals that were chosen for the world: its draws' addresses.
+        self._age, self._count, self.asked = torch.zeros(3, count, dtype=torch.int64, device=device)
+        """Goals that every world was given, first ones included, int64, shape (num_envs,)."""
+        # A first goal is next; done but not reset yet; nobody said how long the goal is to last; the goal was chosen.
+        self._first, self._over, self._open_ended, self._given = torch.zeros(4, count, dtype=torch.bool, device=device)
+        self._first.fill_(True)
+        self._goal = torch.zeros(count, spaces.goal_dim, dtype=torch.float32, device=device)
+        groups = () if spaces.groups == (slice(None),) else (len(spaces.groups),)
+        self._untracked = torch.zeros(count, *groups, dtype=torch.float32, device=device)
+        self._draws: Tensor | None = None  # for the next decision of every world, until the step _drawn_until
+        self._drawn_until = 0
+
+    def advance(
+        self, terminated: Tensor, truncated: Tensor, tracking: Tensor | None, executed: Tensor | None, own: bool
+    ) -> Tensor:
+        """Count a step of all worlds and resolve what it decided.
+
+        Args:
+            terminated: True where the world crashed, bool, shape (num_envs,).
+            truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
+            tracking: How well a goal is met, in [0, 1], shape (num_envs,) for the whole of it or (num_envs, groups);
+                ``None`` for 0.
+            executed: Goals that were pursued, shape (num_envs, goal_dim); ``None`` for those that were given.
+            own: Whether goals are due after T steps. If not, they last until the next proposal, and an interaction
+                at most for its horizon.
+
+        Returns:
+            Worlds that need a goal now, int64, shape (m,): those that are due, then those that begin an episode.
+        """
+        interactions = self.core.interactions
+        if executed is not None:  # what a goal turned into at once: its first step tells
+            begun = (interactions.active & (interactions.issued_at == interactions.now)).nonzero().squeeze(1)
+            interactions.execute(begun, executed[begun])
+            self._given.zero_()
+        begins = self._over.clone()  # this step was their reset alone
+        self._age += ~begins
+        if own:
+            due = self._age >= self.core.goal_period
+        else:
+            due = interactions.active & (interactions.now + 1 - interactions.issued_at >= interactions.horizon)
+        tracking = self._untracked if tracking is None else tracking
+        reward, columns = (tracking, None) if tracking.dim() == 1 else (torch.zeros_like(tracking[:, 0]), tracking)
+        changes = self.core.advance(terminated, truncated, due, reward, columns)
+        done = terminated | truncated
+        self._first.copy_(done | begins)
+        self._given &= ~done
+        self._age.masked_fill_(done, 0)
+        self.core.weight.masked_fill_(done, 1.0)
+        if not self._next_step:
+            return torch.cat([changes.due, changes.done])
+        self._over.copy_(done)
+        return torch.cat([changes.due, begins.nonzero().squeeze(1)])
+
+    def end(self, rows: Tensor) -> None:
+        """End what is pending in the listed worlds, int64, shape (m,), before its time.
+
+        Where nobody had said how long the goal was to last, the world has survived it, and its horizon is what it has
+        lasted; of others the outcome is not known, and they are dropped.
+        """
+        interactions = self.core.interactions
+        lasted = interactions.now - interactions.issued_at[rows]
+        survived = self._open_ended[rows] & (lasted > 0)
+        interactions.horizon[rows] = torch.where(survived, lasted, interactions.horizon[rows])
+        interactions.resolve(rows, torch.zeros_like(survived), survived)
+
+    def propose(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, horizon: Tensor | None = None,
+        open_ended: bool = False, own: bool = False,
+    ) -> Tensor:  # fmt: skip
+        """Give the listed worlds their next goals; nothing is pending in them.
+
+        Args:
+            rows: Worlds, int64, shape (m,), each once.
+            state: Their states, shape (m, state_dim).
+            goal: Their active goals, shape (m, goal_dim).
+            candidates: Independent uniform goals, shape (m, N, goal_dim).
+            horizon: Steps that each goal is to last, int64, shape (m,); ``None`` for T.
+            open_ended: Whether nobody knows, and ``horizon`` is the most that it can be.
+            own: Whether no world gets a goal of ours twice within T steps.
+
+        Returns:
+            Goals, shape (m, goal_dim). First goals are the first candidates, unless they are chosen.
+        """
+        first = self._first[rows]
+        ours = ~(self._over[rows] if self._choose_first else first)
+        goals = candidates[:, 0].clone()
+        chosen = ours.nonzero().squeeze(1)
+        if len(chosen):
+            some = rows[chosen]
+            before = goal[chosen]
+            if self._choose_first:
+                before = before.masked_fill(first[chosen].unsqueeze(1), 0.0)
+            goals[chosen] = self.core.choose(
+                some, state[chosen], before, candidates[chosen], self._drawn(some, own),
+                None if horizon is None else horizon[chosen],
+            )  # fmt: skip
+            self._count[some] += 1
+        self._goal[rows], self._given[rows] = goals, ours
+        self._first[rows], self._open_ended[rows] = False, open_ended
+        self._age[rows] = 0
+        self.asked[rows] += 1
+        return goals
+
+    def _drawn(self, rows: Tensor, own: bool) -> Tensor:
+        """Uniform numbers that belong to the next decision of the listed worlds, shape (m, 4).
+
+        Many worlds at once cost what one does, and as long as nobody can have used his own they stay good.
+        """
+        if not own or self._choose_first:
+            self._drawn_until = 0
+            return uniforms(self._seed, Purpose.GOAL, rows, self._count[rows])
+        if self._draws is None or self.core.interactions.now >= self._drawn_until:
+            every = torch.arange(len(self._count), dtype=torch.int64, device=rows.device)
+            self._draws = uniforms(self._seed, Purpose.GOAL, every, self._count)
+            self._drawn_until = self.core.interactions.now + self.core.goal_period
+        return self._draws[rows]
+
+    def not_given(self, goal: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+        """True where an active goal, shape (m, goal_dim), is another one than was given, beyond rounding to 8 bits."""
+        given = self._goal[rows]
+        other = (goal - given).abs() > 1e-2 * given.abs() + 1e-5
+        return self._given[rows] & other.any(1)
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``Stateful.load_state_dict``."""
+        super().load_state_dict(state)
+        self._drawn_until = 0

@@ -1,0 +1,269 @@
+"""What other people's loops hand over, as tensors of ours: checked, without gradients, floats as float32."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deimos.goals.selector import Transitions
+from deimos.nn.random import Purpose, uniforms
+
+Array = Tensor | np.ndarray
+Rows = Array | slice | list[int] | None
+Candidates = Array | Callable[[Array], Array] | None
+
+
+def matrix(name: str, value: Array, components: str) -> tuple[int, int]:
+    """Rows and ``components`` of an array.
+
+    Raises:
+        ValueError: If it has not two axes.
+    """
+    shape = tuple(np.shape(value))
+    if len(shape) != 2:
+        raise ValueError(f"{name} must have the shape (num_envs, {components}), got {shape}.")
+    return shape
+
+
+def tensor(name: str, value: Array, device: torch.device) -> Tensor:
+    """An array or a tensor as a tensor on ``device``, without gradients.
+
+    Raises:
+        ValueError: If it is a tensor elsewhere, or holds no numbers.
+    """
+    if isinstance(value, Tensor):
+        if value.device != device:
+            raise ValueError(
+                f"{name} must be on {device}, got it on {value.device}; GoalDirector(device=...) names another one."
+            )
+        return value.detach()
+    try:  # a copy, which arrays that must not be written to give too
+        return torch.tensor(np.asarray(value), device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        kind = f"{type(value).__module__}.{type(value).__qualname__}"
+        raise ValueError(f"{name} must be an array or a tensor of numbers, got {kind}.") from error
+
+
+def floats(name: str, value: Array, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """Numbers of exactly this shape, float32.
+
+    Raises:
+        ValueError: If they have another shape.
+    """
+    numbers = tensor(name, value, device)
+    if numbers.shape != shape:
+        raise ValueError(f"{name} must have the shape {shape}, got {tuple(numbers.shape)}.")
+    return numbers.float()
+
+
+def flags(name: str, value: Array, num_envs: int, device: torch.device) -> Tensor:
+    """Flags of all worlds, bool, shape (num_envs,), from bool or from whole or real numbers 0 and 1.
+
+    Raises:
+        ValueError: If they have another shape or are other numbers.
+    """
+    marks = tensor(name, value, device)
+    if marks.shape != (num_envs,):
+        raise ValueError(f"{name} must have the shape {(num_envs,)}, got {tuple(marks.shape)}.")
+    if marks.dtype == torch.bool:
+        return marks
+    other = (marks != 0) & (marks != 1)
+    if bool(other.any()):
+        world = int(other.nonzero()[0])
+        raise ValueError(f"{name} must be bool, or 0 and 1, got {marks[world].item()} in world {world}.")
+    return marks == 1
+
+
+def worlds(rows: Rows, num_envs: int, device: torch.device) -> Tensor:
+    """The listed worlds, int64, shape (m,), from indices, a mask, a slice, or ``None`` for all.
+
+    Raises:
+        ValueError: If a world does not exist or is listed twice, or a mask has another length.
+    """
+    every = torch.arange(num_envs, dtype=torch.int64, device=device)
+    if rows is None or isinstance(rows, slice):
+        return every if rows is None else every[rows]
+    listed = tensor("rows", rows, device)
+    if listed.dtype == torch.bool:
+        if listed.shape != (num_envs,):
+            raise ValueError(f"rows must be a mask of the shape {(num_envs,)}, got {tuple(listed.shape)}.")
+        return every[listed]
+    if listed.dim() != 1 or (len(listed) and (listed.is_floating_point() or listed.is_complex())):
+        raise ValueError(f"rows must be indices of worlds, a mask or a slice, got {rows!r}.")
+    listed = listed.long()
+    if not bool(((listed >= 0) & (listed < num_envs)).all()) or len(listed.unique()) < len(listed):
+        raise ValueError(f"rows must be worlds in [0, {num_envs}), each once, got {listed.tolist()}.")
+    return listed
+
+
+def refuse_not_finite(
+    name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None, what: str = "world"
+) -> None:
+    """Raise ``ValueError`` that names the first row of ``numbers`` in which one is not finite.
+
+    Args:
+        name: What they are.
+        numbers: Shape (m, ...).
+        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
+        but: Rows that do not matter, bool, shape (m,).
+        what: What a row is.
+    """
+    if bool(numbers.sum().isfinite()):  # a sum costs a tenth of a look at every number
+        return
+    bad = ~numbers.flatten(1).isfinite().all(1) if numbers.dim() > 1 else ~numbers.isfinite()
+    if but is not None:
+        bad &= ~but
+    if bool(bad.any()):
+        row = int(bad.nonzero()[0])
+        world = row if rows is None else int(rows[row])
+        raise ValueError(f"{name} of {what} {world} must be finite, got {numbers[row].tolist()}.")
+
+
+def like(values: Tensor, model: Array) -> Array:
+    """Values as an array if ``model`` is one, else as a tensor; floats in its dtype, if it has floats."""
+    if isinstance(model, Tensor):
+        return values.to(model.dtype) if values.is_floating_point() and model.is_floating_point() else values
+    array, dtype = values.cpu().numpy(), np.asarray(model).dtype
+    return array.astype(dtype) if values.is_floating_point() and np.issubdtype(dtype, np.floating) else array
+
+
+def replaced(values: Array, rows: Tensor, new: Tensor) -> Array:
+    """A copy of ``values``, shape (num_envs, ...), with other rows, int64, shape (m,); floats, or it becomes float32."""
+    if isinstance(values, Tensor):
+        copy = values.detach().clone() if values.is_floating_point() else values.float()
+        copy[rows] = new.to(copy.dtype)
+        return copy
+    array = np.array(values)
+    array = array if np.issubdtype(array.dtype, np.floating) else array.astype(np.float32)
+    array[rows.cpu().numpy()] = new.cpu().numpy()
+    return array
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Sizes and device that arguments must have."""
+
+    num_envs: int
+    """Worlds."""
+    state_dim: int
+    """Components of a state."""
+    goal_dim: int
+    """Components of a goal."""
+    device: torch.device
+    """Where tensors lie."""
+    columns: tuple[int, ...]
+    """Shape of the tracking of a world: () for the whole goal, (groups,) for each group of its components."""
+
+    def states(self, value: Array, count: int) -> Tensor:
+        """States of ``count`` worlds."""
+        return floats("state", value, (count, self.state_dim), self.device)
+
+    def goals(self, value: Array, count: int, name: str = "goal") -> Tensor:
+        """Goals of ``count`` worlds, called ``name``."""
+        return floats(name, value, (count, self.goal_dim), self.device)
+
+    def ends(
+        self, terminated: Array, truncated: Array, tracking: Array | None, executed: Array | None
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+        """What a step of all worlds ended in; see ``GoalDirector.step``."""
+        crashed, cut_off = (
+            flags(name, value, self.num_envs, self.device)
+            for name, value in (("terminated", terminated), ("truncated", truncated))
+        )
+        met = pursued = None
+        if tracking is not None:
+            met = floats("tracking", tracking, (self.num_envs, *self.columns), self.device)
+            refuse_not_finite("tracking", met)
+        if executed is not None:
+            pursued = self.goals(executed, self.num_envs, "executed")
+            refuse_not_finite("executed", pursued)
+        return crashed, cut_off, met, pursued
+
+    def candidates(self, value: Array, count: int) -> Tensor:
+        """Candidates of ``count`` worlds, shape (count, N, goal_dim)."""
+        offered = tensor("candidates", value, self.device)
+        if offered.dim() != 3 or offered.shape[::2] != (count, self.goal_dim) or offered.shape[1] < 1:
+            expected = f"({count}, N, {self.goal_dim}) with N at least 1"
+            raise ValueError(f"candidates must have the shape {expected}, got {tuple(offered.shape)}.")
+        return offered.float()
+
+    def horizons(self, value: Array | int, count: int, most: int) -> Tensor:
+        """Steps that the goals of ``count`` worlds are to last, in [1, most], int64, shape (count,)."""
+        steps = tensor("horizon", value, self.device)
+        if steps.dtype == torch.bool or steps.is_floating_point() or steps.shape not in ((), (count,)):
+            raise ValueError(f"horizon must be a whole number or {count} of them, got {value!r}.")
+        if not bool(((steps >= 1) & (steps <= most)).all()):
+            raise ValueError(f"horizon must be in [1, {most}], got {steps.tolist()}.")
+        return steps.long().expand(count)
+
+
+def check_transitions(rollout: Transitions | None) -> None:
+    """Raise ``ValueError`` if something is missing in what a selector learns from."""
+    wanted = [*Transitions.__annotations__, "cut_off"]
+    missing = [name for name in wanted if rollout is not None and not hasattr(rollout, name)]
+    if missing:
+        raise ValueError(
+            f"rollout must have {', '.join(wanted)}, as deimos.goals.selector.Transitions says; it lacks "
+            f"{', '.join(missing)}."
+        )
+
+
+class GoalBox:
+    """The range of goals, a box: candidates are drawn from it, or must lie in it.
+
+    Args:
+        low: Lowest goal, shape (goal_dim,).
+        high: Highest goal, above ``low`` in every component, shape (goal_dim,).
+        goal_dim: Components of a goal.
+        device: Where goals lie.
+
+    Raises:
+        ValueError: If they are no box, or not finite.
+    """
+
+    def __init__(self, low: Array, high: Array, goal_dim: int, device: torch.device) -> None:
+        below, above = (floats("goal_box", end, (goal_dim,), device) for end in (low, high))
+        self._middle, self._half = (below + above) / 2, (above - below) / 2
+        if not bool(((self._half > 0) & self._half.isfinite()).all()):
+            raise ValueError(
+                f"goal_box must be the lowest and the highest goal, finite, got {below.tolist()} and {above.tolist()}."
+            )
+
+    def __len__(self) -> int:
+        return len(self._middle)
+
+    def ends(self, axes: Iterable[int]) -> list[tuple[float, float]]:
+        """Lowest and highest values of some components."""
+        low, high = (self._middle - self._half).tolist(), (self._middle + self._half).tolist()
+        return [(low[axis], high[axis]) for axis in axes]
+
+    def draw(self, seed: int, rows: Tensor, asked: Tensor, count: int, share: Tensor | None) -> Tensor:
+        """Uniform goals, shape (m, count, goal_dim).
+
+        Args:
+            seed: Seed of the draws.
+            rows: Worlds, int64, shape (m,).
+            asked: How often each has drawn, int64, shape (m,).
+            count: Goals for each.
+            share: Of the range, around its middle, shape (goal_dim,); ``None`` for all of it.
+        """
+        numbers = count * len(self)
+        blocks = torch.arange(-(-numbers // 4), dtype=torch.int64, device=rows.device)
+        address = asked.unsqueeze(1) * len(blocks) + blocks
+        drawn = uniforms(seed, Purpose.CANDIDATES, rows.unsqueeze(1).expand_as(address), address)
+        unit = drawn.flatten(1)[:, :numbers].unflatten(1, (count, len(self))) * 2.0 - 1.0
+        return self._middle + self._half * (unit if share is None else unit * share)
+
+    def check(self, candidates: Tensor, rows: Tensor, share: Tensor | None) -> None:
+        """Raise ``ValueError`` if a candidate, shape (m, N, goal_dim), lies outside, but for rounding."""
+        reach = self._half if share is None else self._half * share
+        outside = ((candidates - self._middle).abs() > reach * 1.001).any(2)
+        if bool(outside.any()):
+            row, candidate = outside.nonzero()[0].tolist()
+            low, high = (self._middle - reach).tolist(), (self._middle + reach).tolist()
+            raise ValueError(
+                f"candidates must lie between {low} and {high}, got {candidates[row, candidate].tolist()} for world "
+                f"{int(rows[row])}; see GoalDirector.goal_range."
+            )
