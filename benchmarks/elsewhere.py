@@ -53,12 +53,13 @@ def matching(obs: np.ndarray) -> np.ndarray:
 def train(method: str, seed: int, steps: int) -> PPO:
     """A policy of Stable-Baselines3's PPO at its defaults but for 32 worlds of 64 steps, and minibatches of 256."""
     selector, penalty = METHODS[method]
-    director = GoalDirector(selector, goal_period=PERIOD, learn_every=64, total_steps=steps // 32, seed=seed)
+    box = np.array([-LARGEST]), np.array([LARGEST])
+    director = GoalDirector(selector, PERIOD, goal_box=box, learn_every=64, total_steps=steps // 32, seed=seed)
 
     def reward(obs: np.ndarray, crash: np.ndarray) -> np.ndarray:
         return matching(obs) + penalty * crash
 
-    venv = DirectedVecEnv(DummyVecEnv([GoalCart] * 32), director, GOAL, reward=reward, seed=seed)
+    venv = DirectedVecEnv(DummyVecEnv([GoalCart] * 32), director, GOAL, reward=reward)
     policy = PPO("MlpPolicy", venv, n_steps=64, batch_size=256, seed=seed, device="cpu")
     return policy.learn(steps)
 

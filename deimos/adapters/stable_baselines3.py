@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from deimos.adapters.goal_slot import GoalSlot, Observation, Reward
@@ -15,29 +14,26 @@ class DirectedVecEnv(VecEnvWrapper):
 
     Args:
         venv: The worlds. What terminates is a crash; ``TimeLimit.truncated`` in an info is not.
-        director: Who chooses the goals.
+        director: Who chooses the goals, on its own clock; it must have a ``goal_box``.
         where: The goal's components of a ``Box``, or its key in a ``Dict``.
-        goals: What goals are drawn from; see ``GoalSlot``.
         reward: Rewards for the goals in force; see ``Reward``. ``None`` asks the worlds' own ``compute_reward``, which
             takes achieved goals, desired goals and infos, as in gymnasium-robotics.
-        seed: Seed of the candidates and of the first goals.
 
     Raises:
-        ValueError: See ``GoalSlot``; also if there is no ``reward`` where observations have no ``achieved_goal``.
+        ValueError: If the observation space has no such place, or if there is no ``reward`` where observations have no ``achieved_goal``.
     """
 
     def __init__(
-        self, venv: VecEnv, director: GoalDirector, where: slice | str = "desired_goal", goals: Box | None = None,
-        reward: Reward | None = None, seed: int = 0,
-    ) -> None:  # fmt: skip
+        self, venv: VecEnv, director: GoalDirector, where: slice | str = "desired_goal", reward: Reward | None = None
+    ) -> None:
         super().__init__(venv)
-        self.slot = GoalSlot(director, venv.observation_space, self.num_envs, where, goals, seed)
+        self.slot = GoalSlot(director, venv.observation_space, self.num_envs, where)
         if reward is None and "achieved_goal" not in getattr(venv.observation_space, "spaces", {}):
             raise ValueError("reward must be a function where observations have no achieved_goal, got None.")
         self._reward = reward
 
     def reset(self) -> Observation:
-        """See ``VecEnv.reset``; first goals are uniform."""
+        """See ``VecEnv.reset``; every world gets a first goal."""
         return self.slot.begin(self.venv.reset())
 
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
