@@ -5,19 +5,28 @@ with where it was interrupted, and prints what came out. What is measured, and h
 ``docs/lab/elsewhere.md``.
 """
 
+import csv
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import torch
+import tyro
 from gymnasium.spaces import Box
+from rich.table import Table
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from benchmarks.timing import wide_console
 from deimos.adapters.stable_baselines3 import DirectedVecEnv
 from deimos.goals.director import GoalDirector
 from deimos.goals.fear import Fear, FearConfig
+from deimos.nn.threads import torch_on_one
+from deimos.study.permutation import p_values
+from deimos.study.stats import bootstrap_t
+from reproduction.claims import holm
 
 TRACK, LARGEST = 2.4, 3.0  # [m]: gymnasium's track ends at 2.4 m either side; goals are places out to 3 m
 PERIOD = 100  # T [steps of 0.02 s]
@@ -25,6 +34,9 @@ WORLDS, STEPS = 64, 3000  # of every part of an evaluation
 GOAL = slice(4, 5)
 METHODS = {"uniform": ("uniform", 0.0), "p75": ("p75", 0.0), "p25": ("p25", 0.0), "penalty": ("uniform", 10.0)}
 """Goal selector, and what a crash costs in multiples of the largest reward of a step."""
+
+SHOWN = {"worst": "crashes, worst case", "uniform_goals": "crashes, uniform goals", "reward": "reward of a step"}
+"""Columns of the table, and what they are."""
 
 Choose = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
 """Next goals, shape (n, 1), from the states and the goals of the worlds that are due, shapes (n, 4) and (n, 1)."""
@@ -152,3 +164,68 @@ def judge(policy: PPO, seed: int) -> dict[str, float]:
     rates = {name: outcomes.rate() for name, outcomes in ({"uniform_goals": naive} | attacked).items()}
     goals = {"crashes_learnt_from": int(naive.crashed.sum()), "goals": len(naive.crashed)}
     return {"worst": attacked[worst].rate(1)} | rates | {"reward": naive.reward} | goals
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Train Stable-Baselines3's PPO under goals of several selectors, attack the policies, and print what came out."""
+
+    seeds: tuple[int, ...] = tuple(range(10))
+    """A policy of every method for each; those in the table already are not trained again."""
+    steps: int = 150_000
+    """Steps of a training, at least 1."""
+    table: Path = Path("docs/results/elsewhere.csv")
+    """Rows, one per policy."""
+
+
+def fill(options: Options) -> None:
+    """Train and judge what is missing in the table; a row is written when it is known."""
+    for seed in options.seeds:
+        for method in METHODS:
+            if (method, seed) not in {(row["method"], int(row["seed"])) for row in rows(options.table)}:
+                judged = judge(train(method, seed, options.steps), seed)
+                row = {"method": method, "seed": seed, "steps": options.steps} | judged
+                new = not options.table.exists()
+                with options.table.open("a", newline="") as file:
+                    writer = csv.DictWriter(file, list(row))
+                    if new:
+                        writer.writeheader()
+                    writer.writerow(row)
+
+
+def rows(table: Path) -> list[dict[str, str]]:
+    """The rows of the table, none where there is no table yet."""
+    if not table.exists():
+        return []
+    with table.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def show(table: Path) -> None:
+    """Means over policies with 95 % intervals, and the tests that were declared."""
+    found = {
+        method: {name: np.array([float(row[name]) for row in rows(table) if row["method"] == method]) for name in SHOWN}
+        for method in METHODS
+    }
+    worst = {method: values["worst"] for method, values in found.items()}
+    others = [method for method in METHODS if method != "uniform"]
+    corrected = holm([float(p_values([worst["uniform"], worst[name]], [(0, 1)], "mean")[0]) for name in others])
+    result = Table(title=f"{len(worst['uniform'])} policies of each method")
+    for column in ("method", *SHOWN.values(), "p, by Holm"):
+        result.add_column(column)
+    for method in METHODS:
+        p = dict(zip(others, corrected, strict=True)).get(method)
+        cells = (f"{bootstrap_t(found[method][name]):.3f}" for name in SHOWN)
+        result.add_row(method, *cells, "" if p is None else f"{p:.3f}")
+    wide_console().print(result)
+
+
+def main(options: Options) -> None:
+    """Fill the table and print it."""
+    with torch_on_one():
+        fill(options)
+    show(options.table)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from deimos.adapters.goal_slot import GoalSlot, Observation, Reward
+from deimos.adapters.directed import GoalSlot, Observation, Reward
 from deimos.goals.director import GoalDirector
 
 
@@ -20,7 +20,7 @@ class DirectedVecEnv(VecEnvWrapper):
             takes achieved goals, desired goals and infos, as in gymnasium-robotics.
 
     Raises:
-        ValueError: If the observation space has no such place, or if there is no ``reward`` where observations have no ``achieved_goal``.
+        ValueError: If observations have no such place, or there is no ``reward`` where they have no ``achieved_goal``.
     """
 
     def __init__(

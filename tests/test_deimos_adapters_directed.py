@@ -1,18 +1,25 @@
-"""Environments and the Director in Stable-Baselines3's training loops."""
+"""The Director in other people's training loops: wrappers, command terms, and hindsight in SB3."""
+
+import runpy
+import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import deimos.adapters.gymnasium  # noqa: F401 - it registers the environments
+from deimos.adapters.directed import DirectedVectorEnv
 from deimos.adapters.stable_baselines3 import DirectedVecEnv
 from deimos.goals.director import GoalDirector
 
+HOME = Path(__file__).resolve().parent.parent
 PERIOD, LIMIT = 4, 10
 BOX = np.array([-2.0]), np.array([3.0])
 
@@ -174,3 +181,107 @@ def test_hindsight_experience_replay_runs():
     assert 0.6 < hindsight.float().mean() < 1.0  # four of five are relabelled
     expected = envs.env_method("compute_reward", achieved.numpy(), desired.numpy(), [{}])[0]
     np.testing.assert_allclose(sample.rewards[hindsight, 0], expected[hindsight], rtol=1e-5)
+
+
+def closeness(obs, own):
+    """Rewards of observations that the goal stands in."""
+    steps, goal = (obs["observation"], obs["desired_goal"]) if isinstance(obs, dict) else (obs, obs[:, 2:])
+    return own - np.abs(steps[:, 0] / 10 - goal[:, 0])
+
+
+def histories(mode, parted, selector="uniform", steps=80):
+    """Goals, rewards and ends of every step of four worlds, but for those that only reset one; and the Director."""
+    director = GoalDirector(selector, PERIOD, goal_box=BOX, autoreset=mode)
+    worlds = SyncVectorEnv([lambda: Counter(parted)] * 4, autoreset_mode=mode)
+    envs = DirectedVectorEnv(worlds, director, "desired_goal" if parted else slice(2, 3), closeness)
+    goal_of = (lambda obs: obs["desired_goal"][..., 0]) if parted else (lambda obs: obs[..., 2])
+    obs, found, over = envs.reset(seed=0)[0], [[] for _ in range(4)], np.zeros(4, bool)
+    for _ in range(steps):
+        goal, ignored = goal_of(obs), over
+        obs, reward, terminated, truncated, infos = envs.step(np.zeros((4, 1), np.float32))
+        done = terminated | truncated
+        over = done if mode is AutoresetMode.NEXT_STEP else np.zeros(4, bool)
+        assert not reward[ignored].any()
+        for world in np.flatnonzero(~ignored):
+            found[world].append((goal[world], reward[world], terminated[world], truncated[world]))
+        for world in np.flatnonzero(done):
+            last = obs if mode is AutoresetMode.NEXT_STEP else infos["final_obs"][world]
+            assert (goal_of(last)[world] if mode is AutoresetMode.NEXT_STEP else goal_of(last)) == goal[world]
+    return found, director
+
+
+@pytest.mark.parametrize("parted", [False, True])
+def test_autoreset_modes_of_gymnasium_give_the_same_goals(parted):
+    """Every world meets the same goals and rewards, whether its reset takes a step of its own or none."""
+    (first, _), (second, _) = (histories(mode, parted) for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP))
+    for one, other in zip(first, second, strict=True):
+        assert len(other) > 60
+        assert one[: len(other)] == other
+        assert sum(terminated or truncated for _, _, terminated, truncated in other) > 5
+        assert len({goal for goal, *_ in other}) > 12
+
+
+def test_fear_is_learnt_in_a_wrapped_vector():
+    """The wrapper hands over outcomes from which the Director's network learns."""
+    _, director = histories(AutoresetMode.NEXT_STEP, parted=False, selector="p75", steps=200)
+    assert director.selector.fear.fitted
+    with pytest.raises(ValueError, match=r"env must reset worlds that are done by itself, got AutoresetMode.DISABLED"):
+        histories(AutoresetMode.DISABLED, parted=False)
+
+
+class TestCommandTerm:
+    """``DirectedCommand`` in the example for Isaac Lab, over a stub of it."""
+
+    @pytest.fixture
+    def env(self, monkeypatch):
+        """Makes an environment with a share of standing robots."""
+        monkeypatch.syspath_prepend(str(HOME / "tests" / "data" / "isaaclab_stub"))
+        example = runpy.run_path(str(HOME / "examples" / "isaac_lab_director.py"))
+        make = sys.modules["isaaclab.envs"].ManagerBasedRLEnv
+        yield lambda standing=0.0: make(64, example["DirectedVelocityCfg"](rel_standing_envs=standing))
+        for name in [name for name in sys.modules if name.split(".")[0] == "isaaclab"]:
+            del sys.modules[name]
+
+    def test_timers_and_resets_call_for_commands(self, env):
+        """A command changes where its timer has run out or an episode begins, and nowhere else; all are in the box."""
+        torch.manual_seed(0)
+        worlds = env()
+        changes = 0
+        for _ in range(40):
+            before, left = worlds.term.command.clone(), worlds.term.time_left.clone()
+            worlds.step()
+            new = (worlds.term.command != before).any(1)
+            expected = worlds.reset_terminated | worlds.reset_time_outs | (left - worlds.step_dt <= 0)
+            assert torch.equal(new, expected)
+            assert (worlds.term.command.abs() <= torch.tensor([1.0, 0.5, 2.0])).all()
+            changes += int(new.sum())
+        assert changes > 300
+
+    def test_interactions_are_those_of_the_commands(self, env):
+        """Falls under a command of the Director's are its crashes, first ones are not; it then asks for fast walks."""
+        torch.manual_seed(0)
+        worlds = env()
+        director, counted, found = worlds.term.director, 0, 0
+        for _ in range(300):
+            ours = director.interactions.active.clone()
+            now = director.interactions.now
+            worlds.step()
+            assert director.interactions.now == now + 1
+            counted += int((worlds.reset_terminated & ours).sum())
+            resolved = director.interactions.resolved()
+            found += int((resolved.crashed & (resolved.resolved == now + 1)).sum()) if hasattr(resolved, "resolved") else 0
+        assert counted > 50
+        assert director.selector.fear.fitted
+        state, speeds = torch.zeros(15), np.array([0.0, 0.95])
+        slow, fast = director.risk_map(state, torch.zeros(3), {0: speeds, 1: [0.0]}).probability[0]
+        assert fast > slow + 0.2
+
+    def test_what_is_executed_is_what_is_learnt(self, env):
+        """Robots that stand whatever they were asked for have pursued a goal of zeros."""
+        torch.manual_seed(0)
+        worlds = env(standing=0.5)
+        for _ in range(40):
+            worlds.step()
+        goals = worlds.term.director.interactions.resolved().next_goal
+        standing = (goals == 0).all(1).float().mean().item()
+        assert 0.3 < standing < 0.7

@@ -1,9 +1,12 @@
-"""A Director that writes its goals into somebody else's observations: what the wrappers have in common."""
+"""A Director in gymnasium's training loops, and what wrappers of other libraries have in common with that one."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium.spaces import Dict, Space
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
 from deimos.goals.director import GoalDirector
@@ -100,3 +103,45 @@ class GoalSlot:
         obs = obs.copy()
         obs[:, self.where] = self.goal
         return obs
+
+
+class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
+    """Worlds whose goals a Director chooses: it overwrites the goal in every observation, and the reward follows it.
+
+    Args:
+        env: The worlds, which begin anew by themselves. What terminates is a crash.
+        director: Who chooses the goals, on its own clock; it must have a ``goal_box`` and the worlds'
+            ``autoreset``.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``.
+        reward: Rewards for the goals in force; see ``Reward``.
+
+    Raises:
+        ValueError: If observations have no such place, or if nothing resets a world that is done.
+    """
+
+    def __init__(
+        self, env: gymnasium.vector.VectorEnv, director: GoalDirector, where: slice | str, reward: Reward
+    ) -> None:
+        super().__init__(env)
+        self._mode = env.metadata["autoreset_mode"]
+        if self._mode is AutoresetMode.DISABLED:
+            raise ValueError("env must reset worlds that are done by itself, got AutoresetMode.DISABLED.")
+        self.slot = GoalSlot(director, env.single_observation_space, env.num_envs, where)
+        self._reward, self._over = reward, np.zeros(env.num_envs, dtype=bool)
+
+    def reset(self, **options: Any) -> tuple[Observation, dict[str, Any]]:
+        """See ``VectorEnv.reset``; every world gets a first goal."""
+        obs, infos = self.env.reset(**options)
+        self._over[:] = False
+        return self.slot.begin(obs, self._mode is AutoresetMode.NEXT_STEP), infos
+
+    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """See ``VectorEnv.step``; what an episode ended in, and its reward, are of the goal that was in force."""
+        obs, reward, terminated, truncated, infos = self.env.step(actions)
+        last = {int(world): infos["final_obs"][world] for world in np.flatnonzero(infos.get("_final_obs", False))}
+        reward = np.where(self._over, reward, self._reward(self.slot.ended(obs, last), reward))
+        for world, observation in last.items():
+            infos["final_obs"][world] = observation
+        if self._mode is AutoresetMode.NEXT_STEP:  # the next step of these worlds is their reset
+            self._over = terminated | truncated
+        return self.slot.advance(obs, terminated, truncated), reward, terminated, truncated, infos
