@@ -145,11 +145,21 @@ class GoalClocks(Stateful):
             self._drawn_until = self.core.interactions.now + self.core.goal_period
         return self._draws[rows]
 
-    def not_given(self, goal: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
-        """True where an active goal, shape (m, goal_dim), is another one than was given, beyond rounding to 8 bits."""
-        given = self._goal[rows]
-        other = (goal - given).abs() > 1e-2 * given.abs() + 1e-5
-        return self._given[rows] & other.any(1)
+    def refuse_other_goals(self, goal: Tensor, rows: Tensor | None = None) -> None:
+        """Raise ``ValueError`` if a chosen goal has changed without a proposal, beyond a rounding to 8 bits.
+
+        Args:
+            goal: Active goals, shape (m, goal_dim).
+            rows: Their worlds, int64, shape (m,); ``None`` for all.
+        """
+        chosen, ours = (self._given, self._goal) if rows is None else (self._given[rows], self._goal[rows])
+        other = chosen & ((goal - ours).abs() > 1e-2 * ours.abs() + 1e-5).any(1)
+        if bool(other.any()):
+            row = int(other.nonzero()[0])
+            raise ValueError(
+                f"goal of world {row if rows is None else int(rows[row])} must be {ours[row].tolist()}, which it was "
+                f"given, got {goal[row].tolist()}; report what a world really pursues by executed=."
+            )
 
     def load_state_dict(self, state: dict) -> None:
         """See ``Stateful.load_state_dict``."""

@@ -94,7 +94,7 @@ class GoalDirector:
                 "goal_period must be the steps that a goal is active or, where these vary, max_horizon the most that "
                 f"they can be; got {goal_period} and {max_horizon}."
             )
-        mode = getattr(autoreset, "value", autoreset)
+        mode = str(getattr(autoreset, "value", autoreset))
         check_choice("autoreset", mode, ["SameStep", "NextStep", "Disabled"])
         check_choice("first_goals", first_goals, ["uniform", "chosen"])
         check_at_least("learn_every", learn_every, 1)
@@ -136,8 +136,7 @@ class GoalDirector:
 
     @property
     def weight(self) -> Tensor:
-        """Weight of the transitions under the active goals in everything that the learner learns, at least 0, shape
-        (num_envs,); 1 under most selectors."""
+        """Weight of the transitions under the active goals, shape (num_envs,); see ``Assignment``."""
         return self._known.core.weight
 
     @property
@@ -151,8 +150,7 @@ class GoalDirector:
 
     @property
     def goal_range(self) -> Tensor | None:
-        """Share of the goal range to draw candidates from, around its middle, shape (goal_dim,); ``None`` for all of
-        it.
+        """Share of the goal range to draw candidates from, shape (goal_dim,), around its middle; ``None`` for all.
 
         Only a curriculum of the range (``cl``) has one, and only from the first call on.
         """
@@ -199,7 +197,7 @@ class GoalDirector:
         given.refuse_not_finite("state", states, but=ends[0] | ends[1])
         given.refuse_not_finite("goal", goals)
         if executed is None:
-            self._refuse_changed(goals)
+            clocks.refuse_other_goals(goals)
         rows, new = clocks.advance(*ends, own=True), goals[:0]
         if len(rows):
             offered = self._candidates(candidates[rows] if isinstance(candidates, Tensor) else candidates, rows, goal)
@@ -263,7 +261,7 @@ class GoalDirector:
             return given.like(goals, goal)
         given.refuse_not_finite("state", states, listed)
         given.refuse_not_finite("goal", goals, listed)
-        self._refuse_changed(goals, listed)
+        clocks.refuse_other_goals(goals, listed)
         offered = self._candidates(candidates, listed, goal)
         clocks.end(listed)
         open_ended = horizon is None and self.goal_period is None
@@ -337,16 +335,16 @@ class GoalDirector:
         device = self.weight.device
         states, goals = (given.tensor(name, value, device) for name, value in (("state", state), ("goal", goal)))
         x, y, new = grid(goals.cpu().numpy(), axes, self._box)
-        repeated = (values.expand(len(new), *values.shape) for values in (states, goals))
-        told = self.fear(*repeated, torch.from_numpy(new).to(device), horizon)
+        states, goals = (values.expand(len(new), *values.shape) for values in (states, goals))
+        told = self.fear(states, goals, torch.from_numpy(new).to(device), horizon)
         return RiskMap(x, y, told.probability.view(len(y), len(x)).cpu().numpy(), told.auroc, told.age)
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs, at any time; ``torch.load(weights_only=True)`` reads it."""
         known = self._clocks
         return {
-            "made_with": self._made_with, "learnt_at": self._learnt_at, "sizes": None if known is None else [*self._sizes],
-            "goals": None if known is None else known.state_dict(),
+            "made_with": self._made_with, "learnt_at": self._learnt_at,
+            "sizes": None if known is None else [*self._sizes], "goals": None if known is None else known.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
@@ -404,16 +402,6 @@ class GoalDirector:
         self._box, self._device = box, inputs.device
         self._sizes = inputs.num_envs, inputs.state_dim, inputs.goal_dim
         return self._clocks
-
-    def _refuse_changed(self, goals: Tensor, rows: Tensor | None = None) -> None:
-        """Raise ``ValueError`` if a world, of all or the listed ones, pursues another goal than it was given."""
-        other = self._known.not_given(goals, slice(None) if rows is None else rows)
-        if bool(other.any()):
-            row = int(other.nonzero()[0])
-            raise ValueError(
-                f"goal of world {row if rows is None else int(rows[row])} must be the one that it was given, got "
-                f"{goals[row].tolist()}; report what a world really pursues by executed=."
-            )
 
     def _candidates(self, candidates: Candidates, rows: Tensor, model: Array) -> Tensor:
         """Candidates of the listed worlds, shape (m, N, goal_dim): the given ones, made or drawn."""

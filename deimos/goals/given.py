@@ -27,7 +27,7 @@ def matrix(name: str, value: Array, components: str) -> tuple[int, int]:
     return shape
 
 
-def tensor(name: str, value: Array, device: torch.device) -> Tensor:
+def tensor(name: str, value: Array | list[int] | int, device: torch.device) -> Tensor:
     """An array or a tensor as a tensor on ``device``, without gradients.
 
     Raises:
@@ -130,7 +130,7 @@ def like(values: Tensor, model: Array) -> Array:
 
 
 def replaced(values: Array, rows: Tensor, new: Tensor) -> Array:
-    """A copy of ``values``, shape (num_envs, ...), with other rows, int64, shape (m,); floats, or it becomes float32."""
+    """A copy of ``values``, shape (num_envs, ...), with new rows, int64, shape (m,); whole numbers become float32."""
     if isinstance(values, Tensor):
         copy = values.detach().clone() if values.is_floating_point() else values.float()
         copy[rows] = new.to(copy.dtype)
