@@ -1,9 +1,11 @@
 """A Director as a command term of Isaac Lab: its velocity commands are those that a robot is likely to fall over.
 
-In a velocity task, ``commands.base_velocity = DirectedVelocityCfg(**vars(commands.base_velocity))``; then train as usual.
-The package does not run without Isaac Sim: our tests run this against a stub of its command manager and its environment,
-written after the source of 2.3.2.
+In a velocity task: ``commands.base_velocity = DirectedVelocityCfg(**vars(commands.base_velocity))``; train as usual.
+The package does not run without Isaac Sim: our tests run this against a stub of its command manager and of its
+environment, written after the source of 2.3.2.
 """
+
+import math
 
 import torch
 from isaaclab.envs import ManagerBasedRLEnv
@@ -21,7 +23,7 @@ class DirectedVelocity(DirectedCommand, UniformVelocityCommand):
         super().__init__(cfg, env)
         box = tuple(zip(cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_z, strict=True))
         sizes = {"num_envs": env.num_envs, "state_dim": self.state().shape[1], "goal_dim": 3, "device": env.device}
-        longest = round(cfg.resampling_time_range[1] / env.step_dt)
+        longest = math.ceil(cfg.resampling_time_range[1] / env.step_dt)
         self.director = GoalDirector("p75", max_horizon=longest, goal_box=box, **sizes)
 
     def state(self) -> torch.Tensor:

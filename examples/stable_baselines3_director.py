@@ -1,4 +1,4 @@
-"""A Director in Stable-Baselines3's PPO: a cart with a pole follows places, some of them beyond the end of its track."""
+"""A Director in Stable-Baselines3's PPO: a cart with a pole follows places, some beyond the end of its track."""
 
 import argparse
 
