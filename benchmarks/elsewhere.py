@@ -90,8 +90,12 @@ class Outcomes:
     """Mean goal-matching reward of a step."""
 
     def rate(self, parity: int | None = None) -> float:
-        """Share of the goals that ended in a crash, in worlds of even (0) or odd (1) number or in all."""
-        return float(self.crashed[slice(None) if parity is None else self.world % 2 == parity].mean())
+        """Share of the goals that ended in a crash, in worlds of even (0) or odd (1) number or in all.
+
+        1 where no cart lived to see a goal that was chosen for it.
+        """
+        crashed = self.crashed if parity is None else self.crashed[self.world % 2 == parity]
+        return float(crashed.mean()) if len(crashed) else 1.0
 
 
 def play(policy: PPO, choose: Choose, seed: int) -> Outcomes:

@@ -33,6 +33,7 @@ def test_first_goals_do_not_count():
     """A cart that falls at once has pursued first goals alone, so that nothing is counted."""
     outcomes = elsewhere.play(Pusher([0.0, 0.0, 0.0, 0.0, 0.0]), elsewhere.anywhere, seed=0)
     assert len(outcomes.crashed) == 0
+    assert outcomes.rate() == outcomes.rate(0) == 1.0
 
 
 def test_every_period_has_one_outcome():
@@ -46,18 +47,21 @@ def test_every_period_has_one_outcome():
 
 
 def test_attackers_crash_a_follower():
-    """A policy that follows goals off its track crashes on request, and the network learns what to ask for."""
+    """A policy that follows goals off its track crashes where it is asked to."""
     beyond = elsewhere.play(FOLLOWS, elsewhere.beyond, seed=0)
     naive = elsewhere.play(FOLLOWS, elsewhere.anywhere, seed=0)
     assert beyond.rate() > naive.rate() > 0
-    feared = elsewhere.most_feared(naive, seed=0)
-    asked = feared(
-        np.tile([2.0, 0.5, 0.0, 0.0], (20, 1)).astype(np.float32),
-        np.zeros((20, 1), np.float32),
-        np.random.default_rng(0),
-    )
-    assert asked.mean() > 1.5
-    assert elsewhere.most_feared(elsewhere.play(BALANCES, elsewhere.anywhere, seed=0), seed=0) is None
+
+
+def test_the_most_feared_goals_are_those_that_crashed():
+    """Fitted to outcomes where places to the right ended in a crash, the network asks for these."""
+    rng = np.random.default_rng(0)
+    inputs = rng.uniform(-2, 2, (1000, 6)).astype(np.float32)
+    outcomes = elsewhere.Outcomes(inputs, np.arange(1000) % 8, inputs[:, 5] > 1.5, 0.0)
+    choose = elsewhere.most_feared(outcomes, seed=0)
+    assert choose(inputs[:20, :4], inputs[:20, 4:5], rng).min() > 1.5
+    outcomes.crashed[:] = False
+    assert elsewhere.most_feared(outcomes, seed=0) is None
 
 
 def test_the_table_goes_on_where_it_was(monkeypatch, tmp_path, capsys):
