@@ -9,61 +9,92 @@ from rich.table import Table
 
 from benchmarks.timing import in_turn, short, wide_console
 from deimos.goals.director import GoalDirector
+from deimos.goals.fear_selector import fear_selector
 
-WORLDS, PERIOD, CANDIDATES = 2000, 100, 100
+SIZES = (1, 64, 4096, 65536)  # worlds
+PERIOD, CANDIDATES = 100, 100
 STATE, GOAL = 9, 3  # components, as in Particle Gym
 CRASHES = 0.001  # per world and step
-METHODS = ("uniform", "p25", "rnd")
+DRAWN, OBSERVED = "candidates drawn", "their clock"
+WAYS = ("uniform", "p25", "rnd", f"p25, {DRAWN}", f"p25, {OBSERVED}")
+WARM_UP = 100  # periods at most until a fear network has learnt
 
 
 def measure(
-    device: torch.device, rounds: int, num_envs: int = WORLDS, period: int = PERIOD, methods: tuple[str, ...] = METHODS
-) -> dict[str, Any]:
-    """Milliseconds and world-steps per second of ``GoalDirector.step`` under some methods, learning included.
+    device: torch.device, rounds: int, sizes: tuple[int, ...] = SIZES, period: int = PERIOD,
+    ways: tuple[str, ...] = WAYS,
+) -> dict[str, Any]:  # fmt: skip
+    """Microseconds of a step, and world-steps per second, for some numbers of worlds, learning included.
 
     Args:
         device: Where.
         rounds: Rounds of T steps that a figure is the median of.
-        num_envs: Worlds.
+        sizes: Numbers of worlds.
         period: T, in steps.
-        methods: Who chooses the goals.
+        ways: Methods, on the Director's own clock with candidates from the loop, unless ``DRAWN`` or ``OBSERVED`` is
+            said behind.
     """
+    rows = []
+    for num_envs in sizes:
+        work = {way: periods(way, num_envs, period, device) for way in ways}
+        seconds = {way: statistics.median(times) for way, times in in_turn(work, rounds, device).items()}
+        rows.append({
+            "num_envs": num_envs,
+            "us per step": {way: 1e6 * value / period for way, value in seconds.items()},
+            "world-steps/s": {way: num_envs * period / value for way, value in seconds.items()},
+        })  # fmt: skip
+    return {"period": period, "sizes": rows}
+
+
+def periods(way: str, num_envs: int, period: int, device: torch.device) -> Callable[[], None]:
+    """A Director that has learnt, and T steps of its worlds, which crash at random."""
     generator = torch.Generator(device).manual_seed(0)
 
     def draw(*shape: int) -> torch.Tensor:
-        return torch.rand(num_envs, *shape, generator=generator, device=device)
+        return torch.rand(num_envs, *shape, generator=generator, device=device, dtype=torch.float32)
 
-    states, candidates = [draw(STATE) for _ in range(8)], draw(CANDIDATES, GOAL)
-    crashes = [draw() < CRASHES for _ in range(8)]
+    box = ([0.0] * GOAL, [1.0] * GOAL) if DRAWN in way else None
+    director = GoalDirector(
+        way.split(",")[0], period, num_envs=num_envs, state_dim=STATE, goal_dim=GOAL, device=device, goal_box=box
+    )
+    states, goal = [draw(STATE) for _ in range(8)], draw(GOAL)
+    candidates = None if box else draw(CANDIDATES, GOAL)
     never = torch.zeros(num_envs, dtype=torch.bool, device=device)
+    clock = torch.zeros(num_envs, dtype=torch.int64, device=device)
 
-    def loop(method: str) -> Callable[[], None]:
-        director, goal = GoalDirector(method, period), candidates[:, 0].clone()
+    def step(t: int, crashed: torch.Tensor) -> None:
+        goal.copy_(director.step(states[t % 8], goal, crashed, never, candidates).goal)
 
-        def work() -> None:
-            for t in range(period):
-                found = director.step(states[t % 8], goal, crashes[t % 8], never, candidates)
-                goal.copy_(found.goal)
+    def observe(t: int, crashed: torch.Tensor) -> None:
+        director.observe(crashed, never)
+        clock.add_(1)
+        rows = (crashed | (clock >= period)).nonzero().squeeze(1)
+        clock[rows] = 0
+        if len(rows):
+            goal[rows] = director.propose(rows, states[t % 8][rows], goal[rows], lambda rows: candidates[rows])
 
-        return work
+    advance = observe if OBSERVED in way else step
 
-    work = {name: loop(name) for name in methods}
-    for function in work.values():  # until fear networks have seen both classes
-        for _ in range(3):
-            function()
-    seconds = in_turn(work, rounds, device)
-    return {
-        "num_envs": num_envs,
-        "ms per step": {name: 1000 * statistics.median(values) / period for name, values in seconds.items()},
-        "world-steps/s": {name: num_envs * period / statistics.median(values) for name, values in seconds.items()},
-    }
+    def work() -> None:
+        for t in range(period):
+            advance(t, draw() < CRASHES)
+
+    afraid = fear_selector(director.selector)
+    for _ in range(3 if afraid is None else WARM_UP):
+        if afraid is not None and afraid.fear.fitted:
+            break
+        work()
+    return work
 
 
 def show(result: dict[str, Any]) -> None:
     """Print the table of ``measure``."""
-    table = Table(title=f"GoalDirector.step, {result['num_envs']} worlds", title_justify="left")
-    for name in ("method", "ms per step", "world-steps/s"):
-        table.add_column(name, justify="left" if name == "method" else "right")
-    for name, value in result["ms per step"].items():
-        table.add_row(name, f"{value:.3f}", short(result["world-steps/s"][name]))
+    table = Table(title=f"GoalDirector, us per step (world-steps/s), T = {result['period']}", title_justify="left")
+    table.add_column("worlds", justify="right")
+    rows = result["sizes"]
+    for way in rows[0]["us per step"]:
+        table.add_column(way, justify="right")
+    for row in rows:
+        cells = (f"{value:.0f} ({short(row['world-steps/s'][way])})" for way, value in row["us per step"].items())
+        table.add_row(str(row["num_envs"]), *cells)
     wide_console().print(table)

@@ -165,11 +165,14 @@ def test_quad_is_measured(capsys):
 
 
 def test_director_is_measured(capsys):
-    """The Director in other people's loops has a time per step for each method."""
-    result = director.measure(CPU, 1, num_envs=50, period=10, methods=("uniform", "p25"))
-    assert set(result["ms per step"]) == {"uniform", "p25"}
-    for name, value in result["ms per step"].items():
-        assert result["world-steps/s"][name] == pytest.approx(50 / value * 1000)
+    """The Director in other people's loops has a time per step for each way and number of worlds."""
+    ways = ("uniform", "p25", "p25, candidates drawn", "p25, their clock")
+    result = director.measure(CPU, 1, sizes=(1, 50), period=10, ways=ways)
+    assert [row["num_envs"] for row in result["sizes"]] == [1, 50]
+    for row in result["sizes"]:
+        assert set(row["us per step"]) == set(ways)
+        for way, value in row["us per step"].items():
+            assert row["world-steps/s"][way] == pytest.approx(row["num_envs"] / value * 1e6)
     director.show(result)
     assert "world-steps/s" in capsys.readouterr().out
 
@@ -191,8 +194,9 @@ def test_terrain_is_measured(capsys):
 def test_numbers_are_written(tmp_path, monkeypatch, capsys):
     """The command measures what is asked for and writes its numbers with versions, threads and device."""
     monkeypatch.setattr(
-        director, "measure", lambda device, rounds: {"num_envs": 1, "ms per step": {}, "rounds": rounds}
-    )
+        director, "measure",
+        lambda device, rounds: {"period": 1, "sizes": [{"num_envs": 1, "us per step": {}}], "rounds": rounds},
+    )  # fmt: skip
     path = tmp_path / "numbers.json"
     threads = torch.get_num_threads()
     try:

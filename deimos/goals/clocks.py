@@ -126,8 +126,8 @@ class GoalClocks(Stateful):
             )  # fmt: skip
             self._count[some] += 1
         self._goal[rows], self._given[rows] = goals, ours
-        self._first[rows], self._open_ended[rows] = False, open_ended
-        self._age[rows] = 0
+        self._open_ended.index_fill_(0, rows, open_ended)  # an assignment would copy the number from the host
+        self._age.index_fill_(0, rows, 0)
         self.asked[rows] += 1
         return goals
 

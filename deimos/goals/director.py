@@ -194,7 +194,8 @@ class GoalDirector:
         if candidates is not None and not callable(candidates):
             candidates = inputs.candidates(candidates, inputs.num_envs)
         clocks = self._clocks or self._begin(inputs)
-        given.refuse_not_finite("state", states, but=ends[0] | ends[1])
+        unseen = None if self._choose_first and not self._next_step else ends[0] | ends[1]
+        given.refuse_not_finite("state", states, but=unseen)
         given.refuse_not_finite("goal", goals)
         if executed is None:
             clocks.refuse_other_goals(goals)
@@ -389,6 +390,7 @@ class GoalDirector:
         columns = () if self._groups == (slice(None),) else (len(self._groups),)
         return Inputs(worlds, states, goals, device, columns)
 
+    @own_settings()
     @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
     def _begin(self, inputs: Inputs) -> GoalClocks:
         spaces = Spaces(

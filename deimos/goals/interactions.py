@@ -70,7 +70,7 @@ class Interactions(Stateful):
         groups: Columns of ``tracking`` in ``advance``; 0 where it is ``None`` and the reward says it.
     """
 
-    saved = ("now", "active", "_pending", "issued_at", "horizon", "_ring", "_marks", "_cursor")
+    saved = ("now", "active", "_pending", "issued_at", "_horizon", "_ring", "_marks", "_cursor")
     unknown = ("_pending", "_ring")  # scores
 
     def __init__(
@@ -91,9 +91,8 @@ class Interactions(Stateful):
         width = sum(self._sizes)
         # One row per interaction, not one tensor per field: a few decisions per step cost what their calls cost.
         self._pending = torch.zeros(num_envs, width, dtype=torch.float32, device=device)
-        self.issued_at, self.horizon, self._cursor = torch.zeros(3, num_envs, dtype=torch.int64, device=device)
-        """Of the pending interaction: the step that it was issued after, and the steps that it is to last; int64, shape
-        (num_envs,) each."""
+        self.issued_at, self._horizon, self._cursor = torch.zeros(3, num_envs, dtype=torch.int64, device=device)
+        """Step that the pending interaction was issued after, int64, shape (num_envs,)."""
         self._ring = torch.zeros(num_envs, capacity, width, dtype=torch.float32, device=device)
         self._marks = torch.zeros(num_envs, capacity, 4, dtype=torch.int64, device=device)
         """Crashed, issued, resolved, horizon; steps count from 1, so a resolved step of 0 marks a free slot."""
@@ -129,7 +128,7 @@ class Interactions(Stateful):
         cursor = self._cursor[rows]
         slot = cursor % self._capacity
         marks = torch.stack(
-            [crashed.long(), self.issued_at[rows], torch.full_like(slot, self.now), self.horizon[rows]], dim=1
+            [crashed.long(), self.issued_at[rows], torch.full_like(slot, self.now), self._horizon[rows]], dim=1
         )
         keep = decided.unsqueeze(1)
         self._ring[rows, slot] = torch.where(keep, self._pending[rows], self._ring[rows, slot])
@@ -155,7 +154,7 @@ class Interactions(Stateful):
             rest[:, 1] = note
         self._pending[rows] = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1).float()
         self.issued_at[rows] = self.now
-        self.horizon[rows] = horizon
+        self._horizon[rows] = horizon
         self.active[rows] = True
 
     @torch.no_grad()
@@ -194,6 +193,11 @@ class Interactions(Stateful):
         known = torch.cat([self._pending[pending], self._ring[env, slot]])
         state, goal, next_goal, *_ = known.split(self._sizes, dim=1)
         return torch.cat([pending, env]), state, goal, next_goal
+
+    @property
+    def horizon(self) -> Tensor:
+        """Steps that the pending interaction is to last, int64, shape (num_envs,)."""
+        return self._horizon
 
     @property
     def latest_state(self) -> Tensor:
