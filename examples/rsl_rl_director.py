@@ -17,8 +17,8 @@ class Carts(VecEnv):
 
     def __init__(self, num_envs: int, director: GoalDirector) -> None:
         self.num_envs, self.director, self.cfg = num_envs, director, {}
-        self.state, self.goal = torch.zeros(num_envs, 2), torch.rand(num_envs, 1) * 2 - 1  # (position, speed), speed
-        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
+        self.state, self.episode_length_buf = torch.zeros(num_envs, 2), torch.zeros(num_envs, dtype=torch.long)
+        self.goal = director.propose(None, self.state, torch.zeros(num_envs, 1))  # the state is position and speed
 
     def get_observations(self) -> TensorDict:  # noqa: D102
         return TensorDict({"policy": torch.cat([self.state, self.goal], dim=1)}, batch_size=[self.num_envs])
@@ -29,10 +29,8 @@ class Carts(VecEnv):
         self.episode_length_buf += 1
         reward = torch.exp(-4.0 * (self.state[:, 1] - self.goal[:, 0]).square())
         crashed = self.state[:, 0].abs() > 1.0
-        timed_out = (self.episode_length_buf >= self.max_episode_length) & ~crashed
-        done = crashed | timed_out
-        candidates = torch.rand(self.num_envs, 100, 1) * 2 - 1
-        self.goal = self.director.step(self.state, self.goal, crashed, timed_out, candidates, reward).goal
+        done = crashed | (timed_out := (self.episode_length_buf >= self.max_episode_length) & ~crashed)
+        self.goal = self.director.step(self.state, self.goal, crashed, timed_out).goal
         self.state[done], self.episode_length_buf[done] = 0.0, 0
         return self.get_observations(), reward, done, {"time_outs": timed_out.float()}
 
@@ -42,15 +40,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--num-envs", type=int, default=512)
+    parser.add_argument("--resume", help="a checkpoint to go on from, as this leaves in carts.pt")
     args = parser.parse_args()
-    env = Carts(args.num_envs, GoalDirector("p75", goal_period=40))
+    env = Carts(args.num_envs, GoalDirector("p75", goal_period=40, goal_box=([-1.0], [1.0])))
     model = {"class_name": "MLPModel", "hidden_dims": [32, 32], "activation": "elu"}
-    actor = model | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
-    config = {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "actor": actor, "critic": model}
-    config |= {"algorithm": {"class_name": "PPO"}, "num_steps_per_env": 24, "save_interval": 10**6}
-    OnPolicyRunner(env, config).learn(args.iterations)
+    config = {"actor": model | {"distribution_cfg": {"class_name": "GaussianDistribution"}}, "critic": model}
+    config |= {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "algorithm": {"class_name": "PPO"}}
+    runner = OnPolicyRunner(env, config | {"num_steps_per_env": 24, "save_interval": 10**6})
+    if args.resume:
+        env.director.load_state_dict(runner.load(args.resume)["director"])
+    runner.learn(args.iterations)
+    runner.save("carts.pt", infos={"director": env.director.state_dict()})
     edge, speeds = torch.tensor([0.9, 0.0]).expand(5, 2), torch.linspace(-1, 1, 5).unsqueeze(1)
-    print("Fear of a new speed for a cart that stands 0.1 m from the end of the track:")
     for speed, fear in zip(speeds[:, 0], env.director.fear(edge, torch.zeros(5, 1), speeds).probability, strict=True):
         print(f"{speed:+.1f} m/s  {fear:.2f}")
 

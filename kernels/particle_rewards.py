@@ -9,6 +9,8 @@ from typing import Literal
 
 import warp as wp
 
+from .check import require
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -57,3 +59,40 @@ def shape_reward(shape: int, distance: float, largest: float, length: float) -> 
     if shape == wp.static(int(RewardShape.RECIPROCAL)):
         return reciprocal(distance, length)
     return exponential(distance, length)
+
+
+@wp.kernel
+def _reward_distances(
+    # In
+    distance: wp.array[float],
+    shape: int,
+    largest: float,
+    length: float,
+    # Out
+    reward: wp.array[float],
+):
+    i = wp.tid()
+    reward[i] = shape_reward(shape, distance[i], largest, length)
+
+
+def reward_distances(
+    distance: wp.array, reward: wp.array, *, shape: RewardShape, largest: float, length: float
+) -> None:
+    """Reward distances that no step has measured, such as those to goals that nobody pursued.
+
+    Args:
+        distance: Distances to the goal, at least 0, shape (n,).
+        reward: Their rewards, shape (n,). Overwritten.
+        shape: How a distance becomes a reward.
+        largest: The largest distance that can occur, positive, in the unit of ``distance`` (``LINEAR``).
+        length: The distance of 1/2 (``RECIPROCAL``) or of 1/e (``EXPONENTIAL``), positive.
+
+    Raises:
+        ValueError: If an array has another shape, dtype or device.
+    """
+    require("distance", distance, dtype=wp.float32)
+    require("reward", reward, like=distance)
+    wp.launch(
+        _reward_distances, dim=len(distance), inputs=[distance, int(shape), largest, length], outputs=[reward],
+        device=distance.device,
+    )  # fmt: skip

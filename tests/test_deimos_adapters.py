@@ -192,6 +192,19 @@ class TestRslRl:
         with pytest.raises(SimulationError, match="World 1: its action is not finite"):
             env.step(idle)
 
+    def test_extras_hold_the_terms_of_the_reward(self):
+        """Every so many steps ``log`` holds the mean of each term; together they are the mean reward."""
+        env = RslRlVecEnv(quad.Config(engine="native").build(4, CPU, 0), report_every=3)
+        steps = [env.step(torch.full((4, 12), 0.3)) for _ in range(6)]
+        assert ["log" in extras for *_, extras in steps] == [False, False, True] * 2
+        for block in (steps[:3], steps[3:]):
+            terms = {name: value for name, value in block[-1][3]["log"].items() if name.startswith("reward/")}
+            assert len(terms) > 5
+            mean = torch.stack([rewards for _, rewards, *_ in block]).mean().item()
+            assert sum(terms.values()) == pytest.approx(mean, rel=1e-4, abs=1e-6)
+        with pytest.raises(ValueError, match="report_every must be at least 1, got 0"):
+            RslRlVecEnv(CONFIG.build(1, CPU, 0), report_every=0)
+
     @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
     def test_refuses_a_bad_reward_scale(self, scale):
         """The message names the argument, what it must be and what it was."""
@@ -412,8 +425,51 @@ class TestGymnasium:
         np.testing.assert_array_equal(many.reset()[0][0], one.reset()[0])
         with pytest.raises(TypeError, match="wind"):
             gymnasium.make("Deimos/Particle-Absolute-v1", wind=1.0)
-        with pytest.raises(ValueError, match="render_mode must be None, got 'human'"):
+        with pytest.raises(TypeError, match="render_mode must be None, got 'human'"):
             gymnasium.make("Deimos/Particle-Absolute-v1", render_mode="human")
+
+    @pytest.mark.parametrize("variant", ["absolute", "directional"])
+    def test_goal_dict_is_the_same_world(self, variant):
+        """The parts of a dictionary are those of the flat observation, where an episode ends too; all else is equal."""
+        config, actions = replace(CONFIG, variant=variant), random_actions(40, 6)
+        flat, parted = (GymnasiumVectorEnv(config, 6, 3, goal_dict=given) for given in (False, True))
+        places = {"observation": slice(0, 9), "desired_goal": slice(9, 12)}
+        places["achieved_goal"] = slice(0, 3) if variant == "directional" else slice(3, 6)
+        ended = 0
+        for step, (obs, *expected) in zip(play(parted, actions)[1:], play(flat, actions)[1:], strict=True):
+            assert parted.observation_space.contains(step[0])
+            assert same(step[0], {key: obs[:, place] for key, place in places.items()})
+            assert same(step[1:4], tuple(expected[:3]))
+            for world in np.flatnonzero(expected[3].get("_final_obs", ())):
+                last = step[4]["final_obs"][world]
+                assert same(last, {key: expected[3]["final_obs"][world][place] for key, place in places.items()})
+                ended += 1
+        assert ended > 10
+
+    @pytest.mark.parametrize("variant", ["absolute", "directional"])
+    @pytest.mark.parametrize("reward", ["linear", "reciprocal", "exponential"])
+    def test_compute_reward_is_that_of_the_step(self, variant, reward):
+        """What was achieved under the goal that was in force gives the step's reward, one world or many at a time."""
+        env = GymnasiumEnv(replace(CONFIG, variant=variant, reward=reward, reward_length=200.0), seed=1, goal_dict=True)
+        achieved, goals, rewards = [], [], []
+        goal = env.reset()[0]["desired_goal"]
+        for action in random_actions(60, 1):
+            obs, reward, *over, _ = env.step(action[0])
+            assert env.compute_reward(obs["achieved_goal"], goal, {}) == pytest.approx(reward, rel=1e-4, abs=1e-6)
+            for kept, value in zip((achieved, goals, rewards), (obs["achieved_goal"], goal, reward), strict=True):
+                kept.append(value)
+            goal = (env.reset()[0] if any(over) else obs)["desired_goal"]
+        assert np.ptp(rewards) > 0.1
+        found = env.compute_reward(np.array(achieved), np.array(goals), [{}] * 60)
+        np.testing.assert_allclose(found, rewards, rtol=1e-4, atol=1e-6)
+
+    def test_goal_dict_is_refused_where_rewards_are_not_of_goals_alone(self):
+        """A way from elsewhere is no goal from here, robots are rewarded for more, and a crash may cost something."""
+        for config in (replace(CONFIG, variant="relative"), quad.Config(), replace(CONFIG, crash_penalty=1.0)):
+            with pytest.raises(ValueError, match="goal_dict must be False: rewards depend on more than goals here"):
+                GymnasiumVectorEnv(config, 1, goal_dict=True)
+        with pytest.raises(ValueError, match="The rewards of Locomotion depend on more than what was achieved"):
+            GymnasiumVectorEnv(quad.Config(), 1).compute_reward(np.zeros(3), np.zeros(3))
 
     def test_reset_without_a_seed_goes_on(self):
         """The episodes after such a reset are new ones, and a second reset at once skips none of them."""

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from deimos.kernels.episodes import make_worlds
 from deimos.kernels.particle import GOAL_START, OBS_DIM, PARTICLES, step_particles
-from deimos.kernels.particle_rewards import RewardShape, shape_reward
+from deimos.kernels.particle_rewards import RewardShape, reward_distances
 
 from deimos.sim.envs.particle import HALF_SIDE, Config
 
@@ -16,26 +16,11 @@ U = 2.0**-24  # relative error of one float32 operation
 VARIANTS = ["absolute", "directional", "relative"]
 
 
-@wp.kernel(enable_backward=False)
-def _shape_rewards(
-    # In
-    shape: int,
-    distance: wp.array[float],
-    largest: float,
-    length: float,
-    # Out
-    reward: wp.array[float],
-):
-    i = wp.tid()
-    reward[i] = shape_reward(shape, distance[i], largest, length)
-
-
 def shape_rewards(shape, distance, largest, length, device):
     """The reward of every distance, float32."""
     distance = wp.array(np.asarray(distance, np.float32), dtype=wp.float32, device=device)
     reward = wp.full(distance.shape, np.nan, dtype=wp.float32, device=device)
-    inputs = [int(shape), distance, largest, length]
-    wp.launch(_shape_rewards, dim=len(distance), inputs=inputs, outputs=[reward], device=device)
+    reward_distances(distance, reward, shape=shape, largest=largest, length=length)
     return reward.numpy()
 
 
@@ -127,3 +112,10 @@ def test_configured_shape_is_the_one_that_steps_reward(device, variant, name):
     length = 2.5 if variant == "directional" else 250.0
     expected = reward_reference(name, 3.0, params.largest_distance, length)
     assert abs(worlds.reward.numpy()[0] - expected) <= reward_tolerance(3.0, length)
+
+
+def test_rejects_arrays_that_do_not_fit(device):
+    """The message names the argument, what it must be and what it was."""
+    distance, reward = (wp.zeros(count, dtype=wp.float32, device=device) for count in (4, 5))
+    with pytest.raises(ValueError, match=r"reward must be float32\(4,\).*got float32\(5,\)"):
+        reward_distances(distance, reward, shape=RewardShape.LINEAR, largest=1.0, length=1.0)

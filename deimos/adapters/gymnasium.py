@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
@@ -23,6 +23,8 @@ from deimos.run.loop import GoalLoop, spaces
 from deimos.sim import envs
 from deimos.sim.env import EnvConfig
 
+Observation = np.ndarray | dict[str, np.ndarray]
+"""An array, or one under each of ``observation``, ``achieved_goal`` and ``desired_goal``."""
 VERSION = 1  # goes up when an episode under the same seed and actions becomes another one
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     **{
@@ -53,12 +55,18 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             the new episode's first, and ``infos["final_obs"]`` holds the last one of the old. ``NEXT_STEP``: the
             observation is the last one, and the next step begins anew there, whatever the action, with reward 0.
             ``DISABLED``: ``reset(options={"reset_mask": ...})`` must come before the next step.
+        goal_dict: Whether an observation is a dictionary in the shape of gymnasium-robotics' goal environments:
+            ``observation`` without the goal, ``achieved_goal`` and ``desired_goal``; see ``compute_reward``.
+
+    Raises:
+        ValueError: If ``num_envs`` or ``seed`` is out of range, or there is a ``goal_dict`` where rewards depend on
+            more than what was achieved and the goal, or on a ``crash_penalty``.
     """
 
     def __init__(
         self, config: EnvConfig, num_envs: int, seed: int | None = None, device: torch.device | str = "cpu",
         selector: SelectorConfig | None = None, env_offset: int = 0,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, goal_dict: bool = False,
     ) -> None:  # fmt: skip
         check_at_least("num_envs", num_envs, 1)
         self.num_envs = num_envs
@@ -71,7 +79,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._selector = selector or uniform.Config()
         self._begin(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
         env = self.loop.env
-        self.single_observation_space = Box(-np.inf, np.inf, (env.obs_dim,), np.float32)
+        self._goal_dict = goal_dict
+        if goal_dict and (env.achieved(env.obs) is None or config.crash_penalty):
+            raise ValueError(f"goal_dict must be False: rewards depend on more than goals here; got {config}.")
+        sizes = {"observation": env.state_dim, "achieved_goal": env.goal_dim, "desired_goal": env.goal_dim}
+        boxes = {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in sizes.items()}
+        flat = Box(-np.inf, np.inf, (env.obs_dim,), np.float32)
+        self.single_observation_space = Dict(boxes) if goal_dict else flat
         low, high = env.action_range
         self.single_action_space = Box(low.numpy(), high.numpy(), dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -85,7 +99,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=env.device)
         self._fresh, self._over = everywhere, ~everywhere
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Observation, dict]:
         """Begin an episode.
 
         Args:
@@ -113,9 +127,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if again.any():
             self.loop.start(again)
             self._fresh, self._over = self._fresh | again, self._over & ~again
-        return _copy(self.loop.env.obs), {}
+        return self._seen(), {}
 
-    def step(self, actions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(self, actions: ArrayLike) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Simulate one step of every world, issue the goals that are due and reset the worlds that are done.
 
         Args:
@@ -150,15 +164,47 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         done = step.terminated | step.truncated
         same_step = self._mode is AutoresetMode.SAME_STEP
         begins = done if same_step else ended_before
-        ended = (step.obs, step.reward.double(), step.terminated, step.truncated)
-        final_obs, reward, terminated, truncated = map(_copy, ended)
+        final_obs = self._seen()
+        reward, terminated, truncated = map(_copy, (step.reward.double(), step.terminated, step.truncated))
         if begins.any():
             self.loop.begin(begins)
         self._fresh, self._over = begins, done & ~begins
         infos: dict = {}
         for world in np.flatnonzero(done.cpu()) if same_step else ():
-            infos = self._add_info(infos, {"final_obs": final_obs[world], "final_info": {}}, world)
-        return _copy(env.obs), reward, terminated, truncated, infos
+            infos = self._add_info(infos, {"final_obs": _world(final_obs, world), "final_info": {}}, world)
+        return self._seen(), reward, terminated, truncated, infos
+
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> np.ndarray:
+        """Rewards of steps that achieved one thing and whose goal was another, as in gymnasium-robotics.
+
+        They are those of ``step`` but for rounding, where the goal of the observation was in force during the step: not
+        where a new one was issued after it.
+
+        Args:
+            achieved_goal: As observations hold it, shape (..., goal_dim).
+            desired_goal: The same of goals.
+            info: Ignored: no reward depends on it.
+
+        Returns:
+            Float64, shape (...).
+
+        Raises:
+            ValueError: If rewards depend on more than that; see ``goal_dict``.
+        """
+        env, shape = self.loop.env, np.shape(achieved_goal)[:-1]
+        both = (np.asarray(goal, np.float32).reshape(-1, env.goal_dim) for goal in (achieved_goal, desired_goal))
+        reward = env.goal_reward(*(torch.from_numpy(goal).to(env.device) for goal in both))
+        return _copy(reward.double()).reshape(shape)
+
+    def _seen(self) -> Observation:
+        """Copies of the current observations."""
+        env = self.loop.env
+        if not self._goal_dict:
+            return _copy(env.obs)
+        return {
+            "observation": _copy(env.state(env.obs)), "achieved_goal": _copy(env.achieved(env.obs)),
+            "desired_goal": _copy(env.obs[:, env.goal_slice]),
+        }  # fmt: skip
 
 
 class GymnasiumEnv(gymnasium.Env):
@@ -168,27 +214,32 @@ class GymnasiumEnv(gymnasium.Env):
 
     def __init__(
         self, config: EnvConfig, seed: int | None = None, device: torch.device | str = "cpu",
-        selector: SelectorConfig | None = None, env_offset: int = 0,
+        selector: SelectorConfig | None = None, env_offset: int = 0, goal_dict: bool = False,
     ) -> None:  # fmt: skip
-        self.worlds = GymnasiumVectorEnv(config, 1, seed, device, selector, env_offset, AutoresetMode.DISABLED)
+        disabled = AutoresetMode.DISABLED
+        self.worlds = GymnasiumVectorEnv(config, 1, seed, device, selector, env_offset, disabled, goal_dict)
         self.observation_space = self.worlds.single_observation_space
         self.action_space = self.worlds.single_action_space
         self._running = False
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Observation, dict]:
         """See ``GymnasiumVectorEnv.reset``; observations have the shape (obs_dim,)."""
         obs, info = self.worlds.reset(seed=seed, options=options)
         super().reset(seed=None if seed is None else int(seed))
         self._running = True
-        return obs[0], info
+        return _world(obs, 0), info
 
-    def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict]:
         """See ``GymnasiumVectorEnv.step``; the observation that an episode ends in comes back as such."""
         if not self._running:
             raise gymnasium.error.ResetNeeded("The episode has ended or not begun; call reset().")
         obs, reward, terminated, truncated, _ = self.worlds.step(np.expand_dims(action, 0))
         self._running = not (terminated | truncated).item()
-        return obs[0], reward.item(), terminated.item(), truncated.item(), {}
+        return _world(obs, 0), reward.item(), terminated.item(), truncated.item(), {}
+
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> np.ndarray:
+        """See ``GymnasiumVectorEnv.compute_reward``."""
+        return self.worlds.compute_reward(achieved_goal, desired_goal, info)
 
 
 def make(environment: str, render_mode: None = None, **options: Any) -> GymnasiumEnv:
@@ -201,7 +252,7 @@ def make(environment: str, render_mode: None = None, **options: Any) -> Gymnasiu
 
     Raises:
         ValueError: If there is no such environment or a value is not valid.
-        TypeError: If there is no such option.
+        TypeError: If there is no such option, or a ``render_mode``.
     """
     config = _config(environment, render_mode, options)
     return GymnasiumEnv(config, **options)
@@ -216,9 +267,15 @@ def make_vec(environment: str, num_envs: int, render_mode: None = None, **option
 def _config(environment: str, render_mode: None, options: dict[str, Any]) -> EnvConfig:
     """The environment's configuration, whose fields are taken out of ``options``."""
     if render_mode is not None:
-        raise ValueError(f"render_mode must be None, got '{render_mode}'; `deimos play` draws runs.")
+        # The error of an option that there is not: Stable-Baselines3 asks for 'rgb_array' and goes on without.
+        raise TypeError(f"render_mode must be None, got '{render_mode}'; `deimos play` draws runs.")
     kind = plugins.load(envs, environment).Config
     return kind(**{name: options.pop(name) for name in kind.__dataclass_fields__ if name in options})
+
+
+def _world(obs: Observation, world: int) -> Observation:
+    """The observation of one world."""
+    return {name: part[world] for name, part in obs.items()} if isinstance(obs, dict) else obs[world]
 
 
 def _copy(tensor: torch.Tensor) -> np.ndarray:

@@ -7,7 +7,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from deimos.checks import check_positive
+from deimos.checks import check_at_least, check_positive
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
@@ -26,13 +26,18 @@ class RslRlVecEnv(VecEnv):
         env: The worlds, as they were built.
         selector: Who chooses their goals; ``None`` for Uniform.
         reward_scale: What rewards are multiplied with, positive.
+        report_every: Steps between two reports, ``log`` of the extras, at least 1: making one waits for the device.
 
     Attributes:
         loop: The worlds, their selector and their interactions.
     """
 
-    def __init__(self, env: Env, selector: GoalSelector | None = None, reward_scale: float = 1.0) -> None:
+    def __init__(
+        self, env: Env, selector: GoalSelector | None = None, reward_scale: float = 1.0, report_every: int = 24
+    ) -> None:
         check_positive("reward_scale", reward_scale, finite=True)
+        check_at_least("report_every", report_every, 1)
+        self._report_every, self._steps = report_every, 0
         self.env = env
         self.reward_scale = reward_scale
         self.cfg = spaces(env)
@@ -59,7 +64,7 @@ class RslRlVecEnv(VecEnv):
         """What to act on next: ``policy``, float32, shape (num_envs, obs_dim)."""
         return TensorDict({"policy": self.env.obs.clone()}, batch_size=[self.num_envs], device=self.device)
 
-    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Tensor]]:
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Simulate one step of every world, issue the goals that are due and reset the worlds that are done.
 
         Args:
@@ -67,7 +72,9 @@ class RslRlVecEnv(VecEnv):
 
         Returns:
             What to act on next; scaled rewards, shape (num_envs,); worlds that crashed or were truncated,
-            bool, shape (num_envs,); and ``time_outs``: 1 where a world was truncated, else 0, shape (num_envs,).
+            bool, shape (num_envs,); and ``time_outs``: 1 where a world was truncated, else 0, shape (num_envs,). At a
+            report, where the environment has something to say, ``log`` too: means of the steps since the last one, such
+            as the terms of the reward (``reward/NAME``, not scaled), which rsl_rl logs; see ``Env.report``.
 
         Raises:
             SimulationError: If an action is not finite, or more worlds become invalid than may.
@@ -78,6 +85,9 @@ class RslRlVecEnv(VecEnv):
         dones = step.terminated | step.truncated
         extras = {"time_outs": step.truncated.float()}
         self.loop.advance(step)
+        self._steps += 1
+        if self._steps % self._report_every == 0 and (report := self.env.report()):
+            extras["log"] = report
         return self.get_observations(), rewards, dones, extras
 
 

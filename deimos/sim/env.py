@@ -283,6 +283,32 @@ class Env(abc.ABC):
         """
         return None
 
+    def achieved(self, obs: Tensor) -> Tensor | None:
+        """The goals that observations meet exactly, for learners that hand out goals in hindsight.
+
+        Args:
+            obs: Observations that steps ended in, shape (n, obs_dim).
+
+        Returns:
+            Shape (n, goal_dim); ``None`` where a reward also depends on other things than these and the goal.
+        """
+        return None
+
+    def goal_reward(self, achieved: Tensor, goal: Tensor) -> Tensor:
+        """Rewards of steps that achieved one thing and whose goal was another, without ``crash_penalty``.
+
+        Args:
+            achieved: What ``achieved`` gave, shape (n, goal_dim).
+            goal: Goals as the policy sees them, shape (n, goal_dim).
+
+        Returns:
+            Float32, shape (n,).
+
+        Raises:
+            ValueError: If ``achieved`` gives ``None`` here.
+        """
+        raise ValueError(f"The rewards of {type(self).__name__} depend on more than what was achieved and the goal.")
+
     def place(self, rows: Tensor) -> Tensor | None:
         """Where the listed worlds are in the box that they crash outside of.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from deimos.checks import check_at_least, check_choice, check_positive, check_range
 from deimos.kernels.particle import BROKEN, PARTICLES, ParticleParams, reset_particles, step_particles
-from deimos.kernels.particle_rewards import RewardName, RewardShape
+from deimos.kernels.particle_rewards import RewardName, RewardShape, reward_distances
 from deimos.nn.host import own_settings
 from deimos.sim.env import EnvConfig, ObsField, Sketch
 from deimos.sim.warp_env import WarpEnv
@@ -141,6 +141,24 @@ class Particle(WarpEnv):
         if self.config.has_velocity_goals:
             goal = position + goal * (self.goal_period - int(self.tensors["goal_clock"][world]))
         return Sketch(HALF_SIDE, position, goal)
+
+    def achieved(self, obs: Tensor) -> Tensor | None:
+        """See ``Env.achieved``: velocity or position. The way to a position from elsewhere is no goal from here."""
+        if self.config.variant == "relative":
+            return None
+        return obs[:, 0:3] if self.config.has_velocity_goals else obs[:, 3:6]
+
+    def goal_reward(self, achieved: Tensor, goal: Tensor) -> Tensor:
+        """See ``Env.goal_reward``."""
+        params = self.config.params()
+        scale = params.velocity_scale if self.config.has_velocity_goals else params.position_scale
+        distance = ((achieved - goal) / scale).norm(dim=1).float()
+        reward = torch.empty_like(distance)
+        reward_distances(
+            wp.from_torch(distance), wp.from_torch(reward), shape=RewardShape(params.reward_shape),
+            largest=params.largest_distance, length=params.reward_length,
+        )  # fmt: skip
+        return reward
 
     def place(self, rows: Tensor) -> Tensor:
         """See ``Env.place``."""

@@ -1,0 +1,46 @@
+"""A Director in the command manager of mjlab or Isaac Lab, which keep the clock of the commands themselves."""
+
+import abc
+from typing import Any
+
+from torch import Tensor
+
+from deimos.goals.director import GoalDirector
+
+
+class DirectedCommand(abc.ABC):
+    """Mix it in before the class of a command term, such as either's ``UniformVelocityCommand``.
+
+    The term resamples as before, by its own timers and at resets, and draws its modes (headings, standing robots); the
+    commands come from the Director, which learns from what the modes made of them. A ``reset`` of the whole environment
+    between two steps counts as a resampling.
+    """
+
+    director: GoalDirector
+    """Who chooses the commands, on the term's clock; it must have a ``goal_box``. Set it after ``super().__init__``."""
+    command: Tensor
+    """The term's commands, shape (num_envs, goal_dim)."""
+    _env: Any
+    _observed = 0  # step of the environment that the Director has heard of
+
+    @abc.abstractmethod
+    def state(self) -> Tensor:
+        """What the Director sees of every robot, shape (num_envs, state_dim)."""
+
+    def compute(self, *args: Any, **options: Any) -> None:
+        """See the term; called once in every step."""
+        self._observe()
+        super().compute(*args, **options)  # type: ignore[misc]  # it is the term's
+
+    def _resample_command(self, env_ids: Tensor) -> None:
+        self._observe()
+        before = self.command[env_ids].clone()
+        super()._resample_command(env_ids)  # type: ignore[misc]
+        self.command[env_ids] = self.director.propose(env_ids, self.state()[env_ids], before)
+
+    def _observe(self) -> None:
+        """Tell the Director how the last step ended; in a step, worlds are reset before commands are computed."""
+        env = self._env
+        if env.common_step_counter != self._observed:
+            self._observed = env.common_step_counter
+            self.director.observe(env.reset_terminated, env.reset_time_outs, executed=self.command)

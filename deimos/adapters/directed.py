@@ -1,0 +1,147 @@
+"""A Director in gymnasium's training loops, and what wrappers of other libraries have in common with that one."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Dict, Space
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+
+from deimos.goals.director import GoalDirector
+
+Observation = np.ndarray | dict[str, np.ndarray]
+"""Observations of all worlds: shape (num_envs, obs_dim), or arrays by key, worlds along the first axis."""
+Reward = Callable[[Observation, np.ndarray], np.ndarray]
+"""Rewards, shape (num_envs,), of steps from the observations that they ended in, which hold the goals that were in
+force, and from the rewards of the environment."""
+
+
+class GoalSlot:
+    """The place of the goal in every observation, and the Director that fills it.
+
+    Args:
+        director: Who chooses the goals, on its own clock; it must have a ``goal_box``.
+        space: Observation space of one world: a ``Box`` of one axis, or a ``Dict``.
+        num_envs: Number of worlds.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``.
+
+    Raises:
+        ValueError: If the space has no such place.
+    """
+
+    def __init__(self, director: GoalDirector, space: Space, num_envs: int, where: slice | str) -> None:
+        parted = isinstance(space, Dict)
+        if not isinstance(where, str if parted else slice) or (parted and where not in space.spaces):
+            raise ValueError(f"where must be a key of a Dict or a slice of a Box, got {where!r} for {space}.")
+        self.director, self.where = director, where
+        self.goal: np.ndarray | None = None
+        """The goals in force, shape (num_envs, goal_dim); ``None`` before the first reset."""
+        self._space, self._spaces = space, batch_space(space, num_envs)
+
+    def begin(self, obs: Observation, next_step: bool = False) -> Observation:
+        """First goals for all worlds, which begin an episode; what is pending is dropped.
+
+        Args:
+            obs: Their observations.
+            next_step: Whether the Director expects a step of its own for the reset of a world.
+
+        Returns:
+            The observations with the goals.
+        """
+        if self.goal is not None:
+            everybody = np.ones(len(self.goal), dtype=bool)
+            self.director.observe(~everybody, everybody)
+            if next_step:
+                self.director.observe(~everybody, ~everybody)
+        self.goal = self.director.propose(None, self.state(obs), self.read(obs))
+        return self.write(obs)
+
+    def ended(self, obs: Observation, last: dict[int, Observation]) -> Observation:
+        """Observations that the last step ended in, with the goals that were in force.
+
+        Args:
+            obs: Observations after the step: those after the reset where a world has been reset in it.
+            last: By world that has, the observation that its episode ended in. Its goal is overwritten.
+        """
+        if last:
+            worlds = [last.get(world, own) for world, own in enumerate(iterate(self._spaces, obs))]
+            obs = concatenate(self._space, worlds, create_empty_array(self._space, len(worlds)))
+        obs = self.write(obs)
+        if last:
+            worlds = list(iterate(self._spaces, obs))
+            last.update({world: worlds[world] for world in last})
+        return obs
+
+    def advance(self, obs: Observation, terminated: np.ndarray, truncated: np.ndarray) -> Observation:
+        """What the last step decided, and the goals that are due; returns the observations with the goals to pursue.
+
+        Args:
+            obs: Observations to act on next.
+            terminated: True where the world crashed, bool, shape (num_envs,).
+            truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
+        """
+        self.goal = self.director.step(self.state(obs), self.goal, terminated, truncated).goal
+        return self.write(obs)
+
+    def state(self, obs: Observation) -> np.ndarray:
+        """Everything but the goal, float32, shape (num_envs, state_dim)."""
+        if isinstance(obs, Mapping):
+            parts = [part.reshape(len(part), -1) for key, part in obs.items() if key != self.where]
+            return np.concatenate(parts, axis=1, dtype=np.float32)
+        return np.delete(obs, self.where, axis=1).astype(np.float32)
+
+    def read(self, obs: Observation) -> np.ndarray:
+        """What stands in the place of the goal, shape (num_envs, goal_dim)."""
+        return obs[self.where] if isinstance(obs, Mapping) else obs[:, self.where]
+
+    def write(self, obs: Observation) -> Observation:
+        """A copy of the observations with the goals in force."""
+        if isinstance(obs, Mapping):
+            return {**obs, self.where: self.goal}
+        obs = obs.copy()
+        obs[:, self.where] = self.goal
+        return obs
+
+
+class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
+    """Worlds whose goals a Director chooses: it overwrites the goal in every observation, and the reward follows it.
+
+    Args:
+        env: The worlds, which begin anew by themselves. What terminates is a crash.
+        director: Who chooses the goals, on its own clock; it must have a ``goal_box`` and the worlds'
+            ``autoreset``.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``.
+        reward: Rewards for the goals in force; see ``Reward``.
+
+    Raises:
+        ValueError: If observations have no such place, or if nothing resets a world that is done.
+    """
+
+    def __init__(
+        self, env: gymnasium.vector.VectorEnv, director: GoalDirector, where: slice | str, reward: Reward
+    ) -> None:
+        super().__init__(env)
+        self._mode = env.metadata["autoreset_mode"]
+        if self._mode is AutoresetMode.DISABLED:
+            raise ValueError("env must reset worlds that are done by itself, got AutoresetMode.DISABLED.")
+        self.slot = GoalSlot(director, env.single_observation_space, env.num_envs, where)
+        self._reward, self._over = reward, np.zeros(env.num_envs, dtype=bool)
+
+    def reset(self, **options: Any) -> tuple[Observation, dict[str, Any]]:
+        """See ``VectorEnv.reset``; every world gets a first goal."""
+        obs, infos = self.env.reset(**options)
+        self._over[:] = False
+        return self.slot.begin(obs, self._mode is AutoresetMode.NEXT_STEP), infos
+
+    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """See ``VectorEnv.step``; what an episode ended in, and its reward, are of the goal that was in force."""
+        obs, reward, terminated, truncated, infos = self.env.step(actions)
+        last = {int(world): infos["final_obs"][world] for world in np.flatnonzero(infos.get("_final_obs", False))}
+        reward = np.where(self._over, reward, self._reward(self.slot.ended(obs, last), reward))
+        for world, observation in last.items():
+            infos["final_obs"][world] = observation
+        if self._mode is AutoresetMode.NEXT_STEP:  # the next step of these worlds is their reset
+            self._over = terminated | truncated
+        return self.slot.advance(obs, terminated, truncated), reward, terminated, truncated, infos

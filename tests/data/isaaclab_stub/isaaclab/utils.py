@@ -1,0 +1,5 @@
+"""Configurations."""
+
+from dataclasses import dataclass as configclass
+
+__all__ = ["configclass"]
