@@ -92,7 +92,7 @@ TRAIN_ERRORS = {
     "selector:plr --selector.fill 0": r"fill must be in \(0, 1\], got 0.0",
     "selector:learnability --selector.low 0.95": "low must be below high, got 0.95 and 0.9",
     "--device cuda": "There is no CUDA device here; use --device cpu",
-    "--device tpu": "'tpu' .*'auto', 'cpu', 'cuda'",
+    "--device tpu": "device must be auto, cpu, cuda or cuda:N, got 'tpu'",
     "--bogus 3": "Unrecognized options: --bogus",
     "bogus": "Unrecognized options: bogus",
     "--out there": "there exists and is not overwritten; choose another --out, or continue with --resume",

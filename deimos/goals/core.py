@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deimos.goals.interactions import Interactions
+from deimos.goals.interactions import Interactions, assign
 from deimos.goals.selector import GoalSelector, Spaces, Transitions
 from deimos.nn.stateful import Stateful
 
@@ -87,7 +87,7 @@ class GoalCore(Stateful):
         ))  # fmt: skip
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])
-        self.percentile[changes.done] = 50.0
+        self.percentile.index_fill_(0, changes.done, 50.0)
         return changes
 
     @torch.no_grad()
@@ -103,8 +103,8 @@ class GoalCore(Stateful):
         self.interactions.open(
             rows, state, goal, chosen.goal, chosen.score, self.goal_period, probe=chosen.probe, note=chosen.note
         )
-        self.weight[rows] = 1.0 if chosen.weight is None else chosen.weight
-        self.percentile[rows] = torch.nan if chosen.percentile is None else chosen.percentile
+        assign(self.weight, rows, 1.0 if chosen.weight is None else chosen.weight)
+        assign(self.percentile, rows, torch.nan if chosen.percentile is None else chosen.percentile)
         return chosen.goal
 
     def learn(self, rollout: Transitions | None) -> dict[str, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -52,7 +52,7 @@ class RunOptions(_FolderOptions):
     """Parallel worlds of the training, in place of the file's."""
     env_steps: int | None = None
     """Steps of every world, in place of the file's."""
-    device: Literal["auto", "cpu", "cuda"] | None = None
+    device: str | None = None
     """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
     """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell."""

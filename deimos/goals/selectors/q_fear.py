@@ -56,7 +56,7 @@ class QFear(director.Director):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
-        self._worst[rows] = torch.nan
+        self._worst.index_fill_(0, rows, torch.nan)
         if self.fear.fitted:
             worst = picks.take(candidates, self.score(state, goal, candidates).argmax(1))
             self._worst[rows] = torch.cat([self._seen(state), goal, worst], dim=1).float()
