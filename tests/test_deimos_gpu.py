@@ -148,7 +148,7 @@ def cuda(monkeypatch):
 
 
 def test_devices_by_their_names(cuda):
-    """auto takes the first GPU there is, cuda:N another one; what is not there is refused in one line."""
+    """Auto takes the first GPU there is, cuda:N another one; what is not there is refused in one line."""
     cuda(2, 2)
     for name, device in {"auto": GPU, "cuda": GPU, "cuda:1": torch.device("cuda", 1), "cpu": CPU}.items():
         assert training.resolve_device(name) == device

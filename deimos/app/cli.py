@@ -34,6 +34,7 @@ COMMANDS = {
 EXTRAS = {
     "warp": "sim", "tyro": "sim", "rich": "sim", "tensorboard": "sim", "matplotlib": "sim", "PIL": "legged",
     "mujoco": "legged", "mujoco_warp": "legged", "trimesh": "legged", "imageio_ffmpeg": "legged", "scipy": "study",
+    "ray": "cluster", "wandb": "wandb",
 }  # fmt: skip
 """The extra of ``deimos-rl`` that installs a package."""
 

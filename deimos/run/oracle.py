@@ -15,7 +15,6 @@ from deimos.goals.fear import Fear
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.sim.env import Env
 
-
 MOST = {"cpu": 10_000, "cuda": 200_000}
 """Clones at a time, by the type of the device."""
 

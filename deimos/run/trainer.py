@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, SimulationError, check_at_least, check_device, check_range, one_line
+from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_device, check_range, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
@@ -14,6 +14,7 @@ from deimos.nn.layout import seen_by
 from deimos.nn.threads import tf32_products, torch_on_one
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
+from deimos.run.logs import LOGS
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones, SeesWorlds
 from deimos.sim.env import EnvConfig
@@ -53,6 +54,8 @@ class TrainConfig:
     for large networks. CPUs never do."""
     threads: int = 0
     """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
+    log: tuple[str, ...] = ("tensorboard",)
+    """Where its numbers are shown while it trains: tensorboard, wandb (Weights & Biases), both or nowhere."""
     critic_warmup: int = 0
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 
@@ -62,6 +65,8 @@ class TrainConfig:
         check_at_least("critic_warmup", self.critic_warmup, 0)
         check_range("threads", self.threads, 0, MOST_THREADS)
         check_device("device", self.device)
+        for name in self.log:
+            check_choice("log", name, LOGS)
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
         if self.method is not None and self.selector is not None:

@@ -23,6 +23,7 @@ from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
 from deimos.run.failure import check_finite, dumped
 from deimos.run.folder import RunFolder
+from deimos.run.logs import open_logs
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.shared import find_cuda
 
@@ -287,11 +288,9 @@ def _iterate(
     trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None], stopped: Callable[[], bool]
 ) -> bool:
     """See ``train``."""
-    from torch.utils.tensorboard import SummaryWriter
-
     transitions = trainer.rollout.reward.numel()
     saved = time.monotonic()
-    with SummaryWriter(str(folder.path), purge_step=trainer.iteration + 1) as board:
+    with open_logs(trainer.config.log, folder, to_dict(trainer.config), trainer.iteration) as logs:
         while trainer.iteration < trainer.config.iterations:
             before = dict(trainer.seconds)
             begin = time.perf_counter()
@@ -300,13 +299,12 @@ def _iterate(
             folder.append_csv("progress.csv", row)
             spent = {name: seconds - before[name] for name, seconds in trainer.seconds.items()}
             folder.append_csv("timing.csv", {"iteration": trainer.iteration, "fps": fps, **spent})
-            for name, value in row.items():
-                board.add_scalar(name, value, trainer.iteration)
-            board.add_scalar("fps", fps, trainer.iteration)
+            logs.write(trainer.iteration, row | {"fps": fps})
             report(row, fps)
             if stopped():
                 break
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                logs.flush()  # first: what a resumed run does not say again must be there
                 save(trainer, folder)
                 saved = time.monotonic()
     save(trainer, folder)

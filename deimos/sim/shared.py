@@ -64,8 +64,8 @@ def check_stream(device: torch.device) -> None:
     torchs, warps = torch.cuda.current_stream(device).cuda_stream, wp.get_stream(warp_device(device)).cuda_stream
     if torchs != warps:
         raise RunError(
-            f"torch works on CUDA stream {torchs:#x} and Warp on {warps:#x}, and neither waits for the other; build and "
-            f"step environments within `with deimos.sim.shared.one_stream(torch.device('{device}')):`."
+            f"torch works on CUDA stream {torchs:#x} and Warp on {warps:#x}, and neither waits for the other; build "
+            f"and step environments within `with deimos.sim.shared.one_stream(torch.device('{device}')):`."
         )
 
 
