@@ -20,11 +20,12 @@ from deimos.study.folder import StudyFolder
 from deimos.study.on_ray import OnRay
 
 STUDY = """
-seeds = 2
+seeds = 1
+audit_worlds = 0
 methods = ["uniform", "p25"]
 [train]
-num_envs = 64
-env_steps = 4800
+num_envs = 16
+env_steps = 1920
 device = "cpu"
 ppo = { hidden = [8], epochs = 1 }
 eval = { worlds = 16, steps = 40, adversary_steps = 40 }
@@ -53,7 +54,7 @@ def train_in(study: StudyFolder) -> dict[int, str]:
     return found
 
 
-def wait_until(what: str, condition, seconds: float = 300.0) -> None:  # noqa: ANN001
+def wait_until(what: str, condition, seconds: float = 900.0) -> None:  # noqa: ANN001
     """Wait for something to become true, or end the program."""
     end = time.monotonic() + seconds
     while not condition():

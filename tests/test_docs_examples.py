@@ -64,6 +64,9 @@ ELSEWHERE = {
     r"pip install torch==": "it fetches from another host; no test does",
     r"deimos pool |.* --pool ": "tests/test_deimos_attackers.py, with policies that crash",
     r"python examples/\w+\.py$": "tests/test_examples.py",
+    r"pip install 'deimos-rl\[|ray start |.* --engine ray": ".ci/check_ray.py; Ray is in no environment of the tests",
+    r"sbatch ": "tests/test_deimos_study_cluster.py, without Slurm",
+    r"deimos doctor --gpu |deimos train --device cuda": "tests/test_deimos_doctor.py, on a CPU",
     r"reproduction/freeze ": "tests/test_reproduction_studies.py, in a repository of its own",
 }
 """Commands that are run elsewhere, and where."""

@@ -27,6 +27,7 @@ COMMANDS = {
     "study": ("deimos.app.study", "train and compare populations of policies"),
     "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
     "robot": ("deimos.app.robot", "check a robot of your own, and draft its file from an MJCF"),
+    "doctor": ("deimos.app.doctor", "say what this machine has, and what works on it"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }
 """By name: the module whose ``main`` is the command, imported when it is asked for, and a line about it."""
