@@ -3,7 +3,8 @@
 import json
 import re
 import sys
-from types import SimpleNamespace
+import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -93,11 +94,42 @@ def test_the_report_is_written_after_every_stage(tmp_path, monkeypatch, capsys):
     assert report["rough"]["error"] == "it took longer than 0 s"
     assert "pytest" in report["tests"]["skipped"]
     assert "versions: found" in capsys.readouterr().out
+
+
+def test_the_last_words_of_a_stage_are_kept(monkeypatch):
+    """A stage whose process dies is an error in one line, beside all that it said."""
+    program = "import sys; sys.exit('Traceback\\nCUDA error: an illegal access')"
+    begin = doctor.subprocess.Popen
     monkeypatch.setattr(
-        doctor.subprocess, "run",
-        lambda *args, **more: SimpleNamespace(stderr="Traceback\nCUDA error: an illegal access", returncode=1),
-    )  # fmt: skip
-    assert run("versions", CPU, 1.0)["error"] == "CUDA error: an illegal access"
+        doctor.subprocess, "Popen", lambda command, **more: begin([sys.executable, "-c", program], **more)
+    )
+    found = doctor._run_stage("versions", CPU, 60.0)
+    assert found["error"] == "CUDA error: an illegal access"
+    assert found["said"].startswith("Traceback")
+
+
+def test_a_stage_that_takes_too_long_ends_with_what_it_began(monkeypatch, tmp_path):
+    """At its limit a stage is killed, and so are the processes that it has begun."""
+    program = (
+        "import subprocess, sys, time\n"
+        f"child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
+        f"open({str(tmp_path / 'child')!r}, 'w').write(str(child.pid))\ntime.sleep(600)"
+    )
+    begin = doctor.subprocess.Popen
+    monkeypatch.setattr(
+        doctor.subprocess, "Popen", lambda command, **more: begin([sys.executable, "-c", program], **more)
+    )
+    limit = 2.0
+    while not (tmp_path / "child").exists():  # a busy machine needs longer to begin it
+        assert doctor._run_stage("versions", CPU, limit)["error"] == f"it took longer than {limit:.0f} s"
+        limit *= 2
+    child = int((tmp_path / "child").read_text())
+    end = time.monotonic() + 60
+    while Path(f"/proc/{child}").exists() and "(python" in Path(f"/proc/{child}/stat").read_text():
+        if Path(f"/proc/{child}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z":  # nobody has asked how it ended
+            break
+        assert time.monotonic() < end, "it lives on"
+        time.sleep(0.05)
 
 
 def test_science_continues_what_is_there(tmp_path):

@@ -1,8 +1,10 @@
 """``deimos doctor``: what this machine has, what works on it, and what does not; ``--gpu``: ten minutes of a GPU's."""
 
+import contextlib
 import importlib.metadata
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -77,7 +79,8 @@ def main(arguments: list[str], program: str) -> None:
     print(options.out / REPORT)
     if options.science:
         for command in science(device, options.out):
-            subprocess.run(command, check=True, cwd=gpu_stages.HOME)
+            if code := subprocess.run(command, cwd=gpu_stages.HOME).returncode:
+                raise SystemExit(code)
     if not passed:
         raise SystemExit(1)
 
@@ -201,13 +204,20 @@ def _run_stage(name: str, device: torch.device, limit: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as home:
         file = Path(home) / "found.json"
         command = [sys.executable, "-m", "deimos.app.gpu_stages", name, str(device), str(file)]
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+            said = process.communicate(timeout=limit)[1]
         except subprocess.TimeoutExpired:
             return {"error": f"it took longer than {limit:.0f} s"}
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # they have ended, as they should
+                os.killpg(process.pid, signal.SIGKILL)  # with what it has begun
+            process.wait()
         if not file.exists():
-            last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
-            return {"error": last[0], "said": done.stderr[-4000:]}
+            last = said.strip().splitlines()[-1:] or [f"exit code {process.returncode}"]
+            return {"error": last[0], "said": said[-4000:]}
         return RunFolder(file.parent).read_json(file.name)
 
 

@@ -87,7 +87,7 @@ class GoalCore(Stateful):
         ))  # fmt: skip
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])
-        self.percentile.index_fill_(0, changes.done, 50.0)
+        assign(self.percentile, changes.done, 50.0)
         return changes
 
     @torch.no_grad()

@@ -61,12 +61,12 @@ class WeightsAndBiases:
         if not (folder.path / WANDB).exists():
             folder.write_json(WANDB, {"id": wandb.util.generate_id(16)})
         identity = folder.read_json(WANDB)["id"]
-        for path in folder.path.glob(f"wandb/offline-run-*-{identity}"):
+        for path in sorted(folder.path.glob(f"wandb/offline-run-*-{identity}")):
             shutil.rmtree(path)
         try:
             self._run = wandb.init(
                 project="deimos", name=folder.path.resolve().name, id=identity, resume="allow", dir=str(folder.path),
-                config=facts, settings=wandb.Settings(console="off"),
+                config=facts, reinit="create_new", settings=wandb.Settings(console="off"),
             )  # fmt: skip
         except wandb.Error as error:
             raise RunError(
