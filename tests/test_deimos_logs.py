@@ -63,7 +63,6 @@ class FakeWandb:
     """Weights & Biases as far as runs use it; offline a file for each process, online one history by identity."""
 
     Error = type("Error", (Exception,), {})
-    util = SimpleNamespace(generate_id=lambda length: "k" * length)
 
     def __init__(self, offline):
         self.offline, self.history, self.files, self.began = offline, [], 0, []
@@ -125,7 +124,8 @@ def test_wandb_has_every_iteration_once(offline, tmp_path, monkeypatch):
     rows = RunFolder(path).read_csv("progress.csv")
     assert [row["reward"] for row in wandb.history] == [float(row["reward"]) for row in rows]
     assert all(row["fps"] > 0 for row in wandb.history)
-    assert wandb.began == [("k" * 16, CONFIG.seed)] * 2
+    identity = RunFolder(path).read_json("wandb.json")["id"]
+    assert wandb.began == [(identity, CONFIG.seed)] * 2
     assert not [*path.glob("events.out.tfevents.*")]
 
 

@@ -5,6 +5,7 @@ things that the resumed one says again: each log says below how it comes to have
 """
 
 import shutil
+import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, Protocol
@@ -59,7 +60,7 @@ class WeightsAndBiases:
         import wandb
 
         if not (folder.path / WANDB).exists():
-            folder.write_json(WANDB, {"id": wandb.util.generate_id(16)})
+            folder.write_json(WANDB, {"id": uuid.uuid4().hex[:16]})
         identity = folder.read_json(WANDB)["id"]
         for path in sorted(folder.path.glob(f"wandb/offline-run-*-{identity}")):
             shutil.rmtree(path)
