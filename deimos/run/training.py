@@ -46,9 +46,11 @@ def resolve_device(name: str) -> torch.device:
     if name == "cpu" or (name == "auto" and not count):
         return torch.device("cpu")
     index = int(name.partition(":")[2] or 0)
+    if not count:
+        raise RunError("There is no CUDA device here; use --device cpu.")
     if index >= count:
-        here = f"There are {count} CUDA devices here, cuda:0 first" if count else "There is no CUDA device here"
-        raise RunError(f"{here}; use --device {'cuda' if count else 'cpu'}.")
+        there = ", ".join(f"cuda:{number}" for number in range(count))
+        raise RunError(f"There is no CUDA device {index} here; there are: {there}.")
     return torch.device("cuda", index)
 
 
