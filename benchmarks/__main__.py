@@ -66,7 +66,7 @@ class BenchOptions:
     """Rounds that a ratio is the median of, at least 1."""
     threads: int = 0
     """CPU threads, at least 0; 0 takes one per core."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: str = "auto"
     """Where to measure; auto takes the GPU where there is one."""
     engine: EngineName = "auto"
     """Physics of the robots of ``table41``; auto is warp (mujoco-warp) on a GPU and native on a CPU."""

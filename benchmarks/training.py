@@ -42,7 +42,7 @@ def measure_training(
         warm_up: How often every world gets a goal before anything is timed, so that fear networks see both classes.
         beside_rsl_rl: Whether to time rsl_rl's own loop on the same environment too, if it is installed.
     """
-    config = replace(config, method=None, device="cuda" if device.type == "cuda" else "cpu")
+    config = replace(config, method=None, device=str(device))
     period = math.ceil(config.env.goal_period / config.ppo.num_steps)
     length = period if length is None else length
     trainers = {name: Trainer(replace(config, selector=selector), device) for name, selector in methods.items()}

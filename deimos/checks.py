@@ -2,6 +2,7 @@
 
 import math
 import numbers
+import re
 from collections.abc import Iterable
 
 
@@ -45,6 +46,12 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     choices = list(choices)
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got '{value}'.")
+
+
+def check_device(name: str, value: str) -> None:
+    """Raise ``ValueError`` unless ``value`` names a device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", value):
+        raise ValueError(f"{name} must be auto, cpu, cuda or cuda:N, got '{value}'.")
 
 
 def check_hidden(name: str, sizes: Iterable[int]) -> None:

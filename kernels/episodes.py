@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from .check import require
+from .lanes import split
 from .random import Purpose, uniform4
 from .structs import StructTable
 
@@ -78,7 +79,7 @@ def make_worlds(
         num_groups=num_groups, num_origins=0,
     )  # fmt: skip
     worlds.num_envs = num_envs
-    worlds.num_threads = 1 if wp.get_device(device).is_cpu else num_envs
+    worlds.num_threads = split(num_envs, wp.get_device(device))
     worlds.goal_period, worlds.time_limit, worlds.stagger = goal_period, time_limit, stagger
     worlds.seed, worlds.world_offset, worlds.goal_start = seed, world_offset, goal_start
     worlds.crash_penalty = crash_penalty

@@ -10,6 +10,7 @@ to 0 x inf on their sides. Here a box of no width asks the same search tree, whi
 import warp as wp
 
 from .check import require, require_axes
+from .lanes import split
 
 wp.set_module_options({"enable_backward": False})
 
@@ -103,8 +104,7 @@ def cast_rays(
     count = height.size - first if count is None else count
     if not 0 <= first <= first + count <= height.size:
         raise ValueError(f"first and count must stay within {height.size} samples, got {first} and {count}.")
-    # One thread on a CPU, where Warp copies the arguments anew for every thread.
-    num_threads = 1 if height.device.is_cpu else count
+    num_threads = split(count, height.device)
     wp.launch(
         _cast_rays,
         dim=num_threads,

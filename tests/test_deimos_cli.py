@@ -92,7 +92,7 @@ TRAIN_ERRORS = {
     "selector:plr --selector.fill 0": r"fill must be in \(0, 1\], got 0.0",
     "selector:learnability --selector.low 0.95": "low must be below high, got 0.95 and 0.9",
     "--device cuda": "There is no CUDA device here; use --device cpu",
-    "--device tpu": "'tpu' .*'auto', 'cpu', 'cuda'",
+    "--device tpu": "device must be auto, cpu, cuda or cuda:N, got 'tpu'",
     "--bogus 3": "Unrecognized options: --bogus",
     "bogus": "Unrecognized options: bogus",
     "--out there": "there exists and is not overwritten; choose another --out, or continue with --resume",
@@ -106,13 +106,14 @@ TRAIN_ERRORS = {
     "--init-from there": "there is not a run folder: it holds no config.json",
 }
 OTHER_ERRORS = {
-    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, pool, study, play, view, robot,",
+    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, pool, study, play, view, shield, export,",
     "--bogus": "There is no command '--bogus'",
     "evaluate": "Missing from deimos evaluate: .*Folder of the run",
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
     "evaluate there": "there is not a run folder: it holds no config.json",
     "bench": "There is no command 'bench'",
-    "study walk": "There is no command 'study walk'; there are: run, show, attack, pack, unpack, merge, export, report",
+    "study walk": "There is no command 'study walk'; there are: run, cell, show, attack, pack, unpack, merge, export, "
+    "report",
     "terrain walk": "There is no command 'terrain walk'; there are: list, shape, grid",
 }
 

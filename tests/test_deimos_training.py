@@ -554,7 +554,7 @@ CONFIGS = {
             ),
         ),
         evaluation=False, seed=2**32 - 1, num_envs=11, env_steps=13, critic_warmup=3, device="cpu",
-        threads=2,
+        threads=2, tf32=True, log=("wandb", "tensorboard"),
     ),
 }  # fmt: skip
 

@@ -25,7 +25,7 @@ PAGES = [
     *sorted(DOCS.glob("lab/*.md")),
 ]  # fmt: skip
 SUFFIXES = {".py", ".md", ".toml", ".json", ".csv", ".png", ".svg", ".webp"}
-FURTHER_PAGES = {"deploy.md", "director.md", "gallery.md", "integrations.md", "view.md"}
+FURTHER_PAGES = {"cluster.md", "deploy.md", "director.md", "gallery.md", "gpu.md", "integrations.md", "view.md"}
 """Those that the budget of all pages leaves out."""
 
 

@@ -67,6 +67,9 @@ ELSEWHERE = {
     r"python examples/\w+\.py$": "tests/test_examples.py",
     r"deimos shield ": "tests/test_deimos_shield.py, with policies that crash",
     r"deimos export docs/.* --check|python deploy/go1/|python examples/deploy/": "tests/test_deimos_export.py",
+    r"pip install 'deimos-rl\[|ray start |.* --engine ray": ".ci/check_ray.py; Ray is in no environment of the tests",
+    r"sbatch ": "tests/test_deimos_study_cluster.py, without Slurm",
+    r"deimos doctor --gpu |deimos train --device cuda": "tests/test_deimos_doctor.py, on a CPU",
     r"reproduction/freeze ": "tests/test_reproduction_studies.py, in a repository of its own",
 }
 """Commands that are run elsewhere, and where."""

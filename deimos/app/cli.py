@@ -30,6 +30,7 @@ COMMANDS = {
     "shield": ("deimos.app.shield", "calibrate a shield against goals that would crash a policy, and try it"),
     "export": ("deimos.app.export", "write a policy as ONNX, with all that a robot's controller needs"),
     "robot": ("deimos.app.robot", "check a robot of your own, and draft its file from an MJCF"),
+    "doctor": ("deimos.app.doctor", "say what this machine has, and what works on it"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }
 """By name: the module whose ``main`` is the command, imported when it is asked for, and a line about it."""
@@ -38,6 +39,7 @@ EXTRAS = {
     "warp": "sim", "tyro": "sim", "rich": "sim", "tensorboard": "sim", "matplotlib": "sim", "PIL": "legged",
     "mujoco": "legged", "mujoco_warp": "legged", "trimesh": "legged", "imageio_ffmpeg": "legged", "scipy": "study",
     "onnx": "export", "onnxruntime": "export", "yaml": "export",
+    "ray": "cluster", "wandb": "wandb",
 }  # fmt: skip
 """The extra of ``deimos-rl`` that installs a package."""
 

@@ -58,8 +58,8 @@ class EvaluateOptions:
     """Seed of the worlds and their goals. By default as the run was set up."""
     goal_period: int | None = None
     """T: steps that a goal is active. By default as in training."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to simulate; auto takes the GPU where there is one."""
+    device: str = "auto"
+    """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
     attackers: tuple[str, ...] | None = None
     """Attackers beside those that the run was set up with, by name: argmax-long, oracle, ..."""
     pool: Path | None = None

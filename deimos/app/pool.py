@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -30,8 +29,8 @@ class PoolOptions:
     """Worlds that each policy acts in."""
     adversary_steps: int = 1500
     """Steps of every world that are learnt from, of each policy."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to simulate; auto takes the GPU where there is one."""
+    device: str = "auto"
+    """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
 
     def __post_init__(self) -> None:
         if not self.runs:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Union
 
 import tyro
 
@@ -33,7 +33,7 @@ class ResumeOptions:
     """Folder of the run."""
     env_steps: int | None = None
     """A larger budget: steps of every world in all. By default the one that the run had."""
-    device: Literal["auto", "cpu", "cuda"] | None = None
+    device: str | None = None
     """Where to continue. By default where it was."""
 
 

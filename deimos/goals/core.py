@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deimos.goals.interactions import Interactions
+from deimos.goals.interactions import Interactions, assign
 from deimos.goals.selector import GoalSelector, Spaces, Transitions
 from deimos.nn.stateful import Stateful
 
@@ -91,7 +91,7 @@ class GoalCore(Stateful):
         ))  # fmt: skip
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])
-        self.percentile[changes.done] = 50.0
+        assign(self.percentile, changes.done, 50.0)
         return changes
 
     @torch.no_grad()
@@ -112,8 +112,8 @@ class GoalCore(Stateful):
             rows, state, goal, chosen.goal, chosen.score, self.goal_period if horizon is None else horizon,
             probe=chosen.probe, note=chosen.note,
         )  # fmt: skip
-        self.weight[rows] = 1.0 if chosen.weight is None else chosen.weight
-        self.percentile[rows] = torch.nan if chosen.percentile is None else chosen.percentile
+        assign(self.weight, rows, 1.0 if chosen.weight is None else chosen.weight)
+        assign(self.percentile, rows, torch.nan if chosen.percentile is None else chosen.percentile)
         return chosen.goal
 
     def learn(self, rollout: Transitions | None) -> dict[str, float]:

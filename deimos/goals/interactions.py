@@ -54,6 +54,17 @@ class Resolved:
         return Resolved(**{name: getattr(self, name)[mask] for name in self.__dataclass_fields__})
 
 
+def assign(tensor: Tensor, rows: Tensor, value: Tensor | float) -> None:
+    """Write a value into rows, int64, shape (m,): a number for all, or a tensor with a row for each.
+
+    ``tensor[rows] = number`` would copy the number from the host, which a GPU waits for.
+    """
+    if isinstance(value, Tensor):
+        tensor[rows] = value
+    else:
+        tensor.index_fill_(0, rows, value)
+
+
 class Interactions(Stateful):
     """One pending interaction per world, and the resolved ones of the last steps.
 
@@ -134,7 +145,7 @@ class Interactions(Stateful):
         self._ring[rows, slot] = torch.where(keep, self._pending[rows], self._ring[rows, slot])
         self._marks[rows, slot] = torch.where(keep, marks, self._marks[rows, slot])
         self._cursor[rows] = cursor + decided
-        self.active[rows] = False
+        assign(self.active, rows, False)
 
     @torch.no_grad()
     def open(
@@ -153,9 +164,9 @@ class Interactions(Stateful):
         if note is not None:
             rest[:, 1] = note
         self._pending[rows] = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1).float()
-        self.issued_at[rows] = self.now
-        self._horizon[rows] = horizon
-        self.active[rows] = True
+        assign(self.issued_at, rows, self.now)
+        assign(self._horizon, rows, horizon)
+        assign(self.active, rows, True)
 
     @torch.no_grad()
     def execute(self, rows: Tensor, goal: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Threads that share work, and how many torch uses beside them."""
+"""Threads that share work, how many torch uses beside them, and how precise its products are."""
 
 import os
 import threading
@@ -39,6 +39,17 @@ def torch_on_one() -> Iterator[None]:
     with on_threads(1):
         _shared.set(share)
         yield
+
+
+@contextmanager
+def tf32_products(allowed: bool) -> Iterator[None]:
+    """Let torch's float32 matrix products round their factors to TF32, or not, whatever the host has chosen."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else "highest")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 class _Worker(threading.Thread):

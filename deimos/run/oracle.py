@@ -15,6 +15,9 @@ from deimos.goals.fear import Fear
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.sim.env import Env
 
+MOST = {"cpu": 10_000, "cuda": 200_000}
+"""Clones at a time, by the type of the device."""
+
 
 @runtime_checkable
 class SeesWorlds(Protocol):
@@ -39,10 +42,11 @@ class Clones:
     Args:
         build: Makes worlds like those that are cloned, as many as it is told.
         act: The policy: observations (n, obs_dim) to actions (n, action_dim).
-        limit: Largest number of clones at a time; a decision gets as many as it has candidates in any case.
+        limit: Largest number of clones at a time; a decision gets as many as it has candidates in any case. ``None``
+            for ``MOST`` of the device: a GPU is idle with fewer, and a CPU's caches are full with more.
     """
 
-    def __init__(self, build: Callable[[int], Env], act: Callable[[Tensor], Tensor], limit: int = 10_000) -> None:
+    def __init__(self, build: Callable[[int], Env], act: Callable[[Tensor], Tensor], limit: int | None = None) -> None:
         self.act = act
         self._build, self._limit = build, limit
         self._sets: dict[int, Env] = {}
@@ -59,7 +63,7 @@ class Clones:
         Returns:
             Steps survived, int64 in [0, T], shape (B, N): T where the policy did not crash.
         """
-        size = max(1, self._limit // candidates.shape[1])
+        size = max(1, (self._limit or MOST[env.device.type]) // candidates.shape[1])
         parts = zip(rows.split(size), candidates.split(size), strict=True)
         return torch.cat([self._try_some(env, part, goals) for part, goals in parts])
 

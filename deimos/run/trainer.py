@@ -2,20 +2,20 @@
 
 import time
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_range, one_line
+from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_device, check_range, one_line
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn.host import own_settings
 from deimos.nn.layout import seen_by
-from deimos.nn.threads import torch_on_one
+from deimos.nn.threads import tf32_products, torch_on_one
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
+from deimos.run.logs import LOGS
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones, SeesWorlds
 from deimos.sim.env import EnvConfig
@@ -47,10 +47,16 @@ class TrainConfig:
     """Parallel worlds, at least 1."""
     env_steps: int = 2000
     """Steps of every world, at least 1; rounded up to whole rollouts."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to simulate and learn; auto takes the GPU where there is one."""
+    device: str = "auto"
+    """Where to simulate and learn: cpu, cuda, or cuda:N for one of several GPUs; auto takes the GPU where there is
+    one."""
+    tf32: bool = False
+    """Whether a GPU may round the factors of float32 matrix products to 10 bits of mantissa (TF32), which is faster
+    for large networks. CPUs never do."""
     threads: int = 0
     """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
+    log: tuple[str, ...] = ("tensorboard",)
+    """Where its numbers are shown while it trains: tensorboard, wandb (Weights & Biases), both or nowhere."""
     critic_warmup: int = 0
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 
@@ -59,7 +65,9 @@ class TrainConfig:
         check_at_least("env_steps", self.env_steps, 1)
         check_at_least("critic_warmup", self.critic_warmup, 0)
         check_range("threads", self.threads, 0, MOST_THREADS)
-        check_choice("device", self.device, ["auto", "cpu", "cuda"])
+        check_device("device", self.device)
+        for name in self.log:
+            check_choice("log", name, LOGS)
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
         if self.method is not None and self.selector is not None:
@@ -150,6 +158,11 @@ class Trainer:
         Raises:
             SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
         """
+        with tf32_products(self.config.tf32 and self.env.device.type == "cuda"):
+            return self._iterate()
+
+    def _iterate(self) -> dict[str, float]:
+        """See ``iterate``."""
         try:
             self.collect()
             self.iteration += 1

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from deimos import __version__
-from deimos.checks import RunError, one_line
+from deimos.checks import RunError, check_device, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run import memory
@@ -23,7 +23,9 @@ from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
 from deimos.run.failure import check_finite, dumped
 from deimos.run.folder import RunFolder
+from deimos.run.logs import open_logs
 from deimos.run.trainer import TrainConfig, Trainer
+from deimos.sim.shared import find_cuda
 
 SCHEMA = 1  # of config.json
 CHECKPOINT_SCHEMA = 3  # of checkpoint.pt; of earlier ones the networks can be loaded, but not the rest
@@ -31,14 +33,25 @@ CHECKPOINT_SECONDS = 30.0
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of a name.
+    """The device of a name: auto, cpu, cuda (the first one) or cuda:N.
 
     Raises:
-        RunError: If CUDA is asked for and there is none.
+        RunError: If it names none, if there is no such device, or if torch sees a CUDA device and Warp does not.
     """
-    if name == "cuda" and not torch.cuda.is_available():
+    try:
+        check_device("device", name)
+    except ValueError as error:
+        raise RunError(str(error)) from error
+    count = 0 if name == "cpu" else find_cuda()
+    if name == "cpu" or (name == "auto" and not count):
+        return torch.device("cpu")
+    index = int(name.partition(":")[2] or 0)
+    if not count:
         raise RunError("There is no CUDA device here; use --device cpu.")
-    return torch.device("cuda", 0) if name != "cpu" and torch.cuda.is_available() else torch.device("cpu")
+    if index >= count:
+        there = ", ".join(f"cuda:{number}" for number in range(count))
+        raise RunError(f"There is no CUDA device {index} here; there are: {there}.")
+    return torch.device("cuda", index)
 
 
 def provenance() -> dict[str, str]:
@@ -83,7 +96,7 @@ def start(
     config = with_plain_numbers(config)
     config = replace(
         config, env=config.env.resolved(device), threads=config.threads or cores(),
-        device="cuda" if device.type == "cuda" else "cpu",
+        device=str(device),
     )  # fmt: skip
     torch.set_num_threads(config.threads)
     trainer = build(config, device)
@@ -206,7 +219,7 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
                 raise RunError(f"--env-steps must exceed the {config.env_steps} already set, got {env_steps}.")
             config = replace(config, env_steps=env_steps)
         if device is not None:
-            config = replace(config, device="cuda" if resolve_device(device).type == "cuda" else "cpu")
+            config = replace(config, device=str(resolve_device(device)))
         trainer = load(folder, config)
         stored = folder.read_json("config.json")  # whose files keep the names that they were given by
         stored["config"] |= {"env_steps": config.env_steps, "device": config.device}
@@ -277,11 +290,9 @@ def _iterate(
     trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None], stopped: Callable[[], bool]
 ) -> bool:
     """See ``train``."""
-    from torch.utils.tensorboard import SummaryWriter
-
     transitions = trainer.rollout.reward.numel()
     saved = time.monotonic()
-    with SummaryWriter(str(folder.path), purge_step=trainer.iteration + 1) as board:
+    with open_logs(trainer.config.log, folder, to_dict(trainer.config), trainer.iteration) as logs:
         while trainer.iteration < trainer.config.iterations:
             before = dict(trainer.seconds)
             begin = time.perf_counter()
@@ -290,13 +301,12 @@ def _iterate(
             folder.append_csv("progress.csv", row)
             spent = {name: seconds - before[name] for name, seconds in trainer.seconds.items()}
             folder.append_csv("timing.csv", {"iteration": trainer.iteration, "fps": fps, **spent})
-            for name, value in row.items():
-                board.add_scalar(name, value, trainer.iteration)
-            board.add_scalar("fps", fps, trainer.iteration)
+            logs.write(trainer.iteration, row | {"fps": fps})
             report(row, fps)
             if stopped():
                 break
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                logs.flush()  # first: what a resumed run does not say again must be there
                 save(trainer, folder)
                 saved = time.monotonic()
     save(trainer, folder)

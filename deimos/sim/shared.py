@@ -1,11 +1,14 @@
 """One block of memory, seen by Warp and by torch."""
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 import warp as wp
+
+from deimos.checks import RunError
 
 
 @dataclass(frozen=True)
@@ -36,12 +39,47 @@ def warp_device(device: torch.device) -> str:
 def one_stream(device: torch.device) -> Iterator[None]:
     """Run torch and Warp on one explicit CUDA stream, so that neither has to wait for the other.
 
-    Enter it before anything is built on the device. On the CPU it does nothing. The stream is Warp's: torch's own do
-    not wait for the default stream, on which Warp frees memory that may still be in use.
+    Enter it before anything is built on the device, and around every step. On the CPU it does nothing. It is the same
+    stream every time, since torch keeps freed memory for the stream that has used it; and it is Warp's, since torch's
+    own do not wait for the default stream, on which Warp frees memory that may still be in use.
     """
     if device.type == "cpu":
         yield
         return
-    stream = wp.Stream(warp_device(device))
+    stream = _stream(warp_device(device))
     with wp.ScopedStream(stream), torch.cuda.stream(wp.stream_to_torch(stream)):
         yield
+
+
+@functools.cache
+def _stream(device: str) -> wp.Stream:
+    wp.init()  # a stream does not do it by itself
+    return wp.Stream(device)
+
+
+def check_stream(device: torch.device) -> None:
+    """Raise ``RunError`` unless torch and Warp work on the same CUDA stream: they share memory and do not wait."""
+    if device.type == "cpu":
+        return
+    torchs, warps = torch.cuda.current_stream(device).cuda_stream, wp.get_stream(warp_device(device)).cuda_stream
+    if torchs != warps:
+        raise RunError(
+            f"torch works on CUDA stream {torchs:#x} and Warp on {warps:#x}, and neither waits for the other; build "
+            f"and step environments within `with deimos.sim.shared.one_stream(torch.device('{device}')):`."
+        )
+
+
+def find_cuda() -> int:
+    """How many CUDA devices torch and Warp both see.
+
+    Raises:
+        RunError: If torch sees one and Warp does not, which simulates.
+    """
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if count and not wp.get_cuda_device_count():
+        raise RunError(
+            f"torch {torch.__version__} sees a CUDA device and Warp {wp.config.version} does not: PyPI's Warp needs an "
+            f"NVIDIA driver R580 or newer; update the driver, install the +cu12 wheel of Warp from its releases on "
+            f"GitHub, or use --device cpu."
+        )
+    return count

@@ -14,7 +14,7 @@ from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.kernels.structs import StructTable
 from deimos.sim.env import Env, EnvConfig, ObsField, Step
-from deimos.sim.shared import Shared, warp_device
+from deimos.sim.shared import Shared, check_stream, warp_device
 
 MAX_INVALID_SHARE = 1e-3  # of all world-steps; more of them stop the run
 GUARD = 64  # rows behind the observations, which take what a kernel writes beyond the last one
@@ -58,6 +58,7 @@ class WarpEnv(Env):
         layout: Sequence[ObsField], goal_range: Sequence[float], action_dim: int, action_bound: float = math.inf,
         dt: float = 1.0, time_limit: int = 0, stagger: bool = False,
     ) -> None:  # fmt: skip
+        check_stream(device)
         self.config = config
         self.num_envs, self.device = num_envs, device
         self._seed, self._offset = seed, env_offset
@@ -160,6 +161,7 @@ class WarpEnv(Env):
         if action.shape != self.action.tensor.shape:
             expected = tuple(self.action.tensor.shape)
             raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
+        check_stream(self.device)
         self.action.tensor.copy_(action.detach())
         self.launch_step()
         self._steps_in_window += 1
@@ -168,6 +170,7 @@ class WarpEnv(Env):
     @final
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""
+        check_stream(self.device)
         self._views["mask"].copy_(mask)
         share = 1.0 if goal_scale is None else goal_scale.detach()
         torch.mul(self.goal_range, share, out=self._views["first_range"])

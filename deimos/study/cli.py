@@ -17,7 +17,8 @@ from rich.table import Table
 
 from deimos.checks import RunError, check_at_least
 from deimos.study import archive, factors, plan
-from deimos.study.engine import LocalProcesses
+from deimos.study import cell as worker
+from deimos.study.engine import Engine, LocalProcesses
 from deimos.study.estimate import estimate
 from deimos.study.folder import StudyFolder
 from deimos.study.results import check_comparable, identity, merge
@@ -34,7 +35,54 @@ class _FolderOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(_FolderOptions):
+class _WorkOptions(_FolderOptions):
+    """What works on the cells."""
+
+    engine: Literal["local", "ray"] = "local"
+    """What works on the cells: processes of this machine, or the machines of a Ray cluster (docs/cluster.md)."""
+    workers: int | None = None
+    """Cells at a time, at least 1. By default 1, and with ray as many as its cluster has room for."""
+    gpus: float | None = None
+    """GPUs of a cell with ray, at least 0; 0.25 puts four on one. By default 1 for cells whose device is cuda."""
+    allow_uncommitted: bool = False
+    """Whether sources may differ from the commit that is checked out; a hash of them stands for it then."""
+
+    def __post_init__(self) -> None:
+        if self.workers is not None:
+            check_at_least("workers", self.workers, 1)
+        if self.gpus is not None and not self.gpus >= 0.0:
+            raise ValueError(f"gpus must be at least 0, got {self.gpus}.")
+        if self.gpus is not None and self.engine != "ray":
+            raise ValueError("gpus are given to cells by a Ray cluster; add --engine ray.")
+
+    def _work(
+        self, study: StudyFolder, stopped: Callable[[], bool], report: Callable[[str, float], None]
+    ) -> None:  # fmt: skip
+        """Work on a study until it is finished; see ``RunOptions.run``."""
+        engine: Engine = LocalProcesses(study)
+        workers = self.workers or 1
+        if self.engine == "ray":
+            from deimos.study.on_ray import OnRay
+
+            engine = cluster = OnRay(study, self.gpus)
+            workers = self.workers or cluster.room(study.cells())
+        end = Runner(study, engine, workers).run(lambda progress: report(_summary(progress), _share(progress)), stopped)
+        if end.finished + len(end.failed) < end.total:
+            print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
+                  f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
+            raise SystemExit(130)
+        if end.failed:
+            name, error = next(iter(end.failed.items()))
+            raise RunError(
+                f"{len(end.failed)} of {end.total} cells failed, {name} first: {error}. See log.txt in their folders; "
+                f"--retry-failed tries them again."
+            )
+        print(study.path)
+        print(f"Next: deimos study report {study.path}", file=sys.stderr)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(_WorkOptions):
     """Train and evaluate every cell of a study that is not finished yet.
 
     One process works on a folder at a time.
@@ -52,21 +100,17 @@ class RunOptions(_FolderOptions):
     """Parallel worlds of the training, in place of the file's."""
     env_steps: int | None = None
     """Steps of every world, in place of the file's."""
-    device: Literal["auto", "cpu", "cuda"] | None = None
+    device: str | None = None
     """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
     """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell."""
-    workers: int = 1
-    """Parallel runs, at least 1."""
     retry_failed: bool = False
     """Whether to try the cells again that were given up."""
-    allow_uncommitted: bool = False
-    """Whether sources may differ from the commit that is checked out; a hash of them stands for it then."""
     estimate: bool = False
     """Whether to print what the study takes, and start nothing."""
 
     def __post_init__(self) -> None:
-        check_at_least("workers", self.workers, 1)
+        super().__post_init__()
         changes = ("seeds", "methods", "environments", "num_envs", "env_steps", "device", "threads")
         given = [name for name in changes if getattr(self, name) is not None]
         if given and self.file is None:
@@ -100,7 +144,7 @@ class RunOptions(_FolderOptions):
         if open_:
             print(estimate(study, open_), file=sys.stderr, flush=True)
         if not self.estimate:
-            _work(study, self.workers, stopped, report)
+            self._work(study, stopped, report)
 
     def _add(self, study: StudyFolder, description: dict) -> None:
         """Add what a file describes to a study, after all that can be wrong with it was checked."""
@@ -150,27 +194,8 @@ def _open(study: StudyFolder) -> list[plan.Cell]:
     return left
 
 
-def _work(study: StudyFolder, workers: int, stopped: Callable[[], bool], report: Callable[[str, float], None]) -> None:
-    """Work on a study until it is finished; see ``RunOptions.run``."""
-    end = Runner(study, LocalProcesses(study), workers).run(
-        lambda progress: report(_summary(progress), _share(progress)), stopped
-    )
-    if end.finished + len(end.failed) < end.total:
-        print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
-              f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
-        raise SystemExit(130)
-    if end.failed:
-        name, error = next(iter(end.failed.items()))
-        raise RunError(
-            f"{len(end.failed)} of {end.total} cells failed, {name} first: {error}. See log.txt in their folders; "
-            f"--retry-failed tries them again."
-        )
-    print(study.path)
-    print(f"Next: deimos study report {study.path}", file=sys.stderr)
-
-
 @dataclass(frozen=True, kw_only=True)
-class AttackOptions(_FolderOptions):
+class AttackOptions(_WorkOptions):
     """Evaluate the policies of a finished study under further attackers.
 
     What was killed continues when the command is given again, or by ``run``. Policies that are not in the folder any
@@ -181,13 +206,9 @@ class AttackOptions(_FolderOptions):
     """Names of the attackers."""
     seeds: str | None = None
     """Seeds of the policies that meet them. By default all."""
-    workers: int = 1
-    """Policies at a time, at least 1."""
-    allow_uncommitted: bool = False
-    """Whether sources may differ from the commit that is checked out; a hash of them stands for it then."""
 
     def __post_init__(self) -> None:
-        check_at_least("workers", self.workers, 1)
+        super().__post_init__()
         self._round()
 
     def _round(self) -> plan.AttackRound:
@@ -216,7 +237,43 @@ class AttackOptions(_FolderOptions):
             print(f"{len(lost)} policies of the tables are lost and stay as they are.", file=sys.stderr)
         _check_committed(self.allow_uncommitted)
         study.add_rounds([self._round()])
-        _work(study, self.workers, stopped, report)
+        self._work(study, stopped, report)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellOptions(_FolderOptions):
+    """Train and evaluate one cell of a study, by its number: a task of a Slurm array (docs/cluster.md).
+
+    Any number of these work on a study at a time, wherever its folder is seen.
+    """
+
+    number: tyro.conf.Positional[int]
+    """Number of the cell, from 0; cells are ordered by seed, then by name."""
+
+    def run(
+        self,
+        stopped: Callable[[], bool] = lambda: False,
+        report: Callable[[str, float], None] = lambda said, share: None,
+    ) -> None:
+        """Work on the cell from wherever it stands; one that is finished stays as it is.
+
+        For the arguments see ``RunOptions.run``.
+
+        Raises:
+            RunError: If there is no such cell, or it cannot be worked on; see ``deimos.study.cell.run``.
+            SimulationError: If a number is not finite.
+            SystemExit: With 130, if it was stopped before the end.
+        """
+        study = StudyFolder(self.folder)
+        cells = study.cells()
+        if not 0 <= self.number < len(cells):
+            raise RunError(f"number must be in [0, {len(cells)}), the cells of {study.path}; got {self.number}.")
+        cell = cells[self.number]
+        report(cell.name, 0.0)
+        if not study.finished([cell]) and not worker.run(study, cell, stopped):
+            print(f"{cell.name} was stopped and can be continued.", file=sys.stderr)
+            raise SystemExit(130)
+        print(study.cell_path(cell))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,12 +384,12 @@ class ReportOptions:
 
 
 COMMANDS: dict[str, Any] = {
-    "run": RunOptions, "show": ShowOptions, "attack": AttackOptions, "pack": PackOptions, "unpack": UnpackOptions,
-    "merge": MergeOptions, "export": ExportOptions, "report": ReportOptions,
+    "run": RunOptions, "cell": CellOptions, "show": ShowOptions, "attack": AttackOptions, "pack": PackOptions,
+    "unpack": UnpackOptions, "merge": MergeOptions, "export": ExportOptions, "report": ReportOptions,
 }  # fmt: skip
 """The options of every command, whose ``run`` does it; those of ``LONG`` take what says when to stop and what shows
 progress."""
-LONG = (RunOptions, AttackOptions)
+LONG = (RunOptions, CellOptions, AttackOptions)
 
 
 def _share(progress: Progress) -> float:

@@ -7,6 +7,7 @@ the largest of these sums over the substeps is the part's force.
 
 import warp as wp
 
+from ..lanes import split
 from ..structs import StructTable
 
 wp.set_module_options({"enable_backward": False})
@@ -105,5 +106,5 @@ def gather_contacts(contacts: Contacts, *, substep: int) -> None:
     if not 0 <= substep < substeps:
         raise ValueError(f"substep must be in [0, {substeps}), got {substep}.")
     device = contacts.world.device
-    num_threads = 1 if device.is_cpu else max(1, contacts.world.shape[0])
+    num_threads = split(max(1, contacts.world.shape[0]), device)
     wp.launch(_gather_contacts, dim=num_threads, inputs=[substep, num_threads], outputs=[contacts], device=device)

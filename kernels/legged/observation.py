@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..episodes import Worlds, write_goal
+from ..lanes import is_serial
 from ..random import Purpose, uniform4
 from ..rotations import down_in_body, heading, rotate_by_heading, rotate_inverse
 from .height_scan import sample_minimum
@@ -119,5 +120,5 @@ def finish_obs(legged: LeggedWorlds, mask: wp.array, *, wanted: bool) -> None:
         wanted: Value of ``mask`` where to write.
     """
     n, obs_dim = legged.worlds.obs.shape
-    threads = (1, 1) if mask.device.is_cpu else (n, (obs_dim + 3) // 4)
+    threads = (1, 1) if is_serial(mask.device) else (n, (obs_dim + 3) // 4)
     legged.launch(_finish_obs, threads, legged.ground, legged.sensing, legged.sim, mask, wanted, *threads)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from deimos.checks import check_range
 from deimos.goals import picks
-from deimos.goals.interactions import Interactions, Resolved
+from deimos.goals.interactions import Interactions, Resolved, assign
 from deimos.goals.selector import Proposal, Spaces
 from deimos.goals.selectors import director
 
@@ -56,7 +56,7 @@ class QFear(director.Director):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
-        self._worst[rows] = torch.nan
+        assign(self._worst, rows, torch.nan)
         if self.fear.fitted:
             worst = picks.take(candidates, self.score(state, goal, candidates).argmax(1))
             self._worst[rows] = torch.cat([self._seen(state), goal, worst], dim=1).float()

@@ -47,6 +47,9 @@ class PhysicsConfig:
     rows: int = 0
     """Buffer size for constraint rows in each world; 0 takes what touching with every geom, all joints at limits,
     needs, four fifths of it on a height field. Of mujoco-warp, as above."""
+    deterministic: bool = False
+    """Whether contacts and sums come in the same order every time on a GPU too, as exact resumes and clones there need;
+    it takes time. Of mujoco-warp; on a CPU everything always does."""
 
     def __post_init__(self) -> None:
         check_positive("timestep", self.timestep, finite=True)

@@ -44,6 +44,9 @@ class Engine(Physics):
         with wp.ScopedDevice(warp_device(device)):
             self._model = mjw.put_model(model, batch_sizes=batched)
             self._model.opt.warn_overflow = 0  # reported by ``overflow``, not by printing
+            self._model.opt.deterministic = mjw.DeterminismType.ALL if config.deterministic else 0
+            if device.type == "cuda":
+                self._model.opt.graph_conditional = wp.is_conditional_graph_supported()
             self._data = mjw.make_data(model, num_envs, naconmax=self.max_contacts, njmax=self.max_rows)
             if friction is not None:
                 self._set_friction(model, robot, friction)

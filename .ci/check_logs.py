@@ -1,0 +1,82 @@
+"""Weights & Biases itself, offline: `python .ci/check_logs.py` (extra wandb).
+
+A run is killed some iterations after its last checkpoint and resumed; the files that `wandb sync` would send hold every
+iteration once, with the numbers of progress.csv.
+"""
+
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from wandb.proto.wandb_internal_pb2 import Record
+
+from deimos.run import training
+from deimos.run.folder import RunFolder
+
+SAVED, KILLED, END = 3, 6, 9  # iterations of the last checkpoint, of the kill and in all
+RUN = f"""
+import os, signal, sys
+from pathlib import Path
+from deimos.run import training
+from deimos.run.trainer import TrainConfig
+
+training.CHECKPOINT_SECONDS = -1.0
+def report(row, fps):
+    if row["iteration"] > {SAVED}:
+        training.CHECKPOINT_SECONDS = 1e9
+    if row["iteration"] == {KILLED}:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+config = TrainConfig(num_envs=16, env_steps={24 * END}, device="cpu", threads=1, evaluation=False, log=("wandb",))
+training.train(*training.start(config, Path(sys.argv[1])), report)
+"""
+BLOCK, HEADER = 32768, 7  # of LevelDB's log format, in which wandb keeps its records
+
+
+def records(path: Path) -> Iterator[Record]:
+    """The records of a file of wandb's."""
+    data = path.read_bytes()
+    place, parts = HEADER, b""  # its own header is as long
+    while place + HEADER <= len(data):
+        if BLOCK - place % BLOCK < HEADER:  # the rest of a block is padding
+            place += BLOCK - place % BLOCK
+            continue
+        _, size, kind = struct.unpack("<IHB", data[place : place + HEADER])
+        parts += data[place + HEADER : place + HEADER + size]
+        place += HEADER + size
+        if kind in (1, 4):  # a whole record, or the last part of one
+            yield Record.FromString(parts)
+            parts = b""
+
+
+def main() -> None:
+    """Run the check; ends with an error if something does not hold."""
+    os.environ["WANDB_MODE"] = "offline"
+    with tempfile.TemporaryDirectory() as home:
+        path = Path(home) / "run"
+        killed = subprocess.run([sys.executable, "-c", RUN, str(path)])
+        assert killed.returncode == -signal.SIGKILL, killed
+        trainer, folder = training.resume(path)
+        assert trainer.iteration == SAVED
+        assert training.train(trainer, folder)
+        files = sorted(path.glob("wandb/offline-run-*/run-*.wandb"))
+        assert len(files) == 1, files
+        history = [record.history for record in records(files[0]) if record.HasField("history")]
+        steps = [each.step.num for each in history]
+        assert steps == [*range(1, END + 1)], steps
+        rewards = [
+            json.loads(item.value_json) for each in history for item in each.item
+            if "reward" in (item.key, *item.nested_key)
+        ]  # fmt: skip
+        assert rewards == [float(row["reward"]) for row in RunFolder(path).read_csv("progress.csv")], rewards
+    print(f"Weights & Biases has the iterations 1 to {END} once each, after a kill and a resume.")
+
+
+if __name__ == "__main__":
+    main()

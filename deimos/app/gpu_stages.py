@@ -1,0 +1,359 @@
+"""What the first minutes on a GPU are for: stages, each of which finds out one thing and says it as JSON types.
+
+``python -m deimos.app.gpu_stages NAME DEVICE FILE`` runs one and writes what it found; ``deimos doctor --gpu`` runs
+all, each in such a process, since a kernel that fails takes its process with it. On a CPU the same stages run at
+``SMALL`` sizes.
+"""
+
+import gc
+import importlib.metadata
+import importlib.util
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from deimos.run import training
+from deimos.run.config import to_dict
+from deimos.run.folder import RunFolder
+from deimos.run.presets import preset
+from deimos.run.trainer import TrainConfig, Trainer
+from deimos.sim.env import Env
+from deimos.sim.envs import particle
+from deimos.sim.legged import engines
+from deimos.sim.legged.config import LocomotionConfig
+from deimos.sim.legged.engines.captured import Captured
+from deimos.sim.legged.robots import go1
+from deimos.sim.shared import one_stream, warp_device
+
+HOME = Path(__file__).resolve().parents[2]
+TESTS = ("test_kernels_*.py", "test_deimos_env_particle.py", "test_deimos_interactions.py", "test_deimos_goal_loop.py")
+TOLERANCE = 1e-3  # of observations, CPU against GPU, after the steps below; products and sums round differently
+STEPS = 50
+EAGER_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much a stage does."""
+
+    worlds: int
+    """Particles."""
+    iterations: int
+    """Of a training that is looked at."""
+    scales: tuple[int, ...]
+    """Numbers of particles whose speed is compared."""
+    robots: int
+    """On flat ground."""
+    rough: int
+    """Robots on rough ground."""
+    steps: int
+    """Of robots under random actions."""
+
+
+FULL = Sizes(worlds=2000, iterations=84, scales=(2_000, 16_000, 65_000, 262_000), robots=4096, rough=1024, steps=200)
+SMALL = Sizes(worlds=64, iterations=3, scales=(16, 64), robots=8, rough=4, steps=5)
+
+
+class Skipped(Exception):
+    """A stage has nothing to find out here; the message says why."""
+
+
+def versions(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Versions, driver, memory pools, conditional graphs, and whether torch and Warp are on the same stream."""
+    found: dict[str, Any] = {**training.provenance(), "torch is built for CUDA": torch.version.cuda, "driver": driver()}
+    for name in ("mujoco", "mujoco-warp"):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    if device.type == "cuda":
+        warps = wp.get_device(warp_device(device))
+        properties = torch.cuda.get_device_properties(device)
+        torchs = torch.cuda.current_stream(device).cuda_stream
+        found |= {
+            "device": properties.name, "memory [B]": properties.total_memory, "sm": warps.arch,
+            "memory pools": wp.is_mempool_enabled(warps), "conditional graphs": wp.is_conditional_graph_supported(),
+            "one stream": torchs == wp.get_stream(warps).cuda_stream,
+        }  # fmt: skip
+    return found
+
+
+def driver() -> str | None:
+    """What ``nvidia-smi`` says of GPUs and driver, one line for each; ``None`` where there is no such program."""
+    if shutil.which("nvidia-smi") is None:
+        return None
+    asked = ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"]
+    done = subprocess.run(asked, capture_output=True, text=True)
+    return (done.stdout or done.stderr).strip()
+
+
+def tests(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """The tests of kernels, particles, interactions and the goal loop that run on a GPU."""
+    if device.type != "cuda":
+        raise Skipped("these are the suite's own tests; on a CPU run pytest")
+    if not (HOME / "tests").is_dir() or importlib.util.find_spec("pytest") is None:
+        raise Skipped("it needs a checkout, and pytest: pip install -e '.[all,test]'")
+    files = [str(path) for pattern in TESTS for path in sorted((HOME / "tests").glob(pattern))]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n", "0", "-k", "cuda", *files],
+        cwd=HOME,
+        capture_output=True,
+        text=True,
+    )
+    lines = done.stdout.strip().splitlines()
+    return {
+        "passed": done.returncode == 0,
+        "summary": lines[-1:],
+        "failed": [x for x in lines if x.startswith("FAILED")],
+    }
+
+
+def waits(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Where three iterations under the Director wait for the GPU, and how often: one count in a step is expected."""
+    if device.type != "cuda":
+        raise Skipped("only CUDA says where it waits")
+    trainer = _particles(device, sizes.worlds)
+    for _ in range(5):
+        trainer.iterate()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        for _ in range(3):
+            trainer.iterate()
+        torch.cuda.set_sync_debug_mode("default")
+    places = Counter(f"{Path(each.filename).name}:{each.lineno}" for each in said)
+    return {"waits in an iteration": len(said) / 3, "places": dict(places.most_common())}
+
+
+def agreement(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Candidates and draws of the device have the CPU's bits; steps agree with the CPU's, and repeat bit for bit."""
+    cpu, first, second = (_play_particles(where, sizes.worlds) for where in (torch.device("cpu"), device, device))
+    largest = max(float((a - b).abs().max()) for a, b in zip(cpu["obs"], first["obs"], strict=True))
+    same = {name: all(map(torch.equal, cpu[name], first[name])) for name in ("candidates", "draws")}
+    repeats = all(all(map(torch.equal, first[name], second[name])) for name in first)
+    return {
+        **{f"{name} have the CPU's bits": equal for name, equal in same.items()}, "largest difference": largest,
+        "repeats bit for bit": repeats, "passed": all(same.values()) and repeats and largest <= TOLERANCE,
+    }  # fmt: skip
+
+
+def _play_particles(device: torch.device, worlds: int) -> dict[str, list[Tensor]]:
+    """What particles see under scripted actions, and the candidates and draws of every step, on the CPU."""
+    found: dict[str, list[Tensor]] = {"obs": [], "candidates": [], "draws": []}
+    with one_stream(device):
+        env = particle.Config(goal_period=10).build(worlds, device, seed=1)
+        rows = torch.arange(worlds, device=device)
+        for step in range(STEPS):
+            bound = min(env.action_bound, 1.0)
+            action = bound * torch.cos(torch.arange(worlds * env.action_dim, device=device) + step)
+            env.step(action.view(worlds, -1))
+            found["candidates"].append(env.sample_goals(rows, 100).cpu())
+            found["draws"].append(env.draw(rows).cpu())
+            env.set_goals(rows, env.sample_goals(rows, 1)[:, 0])
+            found["obs"].append(env.obs.cpu())
+    return found
+
+
+def learning(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Training under Uniform and the Director: curves to lay beside a CPU's, speed, where time goes."""
+    found: dict[str, Any] = {}
+    for name in ("uniform", "p25"):
+        trainer = _particles(device, sizes.worlds, name)
+        rows, seconds = [], []
+        for _ in range(sizes.iterations):
+            begin = time.perf_counter()
+            rows.append(trainer.iterate())
+            seconds.append(_since(begin, device))
+        curves = {key: [row[key] for row in rows] for key in ("reward", "crashes_per_1000")}
+        fps = trainer.rollout.reward.numel() / statistics.median(seconds)
+        trainer.synchronise = True
+        before = dict(trainer.seconds)
+        trainer.iterate()
+        parts = {part: value - before[part] for part, value in trainer.seconds.items()}
+        found[name] = {"FPS": fps, "parts of an iteration [s]": parts, **curves}
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    if device.type == "cuda":
+        activities.append(torch.profiler.ProfilerActivity.CUDA)
+    with torch.profiler.profile(activities=activities) as profile:
+        trainer.iterate()
+    calls = sorted(profile.key_averages(), key=lambda each: each.count, reverse=True)[:20]
+    return found | {"most frequent calls of an iteration": {each.key: each.count for each in calls}}
+
+
+def scales(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Speed and memory of more and more particles."""
+    found = {}
+    for worlds in sizes.scales:
+        trainer = _particles(device, worlds)
+        trainer.iterate()
+        seconds = []
+        for _ in range(3):
+            begin = time.perf_counter()
+            trainer.iterate()
+            seconds.append(_since(begin, device))
+        found[str(worlds)] = {"FPS": trainer.rollout.reward.numel() / statistics.median(seconds)} | _memory(device)
+        del trainer
+    return found
+
+
+def resuming(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """A run goes from the CPU to the device and back, and loses no iteration."""
+    config = replace(_config(sizes.worlds), device="cpu", env_steps=2 * 24)
+    with tempfile.TemporaryDirectory() as home:
+        path = Path(home) / "run"
+        training.train(*training.start(config, path))
+        for steps, where in ((4 * 24, str(device)), (6 * 24, "cpu")):
+            with one_stream(training.resolve_device(where)):
+                training.train(*training.resume(path, steps, where))
+        rows = RunFolder(path).read_csv("progress.csv")
+    iterations = [int(row["iteration"]) for row in rows]
+    return {"iterations": iterations, "passed": iterations == [*range(1, 7)]}
+
+
+def flat(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Robots on flat ground: the graph against the same launches one by one, random actions, training, memory."""
+    found: dict[str, Any] = {}
+    if device.type == "cuda":
+        found["graph against eager"] = _graph_against_eager(device)
+    config = preset("quad")
+    begin = time.perf_counter()
+    env = config.env.build(sizes.robots, device, seed=0)
+    found["build [s]"] = _since(begin, device)
+    found |= _walk_at_random(env, sizes.steps)
+    del env
+    for name, tf32 in (("float32", False), ("TF32", True)):
+        larger = replace(config, num_envs=sizes.robots, tf32=tf32, evaluation=False, method="p25")
+        trainer = Trainer(replace(larger, ppo=replace(config.ppo, hidden=(512, 256, 128))), device)
+        seconds = []
+        for _ in range(4):
+            begin = time.perf_counter()
+            trainer.iterate()
+            seconds.append(_since(begin, device))
+        fps = trainer.rollout.reward.numel() / statistics.median(seconds[1:])
+        found[name] = {"iterations [s]": seconds, "FPS": fps} | _memory(device)
+        del trainer
+    return found
+
+
+def _graph_against_eager(device: torch.device) -> dict[str, Any]:
+    """How far robots are apart after some control steps of a graph and of the same launches."""
+    states = []
+    for captured in (True, False):
+        physics = engines.build("warp", go1.build(), None, 64, device, engines.PhysicsConfig(deterministic=True))
+        step = Captured(physics.step, device) if captured else physics.step
+        if captured:  # what capturing has done is undone
+            physics.reset(wp.ones(64, dtype=wp.bool, device=warp_device(device)))
+        for _ in range(EAGER_STEPS):
+            step()
+        states.append(physics.tensors["qpos"].clone())
+    largest = float((states[0] - states[1]).abs().max())
+    return {"largest difference": largest, "passed": largest <= TOLERANCE}
+
+
+def _walk_at_random(env: Env, steps: int) -> dict[str, Any]:
+    """Control steps per second under random actions, what became invalid, and how full the buffers were."""
+    generator = torch.Generator().manual_seed(0)
+    actions = torch.randn(8, env.num_envs, env.action_dim, generator=generator).to(env.device)
+    env.step(actions[0])
+    begin = time.perf_counter()
+    for t in range(steps):
+        step = env.step(actions[t % 8])
+        env.reset(step.terminated | step.truncated)
+    seconds = _since(begin, env.device)
+    env.check()
+    return {
+        "control steps/s": steps * env.num_envs / seconds, "invalid": getattr(env, "invalid_steps", 0),
+        "use of buffers": env.report(),
+    }  # fmt: skip
+
+
+def rebuilding(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """A second environment is captured while the first one is dropped; then, what determinism costs, and gives."""
+    config = preset("quad").env
+    assert isinstance(config, LocomotionConfig)
+    first = config.build(sizes.robots, device, seed=0)
+    _walk_at_random(first, 2)
+    second = config.build(sizes.robots, device, seed=0)
+    del first
+    gc.collect()
+    found: dict[str, Any] = {"the second": _walk_at_random(second, sizes.steps)}
+    del second
+    for wanted in (False, True):
+        physics = replace(config.physics, deterministic=wanted)
+        ends = []
+        for _ in range(2):
+            env = replace(config, physics=physics).build(sizes.robots, device, seed=0)
+            speed = _walk_at_random(env, sizes.steps)["control steps/s"]
+            ends.append(env.obs.clone())
+        found["deterministic" if wanted else "as it is"] = {"control steps/s": speed, "repeats": torch.equal(*ends)}
+    return found | {"passed": found["deterministic"]["repeats"]}
+
+
+def rough(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Robots on rough ground."""
+    config = preset("quad").env
+    assert isinstance(config, LocomotionConfig)
+    begin = time.perf_counter()
+    env = replace(config, terrain="rough").build(sizes.rough, device, seed=0)
+    seconds = _since(begin, device)
+    return {"build [s]": seconds} | _walk_at_random(env, sizes.steps) | _memory(device)
+
+
+def _config(worlds: int, method: str = "p25") -> TrainConfig:
+    return TrainConfig(method=method, num_envs=worlds, evaluation=False, log=())
+
+
+def _particles(device: torch.device, worlds: int, method: str = "p25") -> Trainer:
+    return Trainer(_config(worlds, method), device)
+
+
+def _since(begin: float, device: torch.device) -> float:
+    """Seconds since then, once the device has done all that it was asked to."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - begin
+
+
+def _memory(device: torch.device) -> dict[str, int]:
+    """Memory that a GPU has given away, whoever has it [B]."""
+    if device.type != "cuda":
+        return {}
+    free, total = torch.cuda.mem_get_info(device)
+    return {"memory in use [B]": total - free}
+
+
+STAGES: dict[str, tuple[Callable[[torch.device, Sizes], dict[str, Any]], float]] = {
+    "versions": (versions, 30.0), "tests": (tests, 120.0), "waits": (waits, 30.0), "agreement": (agreement, 30.0),
+    "learning": (learning, 40.0), "scales": (scales, 40.0), "resuming": (resuming, 30.0), "flat": (flat, 180.0),
+    "rebuilding": (rebuilding, 60.0), "rough": (rough, 60.0),
+}  # fmt: skip
+"""By name, in their order: each stage, and how long it may take [s]. Kernels that it compiled are there next time."""
+
+
+def main(name: str, device_name: str, file: Path) -> None:
+    """Run a stage and write what it found, or why it was skipped."""
+    device = training.resolve_device(device_name)
+    sizes = FULL if device.type == "cuda" else SMALL
+    try:
+        with one_stream(device):
+            found = {"found": STAGES[name][0](device, sizes)}
+    except Skipped as reason:
+        found = {"skipped": str(reason)}
+    RunFolder(file.parent).write_json(file.name, found | {"sizes": to_dict(sizes)})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], Path(sys.argv[3]))

@@ -1,0 +1,135 @@
+"""Where the numbers of a run are shown while it trains: ``--log tensorboard wandb``.
+
+``progress.csv`` and ``timing.csv`` are what a run is known by; these are views of them. A run that was killed has said
+things that the resumed one says again: each log says below how it comes to have every iteration once.
+"""
+
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, Protocol
+
+from deimos.checks import RunError, one_line
+from deimos.run.folder import RunFolder
+
+WANDB = "wandb.json"  # in a run's folder: the name of the run among those of Weights & Biases
+
+
+class Log(Protocol):
+    """Where numbers are shown."""
+
+    def write(self, iteration: int, row: dict[str, float]) -> None:
+        """Show what an iteration has given."""
+
+    def flush(self) -> None:
+        """Make what was written survive a kill: called before every checkpoint."""
+
+    def close(self) -> None:
+        """End the log."""
+
+
+class TensorBoard:
+    """Event files in the run's folder.
+
+    All that came before a checkpoint is on the disk when it is written, so nothing is missing before a resume; what an
+    earlier file says of later iterations, TensorBoard drops when it meets the first step of the next file.
+    """
+
+    def __init__(self, folder: RunFolder, facts: dict[str, Any], iteration: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._board = SummaryWriter(str(folder.path), purge_step=iteration + 1)
+        self.flush, self.close = self._board.flush, self._board.close
+
+    def write(self, iteration: int, row: dict[str, float]) -> None:
+        """See ``Log.write``."""
+        for name, value in row.items():
+            self._board.add_scalar(name, value, iteration)
+
+
+class WeightsAndBiases:
+    """A run of Weights & Biases, under the same identity however often it is resumed; offline if WANDB_MODE says so.
+
+    A process of its own writes and sends the numbers, and what it had not done when the run was killed nobody knows. So
+    a resumed run begins the log anew from the tables of its folder: offline in place of the earlier files, online from
+    the first step that has not arrived.
+    """
+
+    def __init__(self, folder: RunFolder, facts: dict[str, Any], iteration: int) -> None:
+        import wandb
+
+        if not (folder.path / WANDB).exists():
+            folder.write_json(WANDB, {"id": uuid.uuid4().hex[:16]})
+        identity = folder.read_json(WANDB)["id"]
+        for path in sorted(folder.path.glob(f"wandb/offline-run-*-{identity}")):
+            shutil.rmtree(path)
+        try:
+            self._run = wandb.init(
+                project="deimos", name=folder.path.resolve().name, id=identity, resume="allow", dir=str(folder.path),
+                config=facts, reinit="create_new", settings=wandb.Settings(console="off"),
+            )  # fmt: skip
+        except wandb.Error as error:
+            raise RunError(
+                f"Weights & Biases cannot be reached ({one_line(error)}); log in by `wandb login`, or set "
+                f"WANDB_MODE=offline and send the run by `wandb sync` later."
+            ) from error
+        fps = {row["iteration"]: row["fps"] for row in folder.read_csv("timing.csv")}
+        for row in folder.read_csv("progress.csv"):
+            known = {name: float(cell) for name, cell in (row | {"fps": fps.get(row["iteration"], "")}).items() if cell}
+            if self._run.step <= int(row["iteration"]) <= iteration:
+                self.write(int(row["iteration"]), known)
+
+    def write(self, iteration: int, row: dict[str, float]) -> None:
+        """See ``Log.write``."""
+        self._run.log(row, step=iteration, commit=True)
+
+    def flush(self) -> None:
+        """See ``Log.flush``; there is nothing to do."""
+
+    def close(self) -> None:
+        """See ``Log.close``."""
+        self._run.finish()
+
+
+LOGS = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
+"""By the name in ``TrainConfig.log``."""
+
+
+class Logs:
+    """Several logs as one."""
+
+    def __init__(self, logs: list[Log]) -> None:
+        self._logs = logs
+
+    def write(self, iteration: int, row: dict[str, float]) -> None:
+        """See ``Log.write``."""
+        for log in self._logs:
+            log.write(iteration, row)
+
+    def flush(self) -> None:
+        """See ``Log.flush``."""
+        for log in self._logs:
+            log.flush()
+
+
+@contextmanager
+def open_logs(names: tuple[str, ...], folder: RunFolder, facts: dict[str, Any], iteration: int) -> Iterator[Logs]:
+    """Open the logs of a run that continues after ``iteration``; its tables hold what came before.
+
+    Args:
+        names: Some of ``LOGS``.
+        folder: The run's.
+        facts: What is known of the run beforehand, as JSON types.
+        iteration: Iterations that are done.
+
+    Raises:
+        RunError: If one cannot be opened.
+    """
+    with ExitStack() as stack:
+        logs: list[Log] = []
+        for name in names:
+            log: Log = LOGS[name](folder, facts, iteration)
+            stack.callback(log.close)
+            logs.append(log)
+        yield Logs(logs)
