@@ -175,6 +175,7 @@ class Panel:
             changed, self._follows = imgui.Checkbox("follow", self._follows)
             if changed:
                 self.place_camera(viewer)
+        if self._scene.is_flat:
             imgui.SameLine()
             _, self._scene.has_carpet = imgui.Checkbox("carpet of fear", self._scene.has_carpet)
 

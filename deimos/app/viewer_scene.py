@@ -50,8 +50,10 @@ class Scene(abc.ABC):
     """Angle of the camera above the horizon, negative when it looks down [degrees]."""
     body: int
     """The body that a camera may follow; 0 where nothing is to be followed."""
+    is_flat: bool = False
+    """Whether it is a robot on flat ground, where a carpet can lie."""
     has_carpet: bool = True
-    """Whether fear lies around a robot as a carpet."""
+    """Whether fear lies around it as a carpet."""
 
     @abc.abstractmethod
     def update(self) -> None:
@@ -66,7 +68,7 @@ def build_scene(session: Session) -> Scene:
     """What can be shown of a session.
 
     Raises:
-        RunError: If there is nothing, or robots are to stand side by side.
+        RunError: If there is nothing.
     """
     if session.env.scene(0) is not None:
         return RobotScene(session)
@@ -90,7 +92,8 @@ class RobotScene(Scene):
         self.update()
         self.body = int(self.model.jnt_bodyid[0])
         terrain = getattr(session.env, "terrain", None)
-        self._is_flat = terrain is None or float(np.ptp(terrain.heights)) < FLAT
+        heights = np.zeros(1) if terrain is None else terrain.heights
+        self.is_flat, self._ground = float(np.ptp(heights)) < FLAT, float(heights.max())
 
     def update(self) -> None:
         """See ``Scene.update``."""
@@ -104,7 +107,7 @@ class RobotScene(Scene):
         point = self._session.env.goal_point(0)
         if point is not None:
             shapes.append(sphere(point, 0.025, RED))
-        if fear is not None and fear.axes == (0, 1) and self._is_flat and self.has_carpet:
+        if fear is not None and fear.axes == (0, 1) and self.is_flat and self.has_carpet:
             shapes += self._carpet(fear)
         return shapes
 
@@ -122,7 +125,7 @@ class RobotScene(Scene):
         for row, second in zip(picked, np.linspace(-CARPET + side, CARPET - side, TILES), strict=True):
             for column, first in zip(picked, np.linspace(-CARPET + side, CARPET - side, TILES), strict=True):
                 place = self.data.qpos[:3] + turn @ np.array([first, second, 0.0])
-                place[2] = 0.002
+                place[2] = self._ground + 0.002  # what is as high as the ground would flicker
                 colour = np.array([*self._colours[shade[row, column]], 0.75], np.float32)
                 tile, size = mujoco.MjvGeom(), np.array([0.92 * side, 0.92 * side, 0.001])
                 mujoco.mjv_initGeom(tile, mujoco.mjtGeom.mjGEOM_BOX, size, place, turn.ravel(), colour)
