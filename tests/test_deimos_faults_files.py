@@ -22,6 +22,7 @@ from deimos.run.trainer import TrainConfig
 from deimos.study import archive, plan
 from deimos.study.document import to_html, to_markdown
 from deimos.study.folder import StudyFolder
+from deimos.study.results import TABLES
 from terrain.grid import Terrain, flat
 
 # Anything that a person, an editor or a disk may leave: the property holds for each, so few examples do.
@@ -288,13 +289,22 @@ def test_a_pipe_in_a_study_is_refused(tmp_path):
     (tmp_path / "cells" / "a").mkdir(parents=True)
     for name in ("study.toml", "results.csv", "policies.zip", "cells/a/failures.jsonl"):
         os.mkfifo(tmp_path / name)
-    for read in (lambda: plan.read(tmp_path / "study.toml"), study.results, lambda: archive.unpack(study)):
+    reads = plan.read, StudyFolder.results, archive.unpack, lambda study: study.failures(cell)
+    for read, place in zip(reads, (tmp_path / "study.toml", study, study, study), strict=True):
         with pytest.raises(RunError, match="not a regular file"):
-            read()
-    with pytest.raises(OSError, match="not a regular file"):
-        study.failures(cell)
+            read(place)
     with pytest.raises(OSError, match="No such device"):  # the system's word for a pipe that nobody reads
         study.record_failure(cell, "killed")
+
+
+def test_what_a_damaged_table_of_a_study_says_can_be_printed(tmp_path):
+    """Zeros that a disk has left in the names of columns, or in a cell, are spelled out in one line."""
+    columns = list(TABLES["curves.csv"])
+    for text in ("hash,met\0hod\n", ",".join(columns) + "\n" + ",".join("\0" for _ in columns) + "\n"):
+        (tmp_path / "curves.csv").write_text(text)
+        found, said = attempt(StudyFolder(tmp_path).results, RunError)
+        assert found is None
+        assert "curves.csv" in said
 
 
 def test_a_page_holds_no_tags_of_names():

@@ -21,8 +21,8 @@ from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import quad
 
 SECONDS = 240.0
-PER_METHOD, PER_ENGINE, ENGINES = 5, 10, ("native", "warp")
-SELECTORS = sorted({selector: name for name, (selector, _) in METHODS.items()}.values())
+PER_METHOD, PER_ENGINE, ENGINES = 6, 10, ("native", "warp")
+SELECTORS = sorted({selector: name for name, (selector, _) in reversed(METHODS.items())}.values())
 """A method of every selector."""
 SAVES = 4  # the kills of which the first is within a save
 RUNS = [*((method, None) for method in SELECTORS for _ in range(PER_METHOD)),

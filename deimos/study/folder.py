@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from deimos.checks import RunError, one_line
-from deimos.files import open_file, read_bytes
+from deimos.files import first_line, open_file, read_bytes
 from deimos.lock import hold
 from deimos.run.config import from_dict, to_dict
 from deimos.run.evaluation import Scale
@@ -134,7 +134,11 @@ class StudyFolder:
         """How a cell's workers have died so far, one line each."""
         path = self.cell_path(cell) / "failures.jsonl"
         found = []
-        for line in read_bytes(path).splitlines() if path.exists() else []:
+        try:
+            lines = read_bytes(path).splitlines() if path.exists() else []
+        except OSError as error:
+            raise RunError(f"{path} cannot be read ({first_line(error)}).") from error
+        for line in lines:
             with contextlib.suppress(ValueError, KeyError, TypeError):  # a kill may leave half a line
                 found.append(str(json.loads(line)["error"]))
         return found

@@ -283,13 +283,15 @@ def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     missing, unknown = [n for n in columns if n not in {*names, *LATER_COLUMNS}], [n for n in names if n not in columns]
     if missing or unknown:
         lists = f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}"
-        raise RunError(f"{path} is a table of another schema; {lists}.")
+        raise RunError(f"{path} is a table of another schema; {ascii(lists)[1:-1]}.")
     rows = []
     for number, values in enumerate(lines, start=2):
         try:
             rows.append(_row(columns, dict(zip(names, values, strict=True))))
         except ValueError as error:
-            raise RunError(f"{path}, line {number}, does not fit its columns ({error}).") from error
+            raise RunError(
+                f"{path}, line {number}, does not fit its columns ({ascii(one_line(error))[1:-1]})."
+            ) from error
     return rows
 
 
