@@ -3,7 +3,7 @@
     python train.py --preset quad-walk --seed 1 --out runs/walk    # five minutes of one core
     python -m reproduction.quad_rough runs/rough --init-from runs/walk --seed 1    # an hour; again to continue
     python -m reproduction.quad_rough runs/rough --minutes 0 --figure rough.png    # tables and curves of what is there
-    python -m reproduction.quad_rough runs/pilot --init-from runs/walk --minutes 9 --change '{"num_envs": 1024}'
+    python -m reproduction.quad_rough runs/pilot --init-from runs/walk --minutes 8 --change '{"num_envs": 1024}'
 
 The run is that of ``python train.py --preset quad-rough --init-from RUN``, on one thread and without the evaluation at
 its end, stopped after ``--minutes`` of processor time. Per-world rewards and levels of every iteration go to worlds.npz
@@ -164,7 +164,7 @@ def main() -> None:
         config = replace(base, seed=args.seed, threads=1, evaluation=False, device="cpu")
         trainer, folder = training.start(config, args.folder, args.init_from)
     recorder = Recorder(trainer, folder.path / "worlds.npz")
-    if recorder.before < 60 * args.minutes:
+    if recorder.before <= 60 * args.minutes:
         training.train(trainer, folder, recorder, lambda: recorder.seconds > 60 * args.minutes)
     print(f"{table(recorder.path)}\n\n{tiles(evaluate(folder.path))}")
     if args.figure is not None:
