@@ -106,7 +106,8 @@ TRAIN_ERRORS = {
     "--init-from there": "there is not a run folder: it holds no config.json",
 }
 OTHER_ERRORS = {
-    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, pool, study, play, view, shield,",
+    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, pool, study, play, view, "
+    "shield, export, robot, doctor, terrain",
     "--bogus": "There is no command '--bogus'",
     "evaluate": "Missing from deimos evaluate: .*Folder of the run",
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",

@@ -47,9 +47,9 @@ class ShieldConfig:
 
     alpha: float = 0.1
     """Largest share of the goals that would crash the policy that the shield lets through, in (0, 1)."""
-    mode: Mode = "project"
+    mode: Mode = "stop"
     """What becomes of a goal that is refused: ignore keeps the active goal, project takes the nearest acceptable one,
-    stop the safe one."""
+    stop the safe one. Against the worst attacker stop is the strongest: project gives it the worst acceptable goal."""
     guarantee: Guarantee = "conditional"
     """What holds alpha: marginal, the mean over calibrations; conditional, this one with a confidence of 95 %."""
     worlds: int = 20_000
