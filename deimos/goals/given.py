@@ -42,8 +42,8 @@ def tensor(name: str, value: Bound | int, device: torch.device) -> Tensor:
                 f"{name} must be on {device}, got it on {value.device}; GoalDirector(device=...) names another one."
             )
         return value.detach()
-    try:  # a copy, which arrays that must not be written to give too
-        return torch.tensor(np.asarray(value), device=device)
+    try:
+        return torch.from_numpy(np.array(value)).to(device)  # a copy, since an array may refuse to be written to
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f"{type(value).__module__}.{type(value).__qualname__}"
         raise ValueError(f"{name} must be an array or a tensor of numbers, got {kind}.") from error
