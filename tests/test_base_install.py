@@ -36,16 +36,12 @@ for name in [*METHODS, "p33", "mix"]:
     generator = torch.Generator().manual_seed(0)
     state, goal = torch.zeros(worlds, 3), torch.zeros(worlds, 2)
     never = torch.zeros(worlds, dtype=torch.bool)
-    try:
-        for _ in range(steps):
-            candidates = 2 * torch.rand(worlds, 10, 2, generator=generator) - 1
-            state = 0.9 * state + torch.nn.functional.pad(goal, (0, 1))
-            terminated = state.norm(dim=1) > 2.5
-            goal = director.step(state, goal, terminated, never, candidates).goal
-            state[terminated] = 0.0
-    except ValueError as error:
-        assert "rollout" in str(error), (name, error)
-        continue
+    for _ in range(steps):
+        candidates = 2 * torch.rand(worlds, 10, 2, generator=generator) - 1
+        state = 0.9 * state + torch.nn.functional.pad(goal, (0, 1))
+        terminated = state.norm(dim=1) > 2.5
+        goal = director.step(state, goal, terminated, never, candidates).goal
+        state[terminated] = 0.0
     assert goal.isfinite().all() and goal.abs().max() <= 1.0, name
     worked += 1
 print(worked)
@@ -61,10 +57,10 @@ def run(code, *arguments):
 
 
 def test_director_serves_another_loop():
-    """Every method that needs no transitions of the learner chooses goals in a loop on torch alone."""
+    """Every method chooses goals in a loop on torch alone."""
     done = run(LOOP)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) >= 12
+    assert int(done.stdout) >= 24
 
 
 def test_trained_policy_loads_and_acts():

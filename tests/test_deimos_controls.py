@@ -354,11 +354,12 @@ def test_the_learner_takes_the_weights():
         GoalDirector(weighted.Config(candidates=9, mix=0.5, alpha=1.0), goal_period=2, learn_every=4),
         torch.zeros(4, dtype=torch.bool),
     )
-    seen = set()
+    seen, goal = set(), torch.zeros(4, 2)
     for t in range(60):
         crash = no.clone()
         crash[t % 4] = t % 3 == 0
-        given = goals.step(torch.randn(4, 3), torch.zeros(4, 2), crash, no, torch.rand(4, 9, 2))
+        given = goals.step(torch.randn(4, 3), goal, crash, no, torch.rand(4, 9, 2))
+        goal = given.goal
         assert (given.weight[crash] == 1).all()
         seen |= set(given.weight.tolist())
     assert len(seen) == 3

@@ -340,13 +340,13 @@ def test_the_gate_opens_and_closes():
 
 def goals_of(director_, steps=60):
     """Let a GoalDirector serve four worlds, one of which crashes now and then."""
-    no = torch.zeros(4, dtype=torch.bool)
+    no, goal = torch.zeros(4, dtype=torch.bool), torch.zeros(4, 2)
     generator = torch.Generator().manual_seed(0)
     for t in range(steps):
         crash = no.clone()
         crash[t % 4] = t % 7 == 6
         state, candidates = torch.randn(4, 3, generator=generator), torch.rand(4, 9, 2, generator=generator)
-        director_.step(state, torch.zeros(4, 2), crash, no, candidates)
+        goal = director_.step(state, goal, crash, no, candidates).goal
     return director_
 
 

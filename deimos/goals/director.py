@@ -191,8 +191,7 @@ class GoalDirector:
         inputs = self._expected(state, num_envs, state_dim, given.matrix("goal", goal, "goal_dim")[1])
         states, goals = inputs.states(state, inputs.num_envs), inputs.goals(goal, inputs.num_envs)
         ends = inputs.ends(terminated, truncated, tracking, executed)
-        if candidates is not None and not callable(candidates):
-            candidates = inputs.candidates(candidates, inputs.num_envs)
+        inputs.check_candidates(candidates, inputs.num_envs)
         clocks = self._clocks or self._begin(inputs)
         unseen = None if self._choose_first and not self._next_step else ends[0] | ends[1]
         given.refuse_not_finite("state", states, but=unseen)
@@ -201,7 +200,7 @@ class GoalDirector:
             clocks.refuse_other_goals(goals)
         rows, new = clocks.advance(*ends, own=True), goals[:0]
         if len(rows):
-            offered = self._candidates(candidates[rows] if isinstance(candidates, Tensor) else candidates, rows, goal)
+            offered = self._candidates(given.taken(candidates, rows), rows, goal)
             new = clocks.propose(rows, self._seen(states[rows], None), goals[rows], offered, own=True)
         self._learn_if_due()
         changed = torch.zeros(inputs.num_envs, dtype=torch.bool, device=inputs.device).index_fill_(0, rows, True)
@@ -255,8 +254,7 @@ class GoalDirector:
         listed = given.worlds(rows, inputs.num_envs, inputs.device)
         states, goals = inputs.states(state, len(listed)), inputs.goals(goal, len(listed))
         lasts = self._lasts(horizon, len(listed), inputs)
-        if candidates is not None and not callable(candidates):
-            candidates = inputs.candidates(candidates, len(listed))
+        inputs.check_candidates(candidates, len(listed))
         clocks = self._clocks or self._begin(inputs)
         if not len(listed):
             return given.like(goals, goal)
@@ -270,6 +268,7 @@ class GoalDirector:
         return given.like(new, goal)
 
     @own_settings()
+    @torch.no_grad()
     def learn(self, rollout: Transitions | None = None) -> dict[str, float]:
         """Update the selector now, besides every ``learn_every`` steps.
 

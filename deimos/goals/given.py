@@ -42,8 +42,8 @@ def tensor(name: str, value: Bound | int, device: torch.device) -> Tensor:
                 f"{name} must be on {device}, got it on {value.device}; GoalDirector(device=...) names another one."
             )
         return value.detach()
-    try:  # a copy, which arrays that must not be written to give too
-        return torch.tensor(np.asarray(value), device=device)
+    try:
+        return torch.from_numpy(np.array(value)).to(device)  # a copy, since an array may refuse to be written to
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f"{type(value).__module__}.{type(value).__qualname__}"
         raise ValueError(f"{name} must be an array or a tensor of numbers, got {kind}.") from error
@@ -132,6 +132,13 @@ def like(values: Tensor, model: A) -> A:
     return array.astype(dtype) if values.is_floating_point() and np.issubdtype(dtype, np.floating) else array
 
 
+def taken(values: Candidates, rows: Tensor) -> Candidates:
+    """Those of some worlds, int64, shape (m,), if they are there yet."""
+    if values is None or callable(values):
+        return values
+    return values[rows] if isinstance(values, Tensor) else np.asarray(values)[rows.cpu().numpy()]
+
+
 def replaced(values: A, rows: Tensor, new: Tensor) -> A:
     """A copy of ``values``, shape (num_envs, ...), with new rows, int64, shape (m,); whole numbers become float32."""
     if isinstance(values, Tensor):
@@ -184,13 +191,19 @@ class Inputs:
             refuse_not_finite("executed", pursued)
         return crashed, cut_off, met, pursued
 
+    def check_candidates(self, value: Candidates, count: int) -> None:
+        """Raise ``ValueError`` if they are there, but not those of ``count`` worlds, shape (count, N, goal_dim)."""
+        if value is None or callable(value):
+            return
+        shape = tuple(np.shape(value))
+        if len(shape) != 3 or shape[::2] != (count, self.goal_dim) or shape[1] < 1:
+            expected = f"({count}, N, {self.goal_dim}) with N at least 1"
+            raise ValueError(f"candidates must have the shape {expected}, got {shape}.")
+
     def candidates(self, value: Array, count: int) -> Tensor:
         """Candidates of ``count`` worlds, shape (count, N, goal_dim)."""
-        offered = tensor("candidates", value, self.device)
-        if offered.dim() != 3 or offered.shape[::2] != (count, self.goal_dim) or offered.shape[1] < 1:
-            expected = f"({count}, N, {self.goal_dim}) with N at least 1"
-            raise ValueError(f"candidates must have the shape {expected}, got {tuple(offered.shape)}.")
-        return offered.float()
+        self.check_candidates(value, count)
+        return tensor("candidates", value, self.device).float()
 
     def horizons(self, value: Array | int, count: int, most: int) -> Tensor:
         """Steps that the goals of ``count`` worlds are to last, in [1, most], int64, shape (count,)."""
