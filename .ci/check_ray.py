@@ -74,7 +74,6 @@ def main() -> None:
         file = Path(folder).resolve() / "study.toml"
         file.write_text(STUDY)
         here, there = (StudyFolder(file.with_name(name)) for name in ("local", "ray"))
-        cli.RunOptions(folder=here.path, file=file, allow_uncommitted=True).run()
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
         machines = [cluster.add_node(num_cpus=1) for _ in range(2)]
         os.environ["RAY_ADDRESS"] = cluster.address
@@ -95,6 +94,7 @@ def main() -> None:
         cells = there.cells()
         assert there.finished(cells) == {cell.digest for cell in cells}
         assert not any(there.failures(cell) for cell in cells), [there.failures(cell) for cell in cells]
+        cli.RunOptions(folder=here.path, file=file, allow_uncommitted=True).run()
         assert table(there) == table(here)
 
         OnRay.run = lambda *_: sys.exit("A finished cell was begun again.")  # type: ignore[method-assign]

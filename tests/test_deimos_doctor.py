@@ -136,7 +136,7 @@ def test_science_continues_what_is_there(tmp_path):
     """Table 4.1 and a Quad run of the thesis's length are commands that parse; a run that was begun is resumed."""
     from benchmarks.__main__ import BenchOptions
 
-    (_, _, _, *table), (_, _, _, *train) = doctor.science(torch.device("cuda", 0), tmp_path)
+    (_, _, _, *table), (_, _, _, _, *train) = doctor.science(torch.device("cuda", 0), tmp_path)
     assert console.parse(BenchOptions, table, "benchmarks").what == "table41"
     options = console.parse(FolderOptions, [word for word in train if word != "--preset" and word != "quad"], "train")
     assert options.num_envs * options.env_steps == pytest.approx(295e6, rel=0.01)

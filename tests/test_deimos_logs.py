@@ -25,30 +25,50 @@ CONFIG = TrainConfig(
 )  # fmt: skip
 
 KILLED_RUN = f"""
-import json, os, signal, sys
+import json, os, signal, sys, time
 from pathlib import Path
+from tensorboard.summary.writer.record_writer import RecordWriter
 from deimos.run import training
 from deimos.run.config import from_dict
 from deimos.run.trainer import TrainConfig
 
+killed, delay = int(sys.argv[3]), 0.0
+save, write = training.save, RecordWriter.write
 training.CHECKPOINT_SECONDS = -1.0
-def report(row, fps):
-    if row["iteration"] > {SAVED}:
-        training.CHECKPOINT_SECONDS = 1e9
-    if row["iteration"] == {KILLED}:
+
+def write_late(self, data):
+    time.sleep(delay)  # a disk that is slow: events wait in the writer's queue
+    write(self, data)
+
+def kill(iteration):
+    if iteration == killed:
         os.kill(os.getpid(), signal.SIGKILL)
 
+def save_and_die(trainer, folder):
+    save(trainer, folder)
+    kill(trainer.iteration)
+
+def report(row, fps):
+    global delay
+    if row["iteration"] == {SAVED} - 1 == killed - 1:
+        delay = 0.1
+    if row["iteration"] > {SAVED}:
+        training.CHECKPOINT_SECONDS = 1e9
+        kill(row["iteration"])
+
+training.save, RecordWriter.write = save_and_die, write_late
 config = from_dict(TrainConfig, json.loads(sys.argv[2]))
 training.train(*training.start(config, Path(sys.argv[1])), report)
 """
 
 
-def test_tensorboard_has_every_iteration_once(tmp_path):
-    """A run that was killed some iterations after a checkpoint, and resumed, has neither gap nor double step."""
+@pytest.mark.parametrize("killed", [SAVED, KILLED])
+def test_tensorboard_has_every_iteration_once(killed, tmp_path):
+    """A run that was killed at once after a checkpoint, or later, and resumed has neither gap nor double step."""
     path = tmp_path / "run"
-    arguments = [sys.executable, "-c", KILLED_RUN, str(path), json.dumps(to_dict(CONFIG))]
+    arguments = [sys.executable, "-c", KILLED_RUN, str(path), json.dumps(to_dict(CONFIG)), str(killed)]
     assert subprocess.run(arguments, stderr=subprocess.DEVNULL).returncode == -signal.SIGKILL
-    assert [int(row["iteration"]) for row in RunFolder(path).read_csv("progress.csv")] == [*range(1, KILLED + 1)]
+    assert [int(row["iteration"]) for row in RunFolder(path).read_csv("progress.csv")] == [*range(1, killed + 1)]
     trainer, folder = training.resume(path)
     assert trainer.iteration == SAVED
     assert training.train(trainer, folder)

@@ -204,17 +204,16 @@ def _run_stage(name: str, device: torch.device, limit: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as home:
         file = Path(home) / "found.json"
         command = [sys.executable, "-m", "deimos.app.gpu_stages", name, str(device), str(file)]
-        process = subprocess.Popen(
+        with subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
-        )
-        try:
-            said = process.communicate(timeout=limit)[1]
-        except subprocess.TimeoutExpired:
-            return {"error": f"it took longer than {limit:.0f} s"}
-        finally:
-            with contextlib.suppress(ProcessLookupError):  # they have ended, as they should
-                os.killpg(process.pid, signal.SIGKILL)  # with what it has begun
-            process.wait()
+        ) as process:
+            try:
+                said = process.communicate(timeout=limit)[1]
+            except subprocess.TimeoutExpired:
+                return {"error": f"it took longer than {limit:.0f} s"}
+            finally:
+                with contextlib.suppress(ProcessLookupError):  # they have ended, as they should
+                    os.killpg(process.pid, signal.SIGKILL)  # with what it has begun
         if not file.exists():
             last = said.strip().splitlines()[-1:] or [f"exit code {process.returncode}"]
             return {"error": last[0], "said": said[-4000:]}

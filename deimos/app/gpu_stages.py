@@ -347,6 +347,7 @@ def main(name: str, device_name: str, file: Path) -> None:
     """Run a stage and write what it found, or why it was skipped."""
     device = training.resolve_device(device_name)
     sizes = FULL if device.type == "cuda" else SMALL
+    found: dict[str, Any]
     try:
         with one_stream(device):
             found = {"found": STAGES[name][0](device, sizes)}

@@ -6,7 +6,7 @@ things that the resumed one says again: each log says below how it comes to have
 
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, Protocol
 
@@ -92,7 +92,9 @@ class WeightsAndBiases:
         self._run.finish()
 
 
-LOGS = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
+LOGS: dict[str, Callable[[RunFolder, dict[str, Any], int], Log]] = {
+    "tensorboard": TensorBoard, "wandb": WeightsAndBiases,
+}  # fmt: skip
 """By the name in ``TrainConfig.log``."""
 
 
@@ -129,7 +131,7 @@ def open_logs(names: tuple[str, ...], folder: RunFolder, facts: dict[str, Any], 
     with ExitStack() as stack:
         logs: list[Log] = []
         for name in names:
-            log: Log = LOGS[name](folder, facts, iteration)
+            log = LOGS[name](folder, facts, iteration)
             stack.callback(log.close)
             logs.append(log)
         yield Logs(logs)
