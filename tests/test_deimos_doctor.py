@@ -96,6 +96,14 @@ def test_the_report_is_written_after_every_stage(tmp_path, monkeypatch, capsys):
     assert "versions: found" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("passed", [True, False])
+def test_a_check_within_a_stage_counts(passed, tmp_path, monkeypatch):
+    """What only a part of a stage has found fails the whole."""
+    found = {"FPS": 1.0, "graph against eager": {"largest difference": 1.0, "passed": passed}}
+    monkeypatch.setattr(doctor, "_run_stage", lambda name, device, limit: {"found": found})
+    assert doctor.run_stages(("flat",), CPU, tmp_path) is passed
+
+
 def test_the_last_words_of_a_stage_are_kept(monkeypatch):
     """A stage whose process dies is an error in one line, beside all that it said."""
     program = "import sys; sys.exit('Traceback\\nCUDA error: an illegal access')"

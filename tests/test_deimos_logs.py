@@ -164,6 +164,18 @@ def test_wandb_without_a_login_is_said_in_one_line(tmp_path, monkeypatch):
     assert training.load_checkpoint(folder)["iteration"] == 0
 
 
+@pytest.mark.parametrize("stored", [{"id": "b/../../.."}, {"id": "*"}, {}, [], {"id": 7}])
+def test_an_identity_is_no_path(stored, tmp_path, monkeypatch):
+    """A file that names something else than a run of Weights & Biases is refused before anything is deleted."""
+    monkeypatch.setitem(sys.modules, "wandb", FakeWandb(offline=True))
+    trainer, folder = training.start(replace(CONFIG, log=("wandb",)), tmp_path / "run")
+    (folder.path / "wandb" / "offline-run-a-b").mkdir(parents=True)
+    folder.write_json("wandb.json", stored)
+    with pytest.raises(RunError, match=r"wandb.json must hold an id of 16 hexadecimal digits, got"):
+        training.train(trainer, folder)
+    assert (folder.path / "wandb" / "offline-run-a-b").is_dir()
+
+
 def test_logs_are_known_by_their_names(tmp_path):
     """No log is a choice, one that is not there is refused, and a run without logs leaves no file of them."""
     with pytest.raises(ValueError, match="log must be one of tensorboard, wandb, got 'paper'"):

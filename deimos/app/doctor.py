@@ -196,7 +196,12 @@ def run_stages(names: tuple[str, ...], device: torch.device, out: Path) -> bool:
         folder.write_json(REPORT, {"schema": SCHEMA, "stages": stages})
         said = stages[name].get("error") or stages[name].get("skipped") or "found"
         print(f"{name}: {said} ({stages[name]['seconds']:.0f} s)", flush=True)
-    return not any("error" in stages[name] or stages[name].get("found", {}).get("passed") is False for name in names)
+    return not any("error" in stages[name] or _fails(stages[name].get("found")) for name in names)
+
+
+def _fails(found: Any) -> bool:
+    """Whether a check has failed in what a stage found, however deep it stands there."""
+    return isinstance(found, dict) and (found.get("passed") is False or any(map(_fails, found.values())))
 
 
 def _run_stage(name: str, device: torch.device, limit: float) -> dict[str, Any]:

@@ -4,6 +4,7 @@
 things that the resumed one says again: each log says below how it comes to have every iteration once.
 """
 
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterator
@@ -61,7 +62,10 @@ class WeightsAndBiases:
 
         if not (folder.path / WANDB).exists():
             folder.write_json(WANDB, {"id": uuid.uuid4().hex[:16]})
-        identity = folder.read_json(WANDB)["id"]
+        stored = folder.read_json(WANDB)
+        identity = stored.get("id") if isinstance(stored, dict) else None
+        if not isinstance(identity, str) or not re.fullmatch(r"[0-9a-f]{16}", identity):  # it becomes part of a path
+            raise RunError(f"{folder.path / WANDB} must hold an id of 16 hexadecimal digits, got {identity!r:.40}.")
         for path in sorted(folder.path.glob(f"wandb/offline-run-*-{identity}")):
             shutil.rmtree(path)
         try:
