@@ -21,7 +21,9 @@ from deimos.goals.risk_map import RiskMap, grid
 from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces, Transitions
 from deimos.nn.host import own_settings
 
-SPARE = 8  # resolved interactions that are kept per world where there may be any number within 2 T steps
+# Resolved interactions that are kept per world where there may be any number within 2 T steps. Of more the oldest are
+# forgotten, and where that happens to worlds that soon crash, the calibration counts too few crashes.
+SPARE = 8
 
 _log = logging.getLogger(__name__)
 
