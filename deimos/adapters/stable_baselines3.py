@@ -12,6 +12,8 @@ from deimos.goals.director import GoalDirector
 class DirectedVecEnv(VecEnvWrapper):
     """Worlds whose goals a Director chooses: it overwrites the goal in every observation, and the reward follows it.
 
+    A ``Monitor`` within reports the worlds' own rewards: put a ``VecMonitor`` around it.
+
     Args:
         venv: The worlds. What terminates is a crash; ``TimeLimit.truncated`` in an info is not.
         director: Who chooses the goals, on its own clock; it must have a ``goal_box``.
