@@ -1,7 +1,12 @@
 """What ``deimos.GoalDirector`` costs in somebody else's loop, per step of its worlds."""
 
+import contextlib
+import io
+import runpy
 import statistics
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,6 +22,7 @@ STATE, GOAL = 9, 3  # components, as in Particle Gym
 CRASHES = 0.001  # per world and step
 DRAWN, OBSERVED = "candidates drawn", "their clock"
 WAYS = ("uniform", "p25", "rnd", f"p25, {DRAWN}", f"p25, {OBSERVED}")
+EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "rsl_rl_director.py"
 WARM_UP = 100  # periods at most until a fear network has learnt
 
 
@@ -43,7 +49,41 @@ def measure(
             "us per step": {way: 1e6 * value / period for way, value in seconds.items()},
             "world-steps/s": {way: num_envs * period / value for way, value in seconds.items()},
         })  # fmt: skip
-    return {"period": period, "sizes": rows}
+    return {"period": period, "sizes": rows, "share of rsl_rl": share(rounds)}
+
+
+class Timed(GoalDirector):
+    """Counts the seconds that its steps take."""
+
+    seconds = 0.0
+
+    def step(self, *arguments: Any, **named: Any) -> Any:
+        """See ``GoalDirector.step``."""
+        begin = time.perf_counter()
+        given = super().step(*arguments, **named)
+        self.seconds += time.perf_counter() - begin
+        return given
+
+
+def share(iterations: int, num_envs: int = 4096) -> float:
+    """Share of the time of rsl_rl's iterations, at its defaults on a CPU, that a Director's steps take.
+
+    Args:
+        iterations: How many are timed; twice as many, but at least 8, come first, so that fear has been learnt.
+        num_envs: Carts of the example.
+    """
+    from rsl_rl.runners import OnPolicyRunner
+
+    env = runpy.run_path(str(EXAMPLE))["Carts"](num_envs, Timed("p75", 40, goal_box=([-1.0], [1.0])))
+    model = {"class_name": "MLPModel"}
+    config = {"actor": model | {"distribution_cfg": {"class_name": "GaussianDistribution"}}, "critic": model}
+    config |= {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "algorithm": {"class_name": "PPO"}}
+    runner = OnPolicyRunner(env, config | {"num_steps_per_env": 24, "save_interval": 10**6})
+    with contextlib.redirect_stdout(io.StringIO()):
+        runner.learn(max(8, 2 * iterations))
+        env.director.seconds, begin = 0.0, time.perf_counter()
+        runner.learn(iterations)
+    return env.director.seconds / (time.perf_counter() - begin)
 
 
 def periods(way: str, num_envs: int, period: int, device: torch.device) -> Callable[[], None]:
@@ -58,7 +98,8 @@ def periods(way: str, num_envs: int, period: int, device: torch.device) -> Calla
         way.split(",")[0], period, num_envs=num_envs, state_dim=STATE, goal_dim=GOAL, device=device, goal_box=box
     )
     states, goal = [draw(STATE) for _ in range(8)], draw(GOAL)
-    candidates = None if box else draw(CANDIDATES, GOAL)
+    offered = draw(CANDIDATES, GOAL)
+    candidates = None if box else offered
     never = torch.zeros(num_envs, dtype=torch.bool, device=device)
     clock = torch.zeros(num_envs, dtype=torch.int64, device=device)
 
@@ -71,7 +112,7 @@ def periods(way: str, num_envs: int, period: int, device: torch.device) -> Calla
         rows = (crashed | (clock >= period)).nonzero().squeeze(1)
         clock[rows] = 0
         if len(rows):
-            goal[rows] = director.propose(rows, states[t % 8][rows], goal[rows], lambda rows: candidates[rows])
+            goal[rows] = director.propose(rows, states[t % 8][rows], goal[rows], lambda rows: offered[rows])
 
     advance = observe if OBSERVED in way else step
 
@@ -98,3 +139,4 @@ def show(result: dict[str, Any]) -> None:
         cells = (f"{value:.0f} ({short(row['world-steps/s'][way])})" for way, value in row["us per step"].items())
         table.add_row(str(row["num_envs"]), *cells)
     wide_console().print(table)
+    wide_console().print(f"Share of an iteration of rsl_rl at 4096 worlds: {result['share of rsl_rl']:.1%}")

@@ -164,8 +164,9 @@ def test_quad_is_measured(capsys):
     assert "env.step / bare, flat" in capsys.readouterr().out
 
 
-def test_director_is_measured(capsys):
-    """The Director in other people's loops has a time per step for each way and number of worlds."""
+def test_director_is_measured(capsys, monkeypatch):
+    """The Director in other people's loops has a time per step for each way and number of worlds, and a share."""
+    monkeypatch.setattr(director, "share", lambda rounds, few=director.share: few(rounds, num_envs=32))
     ways = ("uniform", "p25", "p25, candidates drawn", "p25, their clock")
     result = director.measure(CPU, 1, sizes=(1, 50), period=10, ways=ways)
     assert [row["num_envs"] for row in result["sizes"]] == [1, 50]
@@ -173,6 +174,7 @@ def test_director_is_measured(capsys):
         assert set(row["us per step"]) == set(ways)
         for way, value in row["us per step"].items():
             assert row["world-steps/s"][way] == pytest.approx(row["num_envs"] / value * 1e6)
+    assert 0 < result["share of rsl_rl"] < 1
     director.show(result)
     assert "world-steps/s" in capsys.readouterr().out
 
@@ -195,7 +197,9 @@ def test_numbers_are_written(tmp_path, monkeypatch, capsys):
     """The command measures what is asked for and writes its numbers with versions, threads and device."""
     monkeypatch.setattr(
         director, "measure",
-        lambda device, rounds: {"period": 1, "sizes": [{"num_envs": 1, "us per step": {}}], "rounds": rounds},
+        lambda device, rounds: {
+            "period": 1, "sizes": [{"num_envs": 1, "us per step": {}}], "share of rsl_rl": 0.0, "rounds": rounds,
+        },
     )  # fmt: skip
     path = tmp_path / "numbers.json"
     threads = torch.get_num_threads()

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from deimos.goals import given
 from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore
 from deimos.goals.fear_selector import FearEstimate, fear_selector
-from deimos.goals.given import Array, Candidates, GoalBox, Inputs, Rows
+from deimos.goals.given import A, Array, Bound, Candidates, GoalBox, Inputs, Rows
 from deimos.goals.interactions import Interactions
 from deimos.goals.methods import method
 from deimos.goals.risk_map import RiskMap, grid
@@ -27,14 +27,14 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Assignment:
-    """What every world pursues next; arrays if the goals of the step were one, else tensors."""
+class Assignment(Generic[A]):
+    """What every world pursues next; arrays or tensors, as the goals of the step were."""
 
-    goal: Array
+    goal: A
     """Goals, shape (num_envs, goal_dim): the given ones but where ``changed``."""
-    changed: Array
+    changed: A
     """True where the goal is a new one, bool, shape (num_envs,)."""
-    weight: Array
+    weight: A
     """Weight of the transitions under the goal in everything that the learner learns, at least 0, shape (num_envs,);
     1 under most selectors."""
 
@@ -81,7 +81,7 @@ class GoalDirector:
         self, selector: SelectorConfig | str, goal_period: int | None = None, *, num_envs: int | None = None,
         state_dim: int | None = None, goal_dim: int | None = None, device: torch.device | str | None = None,
         max_horizon: int | None = None, horizon_input: bool = False,
-        first_goals: Literal["uniform", "chosen"] = "uniform", goal_box: tuple[Array, Array] | None = None,
+        first_goals: Literal["uniform", "chosen"] = "uniform", goal_box: tuple[Bound, Bound] | None = None,
         groups: Sequence[slice] = (slice(None),), autoreset: object = "SameStep", learn_every: int = 24,
         total_steps: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
@@ -159,9 +159,9 @@ class GoalDirector:
     @own_settings()
     @torch.no_grad()
     def step(
-        self, state: Array, goal: Array, terminated: Array, truncated: Array, candidates: Candidates = None,
+        self, state: Array, goal: A, terminated: Array, truncated: Array, candidates: Candidates = None,
         tracking: Array | None = None, executed: Array | None = None,
-    ) -> Assignment:  # fmt: skip
+    ) -> Assignment[A]:  # fmt: skip
         """Resolve what the last step decided, and choose the goals that are due after T steps.
 
         Worlds that are done get a first goal; under ``NextStep`` after the step that reset them.
@@ -191,8 +191,7 @@ class GoalDirector:
         inputs = self._expected(state, num_envs, state_dim, given.matrix("goal", goal, "goal_dim")[1])
         states, goals = inputs.states(state, inputs.num_envs), inputs.goals(goal, inputs.num_envs)
         ends = inputs.ends(terminated, truncated, tracking, executed)
-        if candidates is not None and not callable(candidates):
-            candidates = inputs.candidates(candidates, inputs.num_envs)
+        inputs.check_candidates(candidates, inputs.num_envs)
         clocks = self._clocks or self._begin(inputs)
         unseen = None if self._choose_first and not self._next_step else ends[0] | ends[1]
         given.refuse_not_finite("state", states, but=unseen)
@@ -201,7 +200,7 @@ class GoalDirector:
             clocks.refuse_other_goals(goals)
         rows, new = clocks.advance(*ends, own=True), goals[:0]
         if len(rows):
-            offered = self._candidates(candidates[rows] if isinstance(candidates, Tensor) else candidates, rows, goal)
+            offered = self._candidates(given.taken(candidates, rows), rows, goal)
             new = clocks.propose(rows, self._seen(states[rows], None), goals[rows], offered, own=True)
         self._learn_if_due()
         changed = torch.zeros(inputs.num_envs, dtype=torch.bool, device=inputs.device).index_fill_(0, rows, True)
@@ -227,8 +226,8 @@ class GoalDirector:
     @own_settings()
     @torch.no_grad()
     def propose(
-        self, rows: Rows, state: Array, goal: Array, candidates: Candidates = None, horizon: Array | int | None = None
-    ) -> Array:
+        self, rows: Rows, state: Array, goal: A, candidates: Candidates = None, horizon: Array | int | None = None
+    ) -> A:
         """Give the listed worlds their next goals, on your clock or, to begin with, on its own.
 
         What was pending there ends: survived where the horizon was not announced, dropped where it was longer. Worlds
@@ -255,8 +254,7 @@ class GoalDirector:
         listed = given.worlds(rows, inputs.num_envs, inputs.device)
         states, goals = inputs.states(state, len(listed)), inputs.goals(goal, len(listed))
         lasts = self._lasts(horizon, len(listed), inputs)
-        if candidates is not None and not callable(candidates):
-            candidates = inputs.candidates(candidates, len(listed))
+        inputs.check_candidates(candidates, len(listed))
         clocks = self._clocks or self._begin(inputs)
         if not len(listed):
             return given.like(goals, goal)
@@ -270,6 +268,7 @@ class GoalDirector:
         return given.like(new, goal)
 
     @own_settings()
+    @torch.no_grad()
     def learn(self, rollout: Transitions | None = None) -> dict[str, float]:
         """Update the selector now, besides every ``learn_every`` steps.
 
@@ -405,7 +404,7 @@ class GoalDirector:
         self._sizes = inputs.num_envs, inputs.state_dim, inputs.goal_dim
         return self._clocks
 
-    def _candidates(self, candidates: Candidates, rows: Tensor, model: Array) -> Tensor:
+    def _candidates(self, candidates: Candidates, rows: Tensor, model: A) -> Tensor:
         """Candidates of the listed worlds, shape (m, N, goal_dim): the given ones, made or drawn."""
         clocks, share = self._known, self.goal_range
         if candidates is None:

@@ -1,7 +1,8 @@
 """What other people's loops hand over, as tensors of ours: checked, without gradients, floats as float32."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,7 +12,9 @@ from deimos.goals.selector import Transitions
 from deimos.nn.random import Purpose, uniforms
 
 Array = Tensor | np.ndarray
-Rows = Array | slice | list[int] | None
+A = TypeVar("A", Tensor, np.ndarray)  # what comes back is of the kind of what came in
+Bound = Array | Sequence[float]
+Rows = Array | slice | Sequence[int] | None
 Candidates = Array | Callable[[Array], Array] | None
 
 
@@ -27,7 +30,7 @@ def matrix(name: str, value: Array, components: str) -> tuple[int, int]:
     return shape
 
 
-def tensor(name: str, value: Array | list[int] | int, device: torch.device) -> Tensor:
+def tensor(name: str, value: Bound | int, device: torch.device) -> Tensor:
     """An array or a tensor as a tensor on ``device``, without gradients.
 
     Raises:
@@ -39,14 +42,14 @@ def tensor(name: str, value: Array | list[int] | int, device: torch.device) -> T
                 f"{name} must be on {device}, got it on {value.device}; GoalDirector(device=...) names another one."
             )
         return value.detach()
-    try:  # a copy, which arrays that must not be written to give too
-        return torch.tensor(np.asarray(value), device=device)
+    try:
+        return torch.from_numpy(np.array(value)).to(device)  # a copy, since an array may refuse to be written to
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f"{type(value).__module__}.{type(value).__qualname__}"
         raise ValueError(f"{name} must be an array or a tensor of numbers, got {kind}.") from error
 
 
-def floats(name: str, value: Array, shape: tuple[int, ...], device: torch.device) -> Tensor:
+def floats(name: str, value: Bound, shape: tuple[int, ...], device: torch.device) -> Tensor:
     """Numbers of exactly this shape, float32.
 
     Raises:
@@ -121,7 +124,7 @@ def refuse_not_finite(
         raise ValueError(f"{name} of {what} {world} must be finite, got {numbers[row].tolist()}.")
 
 
-def like(values: Tensor, model: Array) -> Array:
+def like(values: Tensor, model: A) -> A:
     """Values as an array if ``model`` is one, else as a tensor; floats in its dtype, if it has floats."""
     if isinstance(model, Tensor):
         return values.to(model.dtype) if values.is_floating_point() and model.is_floating_point() else values
@@ -129,7 +132,14 @@ def like(values: Tensor, model: Array) -> Array:
     return array.astype(dtype) if values.is_floating_point() and np.issubdtype(dtype, np.floating) else array
 
 
-def replaced(values: Array, rows: Tensor, new: Tensor) -> Array:
+def taken(values: Candidates, rows: Tensor) -> Candidates:
+    """Those of some worlds, int64, shape (m,), if they are there yet."""
+    if values is None or callable(values):
+        return values
+    return values[rows] if isinstance(values, Tensor) else np.asarray(values)[rows.cpu().numpy()]
+
+
+def replaced(values: A, rows: Tensor, new: Tensor) -> A:
     """A copy of ``values``, shape (num_envs, ...), with new rows, int64, shape (m,); whole numbers become float32."""
     if isinstance(values, Tensor):
         copy = values.detach().clone() if values.is_floating_point() else values.float()
@@ -181,13 +191,19 @@ class Inputs:
             refuse_not_finite("executed", pursued)
         return crashed, cut_off, met, pursued
 
+    def check_candidates(self, value: Candidates, count: int) -> None:
+        """Raise ``ValueError`` if they are there, but not those of ``count`` worlds, shape (count, N, goal_dim)."""
+        if value is None or callable(value):
+            return
+        shape = tuple(np.shape(value))
+        if len(shape) != 3 or shape[::2] != (count, self.goal_dim) or shape[1] < 1:
+            expected = f"({count}, N, {self.goal_dim}) with N at least 1"
+            raise ValueError(f"candidates must have the shape {expected}, got {shape}.")
+
     def candidates(self, value: Array, count: int) -> Tensor:
         """Candidates of ``count`` worlds, shape (count, N, goal_dim)."""
-        offered = tensor("candidates", value, self.device)
-        if offered.dim() != 3 or offered.shape[::2] != (count, self.goal_dim) or offered.shape[1] < 1:
-            expected = f"({count}, N, {self.goal_dim}) with N at least 1"
-            raise ValueError(f"candidates must have the shape {expected}, got {tuple(offered.shape)}.")
-        return offered.float()
+        self.check_candidates(value, count)
+        return tensor("candidates", value, self.device).float()
 
     def horizons(self, value: Array | int, count: int, most: int) -> Tensor:
         """Steps that the goals of ``count`` worlds are to last, in [1, most], int64, shape (count,)."""
@@ -223,7 +239,7 @@ class GoalBox:
         ValueError: If they are no box, or not finite.
     """
 
-    def __init__(self, low: Array, high: Array, goal_dim: int, device: torch.device) -> None:
+    def __init__(self, low: Bound, high: Bound, goal_dim: int, device: torch.device) -> None:
         below, above = (floats("goal_box", end, (goal_dim,), device) for end in (low, high))
         self._middle, self._half = (below + above) / 2, (above - below) / 2
         if not bool(((self._half > 0) & self._half.isfinite()).all()):
