@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--num-envs", type=int, default=32)
     args = parser.parse_args()
-    director = GoalDirector("p75", goal_period=100, goal_box=([-LARGEST], [LARGEST]), learn_every=64)
+    director = GoalDirector("p75", goal_period=50, goal_box=([-LARGEST], [LARGEST]), learn_every=64)
     worlds = DirectedVecEnv(make_vec_env(GoalCart, args.num_envs), director, slice(4, 5), closeness)
     PPO("MlpPolicy", worlds, n_steps=64, batch_size=256, seed=0, device="cpu").learn(args.steps)
     places = np.linspace(-LARGEST, LARGEST, 5)[:, None]

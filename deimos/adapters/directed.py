@@ -38,18 +38,20 @@ class GoalSlot:
         parted = isinstance(space, Dict)
         if not isinstance(where, str if parted else slice) or (parted and where not in space.spaces):
             raise ValueError(f"where must be a key of a Dict or a slice of a Box, got {where!r} for {space}.")
-        self.director, self.where, self._next_step = director, where, next_step
-        self.goal: np.ndarray | None = None
-        """The goals in force, shape (num_envs, goal_dim); ``None`` before the first reset."""
+        self.director, self._next_step, self._begun = director, next_step, False
+        self.where: Any = where  # a key of dictionaries, else a slice of arrays
+        self.goal: np.ndarray
+        """The goals in force, shape (num_envs, goal_dim), from the first reset on."""
         self._space, self._spaces = space, batch_space(space, num_envs)
 
     def begin(self, obs: Observation) -> Observation:
         """First goals for all worlds, which begin an episode, in their observations; what is pending is dropped."""
-        if self.goal is not None:
+        if self._begun:
             everybody = np.ones(len(self.goal), dtype=bool)
             self.director.observe(~everybody, everybody)
             if self._next_step:  # the step that a reset takes
                 self.director.observe(~everybody, ~everybody)
+        self._begun = True
         self.goal = self.director.propose(None, self.state(obs), self.read(obs))
         return self.write(obs)
 
