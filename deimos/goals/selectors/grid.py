@@ -62,9 +62,7 @@ class Grid(GoalSelector):
         if largest > 2**20:
             raise ValueError(f"bins must give at most 2^20 cells per group, got {config.bins} bins: {largest} cells.")
         self._weights = tuple(self._initial(len(group), device) for group in self._groups)
-        self._seen = torch.zeros(
-            spaces.goal_dim, dtype=torch.float32, device=device
-        )  # largest candidate so far, per component
+        self._seen = torch.zeros(spaces.goal_dim, dtype=torch.float32, device=device)  # largest candidate so far
         self._half = torch.zeros(spaces.goal_dim, dtype=torch.float32, device=device)  # what the cells are cut from
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False

@@ -6,6 +6,7 @@ interaction of max(advantage, 0).
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -62,17 +63,12 @@ class PLR(GoalSelector):
         self.config = config
         self.num_candidates = config.candidates
         device = spaces.device
-        self._level = torch.zeros(config.capacity, spaces.goal_dim, dtype=torch.float32, device=device)
-        self._score = torch.full(
-            (config.capacity,), -torch.inf, dtype=torch.float32, device=device
-        )  # -inf marks a free place
+        zeros = partial(torch.zeros, dtype=torch.float32, device=device)
+        self._level = zeros(config.capacity, spaces.goal_dim)
+        self._score = zeros(config.capacity).fill_(-torch.inf)  # -inf marks a free place
         self._made, self._seen = torch.zeros(2, config.capacity, dtype=torch.int64, device=device)  # steps
-        self._upto = torch.zeros(
-            config.capacity, dtype=torch.float32, device=device
-        )  # cumulated chance of being replayed
-        self._carry = torch.zeros(
-            spaces.num_envs, dtype=torch.float32, device=device
-        )  # of the pending interaction, up to the last rollout
+        self._upto = zeros(config.capacity)  # cumulated chance of being replayed
+        self._carry = zeros(spaces.num_envs)  # of the pending interaction, up to the last rollout
         self._learnt_at = 0  # step of the last call of learn
         self.replaying = False
         """Whether the buffer holds enough."""
