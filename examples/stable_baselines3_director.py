@@ -14,10 +14,10 @@ LARGEST = 3.0  # [m]; the track ends at 2.4 m
 
 
 class GoalCart(gym.ObservationWrapper):
-    """CartPole-v1 with a place for a goal behind its four observations."""
+    """CartPole-v1 with a place for a goal behind its four observations. A crash is rewarded by -1, all else by 0."""
 
     def __init__(self) -> None:
-        super().__init__(gym.make("CartPole-v1"))
+        super().__init__(gym.make("CartPole-v1", sutton_barto_reward=True))
         high = np.append(self.env.observation_space.high, np.float32(LARGEST))
         self.observation_space = gym.spaces.Box(-high, high)
 
@@ -27,7 +27,7 @@ class GoalCart(gym.ObservationWrapper):
 
 
 def closeness(obs: np.ndarray, reward: np.ndarray) -> np.ndarray:
-    """Rewards in [0, 1]: how close the cart is to the goal."""
+    """1 at the goal, 0 at the greatest distance that there is."""
     return 1.0 - np.abs(obs[:, 0] - obs[:, 4]) / (2.4 + LARGEST)
 
 
