@@ -14,7 +14,6 @@ import gymnasium
 import numpy as np
 import torch
 import tyro
-from gymnasium.spaces import Box
 from rich.table import Table
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -26,9 +25,9 @@ from deimos.goals.fear import Fear, FearConfig
 from deimos.nn.threads import torch_on_one
 from deimos.study.permutation import p_values
 from deimos.study.stats import bootstrap_t
+from examples.stable_baselines3_director import LARGEST, GoalCart, closeness
 from reproduction.claims import holm
 
-TRACK, LARGEST = 2.4, 3.0  # [m]: gymnasium's track ends at 2.4 m either side; goals are places out to 3 m
 PERIOD = 100  # T [steps of 0.02 s]
 WORLDS, STEPS = 64, 3000  # of every part of an evaluation
 GOAL = slice(4, 5)
@@ -42,26 +41,6 @@ Choose = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
 """Next goals, shape (n, 1), from the states and the goals of the worlds that are due, shapes (n, 4) and (n, 1)."""
 
 
-class GoalCart(gymnasium.ObservationWrapper):
-    """CartPole-v1 whose last observation is a goal, which a Director writes there."""
-
-    def __init__(self) -> None:
-        # Its rewards are -1 at a crash and else 0.
-        super().__init__(gymnasium.make("CartPole-v1", sutton_barto_reward=True))
-        space = self.env.observation_space
-        low, high = np.append(space.low, -LARGEST), np.append(space.high, LARGEST)
-        self.observation_space = Box(low.astype(np.float32), high.astype(np.float32))
-
-    def observation(self, observation: np.ndarray) -> np.ndarray:
-        """The observation and a place for the goal."""
-        return np.append(observation, np.float32(0.0))
-
-
-def matching(obs: np.ndarray) -> np.ndarray:
-    """1 - d / d_max for the distance d between the cart and its goal, as in the thesis's Particle Gym; in [0, 1]."""
-    return np.clip(1.0 - np.abs(obs[:, 0] - obs[:, 4]) / (TRACK + LARGEST), 0.0, 1.0)
-
-
 def train(method: str, seed: int, steps: int) -> PPO:
     """A policy of Stable-Baselines3's PPO at its defaults but for 32 worlds of 64 steps, and minibatches of 256."""
     selector, penalty = METHODS[method]
@@ -69,7 +48,7 @@ def train(method: str, seed: int, steps: int) -> PPO:
     director = GoalDirector(selector, PERIOD, goal_box=box, learn_every=64, total_steps=steps // 32, seed=seed)
 
     def reward(obs: np.ndarray, crash: np.ndarray) -> np.ndarray:
-        return matching(obs) + penalty * crash
+        return closeness(obs, crash) + penalty * crash
 
     venv = DirectedVecEnv(DummyVecEnv([GoalCart] * 32), director, GOAL, reward=reward)
     policy = PPO("MlpPolicy", venv, n_steps=64, batch_size=256, seed=seed, device="cpu")
@@ -108,19 +87,20 @@ def play(policy: PPO, choose: Choose, seed: int) -> Outcomes:
     clock, begins, done = np.zeros(WORLDS, int), np.ones(WORLDS, bool), np.zeros(WORLDS, bool)
     pending = np.full((WORLDS, 6), np.nan, np.float32)
     found, rewards = [], []
-    for _ in range(STEPS):
+    for step in range(STEPS):
         goal[begins], clock[begins] = anywhere(state[begins], goal[begins], rng), 0
         due = np.flatnonzero((clock == PERIOD) & ~done)
         if len(due):
             chosen = choose(state[due], goal[due], rng)
-            pending[due] = np.concatenate([state[due], goal[due], chosen], axis=1)
+            if step + PERIOD <= STEPS:  # of later ones only the crashes would be known at the end
+                pending[due] = np.concatenate([state[due], goal[due], chosen], axis=1)
             goal[due], clock[due] = chosen, 0
         action = policy.predict(np.concatenate([state, goal], axis=1), deterministic=True)[0]
         begins = done
         state, _, crashed, truncated, _ = envs.step(action)
         done = crashed | truncated
         clock += ~begins
-        rewards.append(matching(np.concatenate([state, goal], axis=1))[~begins])
+        rewards.append(closeness(np.concatenate([state, goal], axis=1), crashed)[~begins])
         over = np.flatnonzero((crashed | (clock == PERIOD)) & ~np.isnan(pending[:, 0]))
         found.append((pending[over], over, crashed[over]))
         pending[over] = pending[done] = np.nan

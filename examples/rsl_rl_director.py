@@ -13,46 +13,46 @@ from deimos import GoalDirector
 class Carts(VecEnv):
     """Carts on a track of 2 m. An action accelerates [m/s^2]; the goal is a speed [m/s]; off the track is a crash."""
 
-    num_actions, max_episode_length, device = 1, 500, "cpu"
-
-    def __init__(self, num_envs: int, director: GoalDirector) -> None:
-        self.num_envs, self.director, self.cfg = num_envs, director, {}
-        self.state, self.episode_length_buf = torch.zeros(num_envs, 2), torch.zeros(num_envs, dtype=torch.long)
-        self.goal = director.propose(None, self.state, torch.zeros(num_envs, 1))  # the state is position and speed
+    def __init__(self, director: GoalDirector) -> None:
+        self.num_envs, self.num_actions, self.max_episode_length, self.device, self.cfg = 256, 1, 500, "cpu", {}
+        self.director, self.state = director, torch.zeros(256, 2)  # position, speed
+        self.goal = director.propose(None, self.state, torch.zeros(256, 1))
+        self.episode_length_buf = torch.zeros(256, dtype=torch.long)
 
     def get_observations(self) -> TensorDict:  # noqa: D102
         return TensorDict({"policy": torch.cat([self.state, self.goal], dim=1)}, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:  # noqa: D102
-        self.state[:, 1] += 0.05 * actions[:, 0].clamp(-2.0, 2.0)
-        self.state[:, 0] += 0.05 * self.state[:, 1]
+        self.state += 0.05 * torch.stack([self.state[:, 1], actions[:, 0].clamp(-2.0, 2.0)], dim=1)
         self.episode_length_buf += 1
         reward = torch.exp(-4.0 * (self.state[:, 1] - self.goal[:, 0]).square())
         crashed = self.state[:, 0].abs() > 1.0
-        done = crashed | (timed_out := (self.episode_length_buf >= self.max_episode_length) & ~crashed)
+        timed_out = (self.episode_length_buf >= self.max_episode_length) & ~crashed
         self.goal = self.director.step(self.state, self.goal, crashed, timed_out).goal
-        self.state[done], self.episode_length_buf[done] = 0.0, 0
-        return self.get_observations(), reward, done, {"time_outs": timed_out.float()}
+        self.state[crashed | timed_out], self.episode_length_buf[crashed | timed_out] = 0.0, 0
+        return self.get_observations(), reward, crashed | timed_out, {"time_outs": timed_out.float()}
 
 
 def main() -> None:
     """Train, and say which speeds the policy has to fear close to the end of the track."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=100)
-    parser.add_argument("--num-envs", type=int, default=512)
     parser.add_argument("--resume", help="a checkpoint to go on from, as this leaves in carts.pt")
     args = parser.parse_args()
-    env = Carts(args.num_envs, GoalDirector("p75", goal_period=40, goal_box=([-1.0], [1.0])))
+    env = Carts(GoalDirector("p75", goal_period=40, goal_box=([-1.0], [1.0])))
     model = {"class_name": "MLPModel", "hidden_dims": [32, 32], "activation": "elu"}
     config = {"actor": model | {"distribution_cfg": {"class_name": "GaussianDistribution"}}, "critic": model}
     config |= {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "algorithm": {"class_name": "PPO"}}
     runner = OnPolicyRunner(env, config | {"num_steps_per_env": 24, "save_interval": 10**6})
     if args.resume:
-        env.director.load_state_dict(runner.load(args.resume)["director"])
+        saved = runner.load(args.resume)
+        env.director.load_state_dict(saved["director"])
+        env.state, env.goal, env.episode_length_buf = saved["env"]
     runner.learn(args.iterations)
-    runner.save("carts.pt", infos={"director": env.director.state_dict()})
+    infos = {"director": env.director.state_dict(), "env": (env.state, env.goal, env.episode_length_buf)}
+    runner.save("carts.pt", infos)
     edge, speeds = torch.tensor([0.9, 0.0]).expand(5, 2), torch.linspace(-1, 1, 5).unsqueeze(1)
-    for speed, fear in zip(speeds[:, 0], env.director.fear(edge, torch.zeros(5, 1), speeds).probability, strict=True):
+    for speed, fear in zip(speeds[:, 0], env.director.fear(edge, 0 * speeds, speeds).probability, strict=True):
         print(f"{speed:+.1f} m/s  {fear:.2f}")
 
 

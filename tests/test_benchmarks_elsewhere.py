@@ -46,6 +46,14 @@ def test_every_period_has_one_outcome():
     assert (np.abs(outcomes.inputs[:, 4:]) <= elsewhere.LARGEST).all()
 
 
+def test_goals_of_the_last_period_do_not_count(monkeypatch):
+    """A goal whose T steps the evaluation does not see is left out, also where the cart crashes on it."""
+    monkeypatch.setattr(elsewhere, "STEPS", 2 * elsewhere.PERIOD - 1)
+    assert len(elsewhere.play(FOLLOWS, elsewhere.beyond, seed=0).crashed) == 0
+    monkeypatch.setattr(elsewhere, "STEPS", 2 * elsewhere.PERIOD)
+    assert len(elsewhere.play(FOLLOWS, elsewhere.beyond, seed=0).crashed) > 4
+
+
 def test_attackers_crash_a_follower():
     """A policy that follows goals off its track crashes where it is asked to."""
     beyond = elsewhere.play(FOLLOWS, elsewhere.beyond, seed=0)

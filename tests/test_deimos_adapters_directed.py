@@ -221,6 +221,23 @@ def test_autoreset_modes_of_gymnasium_give_the_same_goals(parted):
         assert len({goal for goal, *_ in other}) > 12
 
 
+def play(envs, steps):
+    """An episode or more."""
+    envs.reset(seed=0)
+    for _ in range(steps):
+        envs.step(np.zeros((4, 1), np.float32))
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_a_director_that_expects_other_resets_is_refused(mode):
+    """At the first end of an episode the mistake shows, and the message says what the Director must be made with."""
+    other = {AutoresetMode.SAME_STEP: "NextStep", AutoresetMode.NEXT_STEP: "SameStep"}[mode]
+    director = GoalDirector("uniform", PERIOD, goal_box=BOX, autoreset=other)
+    envs = DirectedVectorEnv(SyncVectorEnv([Counter] * 4, autoreset_mode=mode), director, slice(2, 3), closeness)
+    with pytest.raises(ValueError, match=f"director must be made with autoreset='{mode.value}'"):
+        play(envs, LIMIT)
+
+
 def test_fear_is_learnt_in_a_wrapped_vector():
     """The wrapper hands over outcomes from which the Director's network learns."""
     _, director = histories(AutoresetMode.NEXT_STEP, parted=False, selector="p75", steps=200)

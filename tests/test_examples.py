@@ -12,8 +12,8 @@ import pytest
 HOME = Path(__file__).resolve().parent.parent
 BUDGETS = {
     "gymnasium_director": ["--steps", "400"],
-    "rsl_rl_director": ["--iterations", "8", "--num-envs", "256"],
-    "stable_baselines3_director": ["--steps", "8192"],
+    "rsl_rl_director": ["--iterations", "8"],
+    "stable_baselines3_director": ["--steps", "24576"],
 }
 ELSEWHERE = {
     "mjlab_director": ".ci/integrations",  # its pins do not go with ours

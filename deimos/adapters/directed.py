@@ -26,35 +26,32 @@ class GoalSlot:
         space: Observation space of one world: a ``Box`` of one axis, or a ``Dict``.
         num_envs: Number of worlds.
         where: The goal's components of a ``Box``, or its key in a ``Dict``.
+        next_step: Whether a world that is done is reset in a step of its own.
 
     Raises:
         ValueError: If the space has no such place.
     """
 
-    def __init__(self, director: GoalDirector, space: Space, num_envs: int, where: slice | str) -> None:
+    def __init__(
+        self, director: GoalDirector, space: Space, num_envs: int, where: slice | str, next_step: bool = False
+    ) -> None:
         parted = isinstance(space, Dict)
         if not isinstance(where, str if parted else slice) or (parted and where not in space.spaces):
             raise ValueError(f"where must be a key of a Dict or a slice of a Box, got {where!r} for {space}.")
-        self.director, self.where = director, where
-        self.goal: np.ndarray | None = None
-        """The goals in force, shape (num_envs, goal_dim); ``None`` before the first reset."""
+        self.director, self._next_step, self._begun = director, next_step, False
+        self.where: Any = where  # a key of dictionaries, else a slice of arrays
+        self.goal: np.ndarray
+        """The goals in force, shape (num_envs, goal_dim), from the first reset on."""
         self._space, self._spaces = space, batch_space(space, num_envs)
 
-    def begin(self, obs: Observation, next_step: bool = False) -> Observation:
-        """First goals for all worlds, which begin an episode; what is pending is dropped.
-
-        Args:
-            obs: Their observations.
-            next_step: Whether the Director expects a step of its own for the reset of a world.
-
-        Returns:
-            The observations with the goals.
-        """
-        if self.goal is not None:
+    def begin(self, obs: Observation) -> Observation:
+        """First goals for all worlds, which begin an episode, in their observations; what is pending is dropped."""
+        if self._begun:
             everybody = np.ones(len(self.goal), dtype=bool)
             self.director.observe(~everybody, everybody)
-            if next_step:
+            if self._next_step:  # the step that a reset takes
                 self.director.observe(~everybody, ~everybody)
+        self._begun = True
         self.goal = self.director.propose(None, self.state(obs), self.read(obs))
         return self.write(obs)
 
@@ -81,8 +78,15 @@ class GoalSlot:
             obs: Observations to act on next.
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
+
+        Raises:
+            ValueError: If the Director expects resets at another time.
         """
-        self.goal = self.director.step(self.state(obs), self.goal, terminated, truncated).goal
+        chosen = self.director.step(self.state(obs), self.goal, terminated, truncated)
+        if (chosen.changed[terminated | truncated] == self._next_step).any():
+            mode = (AutoresetMode.NEXT_STEP if self._next_step else AutoresetMode.SAME_STEP).value
+            raise ValueError(f"director must be made with autoreset='{mode}', as these worlds are reset.")
+        self.goal = chosen.goal
         return self.write(obs)
 
     def state(self, obs: Observation) -> np.ndarray:
@@ -126,14 +130,15 @@ class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
         self._mode = env.metadata["autoreset_mode"]
         if self._mode is AutoresetMode.DISABLED:
             raise ValueError("env must reset worlds that are done by itself, got AutoresetMode.DISABLED.")
-        self.slot = GoalSlot(director, env.single_observation_space, env.num_envs, where)
+        next_step = self._mode is AutoresetMode.NEXT_STEP
+        self.slot = GoalSlot(director, env.single_observation_space, env.num_envs, where, next_step)
         self._reward, self._over = reward, np.zeros(env.num_envs, dtype=bool)
 
     def reset(self, **options: Any) -> tuple[Observation, dict[str, Any]]:
         """See ``VectorEnv.reset``; every world gets a first goal."""
         obs, infos = self.env.reset(**options)
         self._over[:] = False
-        return self.slot.begin(obs, self._mode is AutoresetMode.NEXT_STEP), infos
+        return self.slot.begin(obs), infos
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """See ``VectorEnv.step``; what an episode ended in, and its reward, are of the goal that was in force."""

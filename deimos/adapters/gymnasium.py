@@ -5,7 +5,7 @@ Importing this module registers ``ENVIRONMENTS``: ``gymnasium.make("Deimos/Parti
 
 from functools import partial
 from numbers import Integral
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -171,7 +171,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._fresh, self._over = begins, done & ~begins
         infos: dict = {}
         for world in np.flatnonzero(done.cpu()) if same_step else ():
-            infos = self._add_info(infos, {"final_obs": _world(final_obs, world), "final_info": {}}, world)
+            infos = self._add_info(infos, {"final_obs": _world(final_obs, int(world)), "final_info": {}}, world)
         return self._seen(), reward, terminated, truncated, infos
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> np.ndarray:
@@ -201,8 +201,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         env = self.loop.env
         if not self._goal_dict:
             return _copy(env.obs)
+        achieved = cast(torch.Tensor, env.achieved(env.obs))  # the constructor has refused what gives None
         return {
-            "observation": _copy(env.state(env.obs)), "achieved_goal": _copy(env.achieved(env.obs)),
+            "observation": _copy(env.state(env.obs)), "achieved_goal": _copy(achieved),
             "desired_goal": _copy(env.obs[:, env.goal_slice]),
         }  # fmt: skip
 

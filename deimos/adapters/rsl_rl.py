@@ -83,7 +83,7 @@ class RslRlVecEnv(VecEnv):
         self.env.check()  # rsl_rl looks for NaN in what comes back, but a clipped NaN is a number
         rewards = step.reward * self.reward_scale
         dones = step.terminated | step.truncated
-        extras = {"time_outs": step.truncated.float()}
+        extras: dict[str, Any] = {"time_outs": step.truncated.float()}
         self.loop.advance(step)
         self._steps += 1
         if self._steps % self._report_every == 0 and (report := self.env.report()):

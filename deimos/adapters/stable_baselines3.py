@@ -1,6 +1,6 @@
 """A Director in Stable-Baselines3's training loops."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -11,6 +11,8 @@ from deimos.goals.director import GoalDirector
 
 class DirectedVecEnv(VecEnvWrapper):
     """Worlds whose goals a Director chooses: it overwrites the goal in every observation, and the reward follows it.
+
+    A ``Monitor`` within reports the worlds' own rewards: put a ``VecMonitor`` around it.
 
     Args:
         venv: The worlds. What terminates is a crash; ``TimeLimit.truncated`` in an info is not.
@@ -47,8 +49,9 @@ class DirectedVecEnv(VecEnvWrapper):
         for world, observation in last.items():
             infos[world]["terminal_observation"] = observation
         if self._reward is None:
-            desired = ended[self.slot.where]
-            (reward,) = self.env_method("compute_reward", ended["achieved_goal"], desired, np.array(infos), indices=[0])
+            goals = cast(dict, ended)
+            both = goals["achieved_goal"], goals[self.slot.where]
+            (reward,) = self.env_method("compute_reward", *both, np.array(infos), indices=[0])
         else:
             reward = self._reward(ended, reward)
         truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
