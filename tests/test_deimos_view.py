@@ -344,8 +344,9 @@ def test_what_cannot_be_shown_is_one_line(scared, tmp_path, monkeypatch, capsys,
     assert not list(tmp_path.iterdir())
 
 
-def test_a_port_in_use_is_one_line(scared, capsys):
-    """A port that another program listens on is refused in one line with the way out."""
+def test_a_port_in_use_is_one_line(scared, capsys, monkeypatch):
+    """A port that another program listens on is refused in one line with the way out, before attackers learn."""
+    monkeypatch.delattr("deimos.app.view.prepare")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         assert cli.main(["view", str(scared), "--port", str(port), "--seconds", "1"]) == 2
