@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from benchmarks import viewer
-from deimos.app.loading import SavedRun
 from deimos.app.view import simulate
 from deimos.app.viewer_panel import Panel
 from deimos.app.viewer_scene import build_scene
@@ -22,6 +21,7 @@ from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.run import training
 from deimos.run.attack import argmax_director
+from deimos.run.saved import SavedRun
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs.particle import Config
 

@@ -15,7 +15,6 @@ import tyro
 from deimos.app import console
 from deimos.app.drawing import with_caption
 from deimos.app.findings import percent
-from deimos.app.loading import SavedRun
 from deimos.app.playback import LARGEST, choose_renderer, rendering
 from deimos.app.video import video
 from deimos.app.viewer_panel import Moment, Panel
@@ -24,6 +23,7 @@ from deimos.app.viewer_session import UNIFORM, Session, prepare
 from deimos.app.viewer_web import HOST, check_port, serve
 from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.run.attack import names as attacker_names
+from deimos.run.saved import SavedRun
 
 PATIENCE = 1.0  # [s] between two looks at whether the run has written a checkpoint
 SIDE_OF_MAP = 0.3  # of a picture's height, in its corner
