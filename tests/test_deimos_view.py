@@ -298,9 +298,10 @@ def test_what_begins_again_has_no_ends(scared, again, steps):
     """A reset and another world end no episode: marks, trail and velocities are gone."""
     session = session_of(scared, worlds=3)
     scene = build_scene(session)
-    session.env.tensors["position"][1] = torch.tensor([999.0, 0.0, 0.0])
-    session.env.tensors["velocity"][1] = torch.tensor([200.0, 0.0, 0.0])
-    for _ in range(9):
+    for step in range(9):
+        if step == 6:
+            session.env.tensors["position"][1] = torch.tensor([999.0, 0.0, 0.0])
+            session.env.tensors["velocity"][1] = torch.tensor([200.0, 0.0, 0.0])
         session.step()
         scene.update()
     assert scene._ends
