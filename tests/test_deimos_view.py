@@ -13,13 +13,14 @@ import torch
 from PIL import Image, ImageSequence
 
 from deimos.app import cli
-from deimos.app.loading import SavedRun
 from deimos.app.view import ViewOptions, caption
 from deimos.app.viewer_panel import Moment, Panel
 from deimos.app.viewer_scene import BoxScene, RobotScene, build_scene, palette, shades
-from deimos.app.viewer_session import BY_HAND, SIDE, UNIFORM, FearMap, Session, components, prepare
+from deimos.app.viewer_session import BY_HAND, SIDE, UNIFORM, FearMap, Session, prepare
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy, save_policy
+from deimos.nn.layout import ObsField, goal_components
+from deimos.run.saved import SavedRun
 from deimos.sim.envs.particle import Config
 
 WALK = Path(__file__).parent.parent / "docs" / "results" / "quad_flat"
@@ -65,8 +66,8 @@ def test_the_next_goal_is_announced(scared):
     announced = session.next_goal()
     assert announced == session.next_goal() != session.goal
     assert steps_to_next_goal(session) == steps_to_next_goal(silent)
-    if not session.crashes:
-        assert session.goal == pytest.approx(announced)
+    assert not session.crashes
+    assert session.goal == pytest.approx(announced)
     assert session.goal == silent.goal
 
 
@@ -188,8 +189,11 @@ def test_a_new_checkpoint_is_loaded_where_the_worlds_are(scared, tmp_path):
         for weights in policy.actor.parameters():
             weights.add_(1.0)
     save_policy(run / "policy.pt", policy)
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    torch.save(state | {"iteration": 7}, run / "checkpoint.pt")  # the log is ahead of it
     assert session.reload()
     assert (session.steps, session.goals.current) == (5, "p75")
+    assert session.iteration == 7
     assert torch.equal(session.env.obs, place)
     assert not torch.equal(session._policy.scaled(session.env.obs), before)
     assert not session.reload()
@@ -198,7 +202,7 @@ def test_a_new_checkpoint_is_loaded_where_the_worlds_are(scared, tmp_path):
 def test_components_have_names_and_units():
     """Components of a goal are called after its groups, with units, and have the scale that the policy sees."""
     session = session_of(WALK, worlds=1)
-    assert [component.name for component in session.components] == [
+    assert [component.label for component in session.components] == [
         "velocity x [m/s]", "velocity y [m/s]", "yaw rate [rad/s]"
     ]  # fmt: skip
     assert [component.scale for component in session.components] == [2.0, 2.0, 0.25]
@@ -226,8 +230,8 @@ def ramp(axes=(0, 1)):
     return FearMap(axes, (-1.0, -1.0), (1.0, 1.0), torch.linspace(0.1, 0.9, SIDE).expand(SIDE, SIDE))
 
 
-def test_the_carpet_is_brightest_where_fear_is_highest():
-    """Where fear grows with forward velocity, the carpet's tiles get brighter along the robot's heading."""
+def test_tiles_are_brightest_where_fear_is_highest():
+    """Where fear grows with forward velocity, the tiles of fear get brighter along the robot's heading."""
     session = session_of(WALK, worlds=1)
     scene = RobotScene(session)
     w, x, y, z = scene.data.qpos[3:7]
@@ -239,12 +243,12 @@ def test_the_carpet_is_brightest_where_fear_is_highest():
     assert np.corrcoef(ahead, brightness)[0, 1] > 0.95
     assert scene.shapes(ramp((0, 2))) == []  # not over a yaw rate
     assert scene.shapes(None) == []
-    scene.has_carpet = False
+    scene.has_tiles = False
     assert scene.shapes(ramp()) == []
 
 
-def test_there_is_no_carpet_on_rough_ground():
-    """On another ground than the policy was trained on it acts as well, and there is no carpet on it."""
+def test_there_are_no_tiles_on_rough_ground():
+    """On another ground than the policy was trained on it acts as well, and there are no tiles of fear."""
     scene = RobotScene(session_of(WALK, worlds=1, terrain="rough"))
     assert scene.shapes(ramp()) == []
     assert scene.model.nhfield == 1
@@ -286,6 +290,28 @@ def test_particles_are_shown_where_they_are(scared):
     goal = scene.shapes(None)[0]
     np.testing.assert_allclose(goal.pos, session.env.sketch(0).target / 1000.0, atol=1e-6)
     assert len(scene._ends) == session.episodes
+
+
+@pytest.mark.parametrize("again", [Session.reset, lambda session: session.go_to(7)], ids=["reset", "another world"])
+@pytest.mark.parametrize("steps", [0, 1], ids=["paused", "running"])
+def test_what_begins_again_has_no_ends(scared, again, steps):
+    """A reset and another world end no episode: marks, trail and velocities are gone."""
+    session = session_of(scared, worlds=3)
+    scene = build_scene(session)
+    for step in range(9):
+        if step == 6:
+            session.env.tensors["position"][1] = torch.tensor([999.0, 0.0, 0.0])
+            session.env.tensors["velocity"][1] = torch.tensor([200.0, 0.0, 0.0])
+        session.step()
+        scene.update()
+    assert scene._ends
+    assert scene._trail
+    again(session)
+    for _ in range(steps):
+        session.step()
+    scene.update()
+    assert scene._ends == scene._trail == []
+    assert not scene._velocity.any()
 
 
 def test_colours_span_the_map():
@@ -344,8 +370,9 @@ def test_what_cannot_be_shown_is_one_line(scared, tmp_path, monkeypatch, capsys,
     assert not list(tmp_path.iterdir())
 
 
-def test_a_port_in_use_is_one_line(scared, capsys):
-    """A port that another program listens on is refused in one line with the way out."""
+def test_a_port_in_use_is_one_line(scared, capsys, monkeypatch):
+    """A port that another program listens on is refused in one line with the way out, before attackers learn."""
+    monkeypatch.delattr("deimos.app.view.prepare")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         assert cli.main(["view", str(scared), "--port", str(port), "--seconds", "1"]) == 2
@@ -375,7 +402,28 @@ def test_options_are_checked():
             ViewOptions(run=Path("run"), **options)
 
 
+def labels(field, groups=(slice(None),), names=("goal",)):
+    """Names with units of the components of a goal, between other fields."""
+    layout = (ObsField("velocity", 3, "m/s", 1.0), field, ObsField("action", 2, "1", 1.0))
+    return [component.label for component in goal_components(layout, groups, names)]
+
+
 def test_a_goal_of_one_unit_has_it_on_every_component():
     """A particle's goal has three components of one unit."""
-    names = [component.name for component in components(Config().build(1, torch.device("cpu"), 0))]
-    assert names == ["goal x [u/step]", "goal y [u/step]", "goal z [u/step]"]
+    env = Config().build(1, torch.device("cpu"), 0)
+    found = goal_components(env.layout, env.goal_groups, env.goal_group_names)
+    assert [component.label for component in found] == ["goal x [u/step]", "goal y [u/step]", "goal z [u/step]"]
+    assert [component.name for component in found] == ["goal x", "goal y", "goal z"]
+
+
+def test_components_are_called_after_their_group():
+    """One alone has the group's name, up to three have letters, more have numbers; groups may stand in any order."""
+    field = ObsField("goal", 4, "m, m, m, rad", (1.0, 2.0, 3.0, 4.0))
+    places = ["place x [m]", "place y [m]", "place z [m]"]
+    assert labels(field, (slice(3, 4), slice(0, 3)), ("turn", "place")) == [*places, "turn [rad]"]
+    assert labels(field) == ["goal 0 [m]", "goal 1 [m]", "goal 2 [m]", "goal 3 [rad]"]
+    assert labels(ObsField("goal", 2, "1", 1.0)) == ["goal x", "goal y"]
+    scales = [component.scale for component in goal_components((field,), (slice(None),), ("goal",))]
+    assert scales == [1.0, 2.0, 3.0, 4.0]
+    with pytest.raises(ValueError, match="The layout has no field named 'goal'"):
+        goal_components((ObsField("velocity", 3, "m/s", 1.0),), (), ())

@@ -2,6 +2,7 @@
 
 import errno
 import gc
+import http.client
 import socket
 import threading
 import time
@@ -11,15 +12,16 @@ import pytest
 import torch
 
 from benchmarks import viewer
-from deimos.app.loading import SavedRun
 from deimos.app.view import simulate
 from deimos.app.viewer_panel import Panel
 from deimos.app.viewer_scene import build_scene
 from deimos.app.viewer_session import BY_HAND, Session
-from deimos.app.viewer_web import serve
+from deimos.app.viewer_web import check_port, serve
+from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.run import training
 from deimos.run.attack import argmax_director
+from deimos.run.saved import SavedRun
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs.particle import Config
 
@@ -158,13 +160,90 @@ def test_no_other_address_is_served(robot):
                 assert caller.connect_ex((address, port)) in (errno.ECONNREFUSED, errno.EADDRNOTAVAIL), address
 
 
+def answer_to(port, path, host="127.0.0.1:{port}", origin=None):
+    """Status of the answer to a request for a WebSocket, or for a file, with the headers of a page."""
+    headers = {"Host": host.format(port=port)} | ({} if origin is None else {"Origin": origin.format(port=port)})
+    if path.startswith(("/ui", "/state", "/drop")):
+        headers |= {
+            "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        }  # fmt: skip
+    caller = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    try:
+        caller.request("GET", path, headers=headers)
+        return caller.getresponse().status
+    finally:
+        caller.close()
+
+
+def test_only_its_own_page_is_answered(robot):
+    """Another page in the browser, or one by another name of this machine, gets nothing; nobody can send files."""
+    with serve(Panel(build_scene(robot)), 0) as (_, port):
+        for path, status in (("/", 200), ("/model", 200), ("/ui?sid=a", 101), ("/state?sid=a", 101)):
+            for host in ("127.0.0.1:{port}", "localhost:{port}", "localhost:9", "localhost"):
+                assert answer_to(port, path, host) == status
+                assert answer_to(port, path, host, f"http://{host}") == status
+                for origin in ("null", "http://example.org", "http://127.0.0.1:1", "https://127.0.0.1:{port}", ""):
+                    assert answer_to(port, path, host, origin) == 403, (path, host, origin)
+            for host in ("example.org:{port}", "127.0.0.1.example.org", "127.0.0.1:{port}@example.org", "", "10.0.0.1"):
+                assert answer_to(port, path, host) == 403, (path, host)
+                assert answer_to(port, path, host, f"http://{host}") == 403, (path, host)
+        for path in ("/drop", "/drop?sid=a", "/dropped"):
+            assert answer_to(port, path) == 403
+            assert answer_to(port, path, origin="http://127.0.0.1:{port}") == 403
+
+
+def test_a_request_with_two_hosts_or_origins_is_refused(robot):
+    """Which of two headers counts is not left to the server."""
+    own = "127.0.0.1:{port}"
+    with serve(Panel(build_scene(robot)), 0) as (_, port):
+        for extra in (["Host: example.org"], [f"Origin: http://{own}", "Origin: http://example.org"]):
+            lines = ["GET / HTTP/1.1", f"Host: {own}", *extra, "", ""]
+            with socket.create_connection(("127.0.0.1", port), timeout=60) as caller:
+                caller.sendall("\r\n".join(lines).format(port=port).encode())
+                assert b" 403 " in caller.recv(100), extra
+
+
+def free_port():
+    """A port that nobody listens on."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
 def test_a_port_is_free_again(robot):
     """Once it is closed, the page is gone and its port can be had again."""
+    wanted = free_port()
     for _ in range(2):
-        with serve(Panel(build_scene(robot)), 18_431) as (_, port):
-            assert port == 18_431
+        with serve(Panel(build_scene(robot)), wanted) as (_, port):
+            assert port == wanted
     with socket.socket() as caller:
-        assert caller.connect_ex(("127.0.0.1", 18_431)) == errno.ECONNREFUSED
+        assert caller.connect_ex(("127.0.0.1", wanted)) == errno.ECONNREFUSED
+
+
+def test_a_port_that_cannot_be_opened_says_why(monkeypatch):
+    """What is wrong with a port is what the system says, not always that it is in use."""
+
+    def refuse(self, address):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "bind", refuse)
+    with pytest.raises(RunError, match=r"Port 80 cannot be opened \(Permission denied\) on 127.0.0.1; choose another"):
+        check_port(80)
+
+
+def test_a_viewer_that_does_not_start_says_why(robot, monkeypatch):
+    """Where MuJoCo's viewer cannot be made, its reason is the error, in one line."""
+    from mujoco.studio.web import web_server
+
+    def broken(port):
+        raise RuntimeError("no more\nsockets")
+
+    monkeypatch.setattr(web_server, "bind_loopback_socket", broken)
+    with (
+        pytest.raises(RunError, match="The viewer does not start: no more sockets"),
+        serve(Panel(build_scene(robot)), 0),
+    ):
+        pass
 
 
 def test_a_broken_panel_stops_the_simulation(robot, monkeypatch):

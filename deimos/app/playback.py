@@ -14,13 +14,14 @@ import tyro
 from deimos.app import console
 from deimos.app.drawing import Drawing, with_caption
 from deimos.app.findings import percent
-from deimos.app.loading import SavedRun
 from deimos.app.video import pictures, video
 from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.goals.fear_selector import FearSelector
 from deimos.goals.selectors import uniform
 from deimos.learn.policy import Policy
+from deimos.nn.layout import goal_field
 from deimos.run.loop import GoalLoop, spaces
+from deimos.run.saved import SavedRun
 from deimos.sim.env import Env
 
 LARGEST = 8192  # [pixels] along a side of a picture
@@ -131,7 +132,7 @@ def rendering() -> Iterator[None]:
 
 def _caption(env: Env, afraid: FearSelector | None, t: int, crashes: int) -> str:
     goal = env.obs[:, env.goal_slice]
-    field = next(field for field in env.layout if field.name == "goal")
+    field = goal_field(env.layout)
     physical = (goal[0] / torch.as_tensor(field.scale)).round(decimals=2) + 0.0  # never "-0.00"
     now = f"{t * env.dt:5.2f} s" if env.has_seconds else f"step {t}"
     values = "  ".join(f"{value:+.2f}" for value in physical.tolist())

@@ -15,15 +15,15 @@ import tyro
 from deimos.app import console
 from deimos.app.drawing import with_caption
 from deimos.app.findings import percent
-from deimos.app.loading import SavedRun
 from deimos.app.playback import LARGEST, choose_renderer, rendering
 from deimos.app.video import video
 from deimos.app.viewer_panel import Moment, Panel
 from deimos.app.viewer_scene import Scene, build_scene, palette, shades
 from deimos.app.viewer_session import UNIFORM, Session, prepare
-from deimos.app.viewer_web import HOST, serve
+from deimos.app.viewer_web import HOST, check_port, serve
 from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.run.attack import names as attacker_names
+from deimos.run.saved import SavedRun
 
 PATIENCE = 1.0  # [s] between two looks at whether the run has written a checkpoint
 SIDE_OF_MAP = 0.3  # of a picture's height, in its corner
@@ -92,6 +92,7 @@ def main(arguments: list[str], program: str) -> None:
         with rendering():
             import mujoco  # noqa: F401 (it decides now how it will render)
     run = SavedRun.open(options.run, options.goal_period, options.terrain)
+    check_port(options.port)  # attackers learn for minutes
     with console.progress("attackers learn") as report:
         attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report)
     worlds = options.worlds or (1 if run.has_robots else 8)

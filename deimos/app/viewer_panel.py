@@ -11,7 +11,8 @@ import numpy as np
 
 from deimos.app.findings import percent
 from deimos.app.viewer_scene import Scene, palette, shades
-from deimos.app.viewer_session import Component, FearMap, Session
+from deimos.app.viewer_session import FearMap, Session
+from deimos.nn.layout import GoalComponent
 
 if TYPE_CHECKING:
     import mujoco
@@ -37,7 +38,7 @@ class Moment:
     """Global number of the world."""
     paused: bool
     """Whether it stands still."""
-    components: list[Component]
+    components: list[GoalComponent]
     """What the goal consists of."""
     low: list[float]
     """Lowest values of the goal, in physical units."""
@@ -177,7 +178,7 @@ class Panel:
                 self.place_camera(viewer)
         if self._scene.is_flat:
             imgui.SameLine()
-            _, self._scene.has_carpet = imgui.Checkbox("carpet of fear", self._scene.has_carpet)
+            _, self._scene.has_tiles = imgui.Checkbox("tiles of fear", self._scene.has_tiles)
 
     def _draw_goal(self, imgui: Any, shown: Moment) -> None:
         """A slider per component of the goal: to move one is to choose by hand."""
@@ -185,7 +186,7 @@ class Panel:
         imgui.PushItemWidth(150)
         goal, is_moved = list(shown.goal), False
         for k, component in enumerate(shown.components):
-            moved, goal[k] = imgui.SliderFloat(component.name, goal[k], shown.low[k], shown.high[k], "%.2f")
+            moved, goal[k] = imgui.SliderFloat(component.label, goal[k], shown.low[k], shown.high[k], "%.2f")
             is_moved = is_moved or moved
         imgui.PopItemWidth()
         if is_moved:
@@ -226,14 +227,14 @@ class Panel:
             goal[fear.axes[0]] = low[0] + size[0] * (mouse.x - corner.x) / MAP
             goal[fear.axes[1]] = low[1] + size[1] * (1.0 - (mouse.y - corner.y) / MAP)
             self.ask(lambda session: session.ask(goal))
-        first, second = (shown.components[axis].name for axis in fear.axes)
+        first, second = (shown.components[axis].label for axis in fear.axes)
         least, most = float(fear.probability.min()), float(fear.probability.max())
         imgui.TextUnformatted(f"right: {first}   up: {second}")
         imgui.TextUnformatted(f"dark {percent(least)}, bright {percent(most)}; white: goal, cyan: next")
 
     def _draw_axes(self, imgui: Any, shown: Moment) -> None:
         """Which two components of the goal the map is over."""
-        names, axes = [component.name for component in shown.components], list(shown.axes)
+        names, axes = [component.label for component in shown.components], list(shown.axes)
         imgui.PushItemWidth(140)
         for k, label in enumerate(("##right", "##up")):
             if k:

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 BLUE, ORANGE, RED = (0.0, 0.45, 0.70, 1.0), (0.90, 0.62, 0.0, 1.0), (0.85, 0.10, 0.10, 1.0)
 GREY = (0.45, 0.48, 0.52, 1.0)
-TILES = 11  # tiles of the carpet along each of its sides
-CARPET = 0.8  # half side of the carpet around a robot [m]
+TILES = 11  # tiles of fear along each side of the square around a robot
+AROUND = 0.8  # half side of that square [m]
 FLAT = 1e-6  # largest difference of heights of a flat ground [m]
 MARKS = 200  # ends of episodes that are marked, the last ones
 TRAIL, STRIDE = 60, 3  # pieces of the trail of the first particle, and steps of each
@@ -51,9 +51,9 @@ class Scene(abc.ABC):
     body: int
     """The body that a camera may follow; 0 where nothing is to be followed."""
     is_flat: bool = False
-    """Whether it is a robot on flat ground, where a carpet can lie."""
-    has_carpet: bool = True
-    """Whether fear lies around it as a carpet."""
+    """Whether it is a robot on flat ground, where tiles of fear can lie."""
+    has_tiles: bool = True
+    """Whether tiles of fear lie on the ground around it."""
 
     @abc.abstractmethod
     def update(self) -> None:
@@ -78,7 +78,7 @@ def build_scene(session: Session) -> Scene:
 
 
 class RobotScene(Scene):
-    """The first world of an environment with a ``scene``, with its goal and, on flat ground, a carpet of fear.
+    """The first world of an environment with a ``scene``, with its goal and, on flat ground, tiles of fear.
 
     Args:
         session: Where it lives.
@@ -107,12 +107,12 @@ class RobotScene(Scene):
         point = self._session.env.goal_point(0)
         if point is not None:
             shapes.append(sphere(point, 0.025, RED))
-        if fear is not None and fear.axes == (0, 1) and self.is_flat and self.has_carpet:
-            shapes += self._carpet(fear)
+        if fear is not None and fear.axes == (0, 1) and self.is_flat and self.has_tiles:
+            shapes += self._tiles(fear)
         return shapes
 
-    def _carpet(self, fear: FearMap) -> "list[mujoco.MjvGeom]":
-        """Tiles around the robot: a tile ahead is coloured by the fear of walking ahead, and so on."""
+    def _tiles(self, fear: FearMap) -> "list[mujoco.MjvGeom]":
+        """Tiles on the ground around the robot: a tile ahead is coloured by the fear of walking ahead, and so on."""
         import mujoco
 
         w, x, y, z = self.data.qpos[3:7]
@@ -120,10 +120,10 @@ class RobotScene(Scene):
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         shade = shades(fear)
         picked = np.round(np.linspace(0, len(shade) - 1, TILES)).astype(np.int64)
-        side = CARPET / TILES
+        side = AROUND / TILES
         tiles = []
-        for row, second in zip(picked, np.linspace(-CARPET + side, CARPET - side, TILES), strict=True):
-            for column, first in zip(picked, np.linspace(-CARPET + side, CARPET - side, TILES), strict=True):
+        for row, second in zip(picked, np.linspace(-AROUND + side, AROUND - side, TILES), strict=True):
+            for column, first in zip(picked, np.linspace(-AROUND + side, AROUND - side, TILES), strict=True):
                 place = self.data.qpos[:3] + turn @ np.array([first, second, 0.0])
                 place[2] = self._ground + 0.002  # what is as high as the ground would flicker
                 colour = np.array([*self._colours[shade[row, column]], 0.75], np.float32)
@@ -150,7 +150,7 @@ class BoxScene(Scene):
         self._velocity = np.zeros((len(self._sketches), 3))
         self._ends: list[np.ndarray] = []
         self._trail: list[np.ndarray] = []
-        self._age = session.env.episode_step.tolist()
+        self._age, self._restarts = session.env.episode_step.tolist(), session.restarts
         self.model = _box(len(self._sketches)).compile()
         self.data = mujoco.MjData(self.model)
         self.update()
@@ -164,6 +164,12 @@ class BoxScene(Scene):
         """See ``Scene.update``."""
         import mujoco
 
+        if self._session.restarts > self._restarts:  # no episode has ended
+            self._ends.clear()
+            self._trail.clear()
+            self._velocity[:] = 0.0
+            self._restarts = self._session.restarts
+            self._sketches, self._age = self._look(), self._session.env.episode_step.tolist()
         before, self._sketches = self._sketches, self._look()
         age = self._session.env.episode_step.tolist()
         for world, (old, new) in enumerate(zip(before, self._sketches, strict=True)):

@@ -7,29 +7,20 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from deimos.app.loading import SavedRun
 from deimos.checks import RunError, check_choice
 from deimos.goals.fear_selector import FearSelector
 from deimos.goals.selector import GoalSelector, Proposal
+from deimos.nn.layout import goal_components
 from deimos.run.attack import Attack, argmax_director, attacker, uniform_goals
 from deimos.run.evaluation import make_target
 from deimos.run.loop import GoalLoop
+from deimos.run.saved import SavedRun
 from deimos.sim.env import Env
 
 UNIFORM, BY_HAND = "uniform", "by hand"
 EXTENT = 512  # goals that tell how far goals reach where they fill no box
 SIDE = 21  # points of the map of fear along each of its axes
 WATCHED = ("policy.pt", "checkpoint.pt")  # written one after the other, whole
-
-
-@dataclass(frozen=True)
-class Component:
-    """One component of the goal."""
-
-    name: str
-    """What it is called, with its unit."""
-    scale: float
-    """The policy sees the physical value times this."""
 
 
 @dataclass(frozen=True)
@@ -48,20 +39,6 @@ class FearMap:
     probability: Tensor
     """In (0, 1), float32, shape (SIDE, SIDE): the second component grows along the first axis, the first along the
     second; both ends are included."""
-
-
-def components(env: Env) -> list[Component]:
-    """The components of the goals of an environment."""
-    field = next(field for field in env.layout if field.name == "goal")
-    units = field.unit.split(", ")
-    units = units if len(units) == field.size else units * field.size
-    scales = torch.as_tensor(field.scale, dtype=torch.float64).expand(field.size).tolist()
-    names = []
-    for group, part in zip(env.goal_group_names, env.goal_groups, strict=True):
-        size = len(range(field.size)[part])
-        names += [f"{group} {'xyz'[k] if size <= 3 else k}" if size > 1 else group for k in range(size)]
-    labels = (f"{name} [{unit}]" if unit != "1" else name for name, unit in zip(names, units, strict=True))
-    return [Component(label, scale) for label, scale in zip(labels, scales, strict=True)]
 
 
 class Steered(GoalSelector):
@@ -114,6 +91,8 @@ class Session:
         self.paused = False
         self.axes = (0, 1)
         self.crashes = self.steps = self.episodes = 0
+        self.restarts = 0
+        """How often ``reset`` and ``go_to`` have begun everything anew."""
         self.goals = Steered({})
         self._go_to(world)
 
@@ -121,7 +100,7 @@ class Session:
         """Make the worlds, the first of a global number."""
         self.world = world
         self.env = self._run.build(self._worlds, self._seed, world)
-        self.components = components(self.env)
+        self.components = goal_components(self.env.layout, self.env.goal_groups, self.env.goal_group_names)
         self._scale = torch.tensor([component.scale for component in self.components])
         self._rows = torch.zeros(1, dtype=torch.int64)
         self._extent: tuple[Tensor, Tensor] | None = None
@@ -202,7 +181,7 @@ class Session:
     def reset(self) -> None:
         """Begin new episodes in all worlds, and count crashes anew."""
         self._loop.start()
-        self.crashes = self.steps = self.episodes = 0
+        self._count_anew()
 
     def go_to(self, world: int) -> None:
         """Look at the world of another global number, from its beginning.
@@ -213,7 +192,11 @@ class Session:
         if world < 0:
             raise ValueError(f"world must be at least 0, got {world}.")
         self._go_to(world)
+        self._count_anew()
+
+    def _count_anew(self) -> None:
         self.crashes = self.steps = self.episodes = 0
+        self.restarts += 1
 
     @property
     def goal(self) -> list[float]:

@@ -5,21 +5,35 @@ until the thread that simulates takes it.
 """
 
 import contextlib
+import errno
 import io
 import logging
+import re
 import socket
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 from deimos.app.viewer_panel import Panel
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 
 if TYPE_CHECKING:
     from mujoco.studio.viewer_handle import ViewerHandle
 
 HOST = "127.0.0.1"
 """The only address that the page is served on."""
+HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]+)?")  # whom a browser may ask for; a tunnel has a port of its own
+
+
+def check_port(port: int) -> None:
+    """Raise ``RunError`` if a port in [0, 65535] cannot be listened on; 0 always can."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does: one just closed is free
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be opened ({error.strerror})"
+            raise RunError(f"Port {port} {reason} on {HOST}; choose another --port, or 0 for a free one.") from error
 
 
 @contextlib.contextmanager
@@ -31,8 +45,9 @@ def serve(panel: Panel, port: int) -> "Iterator[tuple[ViewerHandle, int]]":
         port: Where, in [0, 65535]; 0 takes the first free one from 8080 on.
 
     Raises:
-        RunError: If the port is in use.
+        RunError: If the port is in use, or the viewer does not start.
     """
+    check_port(port)
     from mujoco.studio import launch_thread, viewer_protocol
 
     logging.getLogger("WebServer").setLevel(logging.WARNING)
@@ -45,7 +60,7 @@ def serve(panel: Panel, port: int) -> "Iterator[tuple[ViewerHandle, int]]":
             while not made and handle.is_running():
                 panel.wait(0.01)
         except RuntimeError as error:
-            raise RunError(f"Port {port} is in use on {HOST}; choose another --port, or 0 for a free one.") from error
+            raise RunError(f"The viewer does not start: {one_line(error)}") from error
         found = made.pop().port  # the viewer itself belongs to its thread, which ends before this process does
         with handle:
             _await_answer(found, panel, handle)
@@ -74,9 +89,46 @@ def _run(endpoint: Any, config: Any, plugins: list[Any], made: list[Any]) -> Non
         plugin.viewer = None
 
 
+def is_own(path: str, hosts: list[str], origins: list[str]) -> bool:
+    """Whether a request is one of the viewer's own page, or of a program that is no browser.
+
+    A browser lets every page that is open in it send requests to this machine, and WebSockets are not kept from reading
+    the answers; it says in ``Origin`` whose page it is. A page whose name is suddenly resolved to this machine (DNS
+    rebinding) is of the same origin, but its name is in ``Host``. Models that are dropped on the page are of no use
+    here, and the server would keep them in memory without a limit.
+
+    Args:
+        path: What is asked for, with its query.
+        hosts: Values of the header ``Host``.
+        origins: Values of the header ``Origin``.
+    """
+    if len(hosts) != 1 or not HOSTS.fullmatch(hosts[0]):
+        return False
+    return origins in ([], [f"http://{hosts[0]}"]) and not path.startswith("/drop")
+
+
+def _guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
+    """The ``serve`` of websockets that MuJoCo calls, with 403 for whatever is not its own page's."""
+
+    def guarded(*arguments: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            if not is_own(request.path, headers.get_all("Host"), headers.get_all("Origin")):
+                return connection.respond(403, "Only the page of this viewer may ask for this.\n")
+            return process_request(connection, request)
+
+        return serve(*arguments, process_request=check, **options)
+
+    return guarded
+
+
+@cache  # the server is guarded once
 def _loopback_viewer() -> Any:
-    """MuJoCo's web viewer, which binds every address of the machine by itself, on ``HOST`` alone."""
+    """MuJoCo's web viewer, which binds every address and answers every page by itself, on ``HOST`` for its own page."""
     from mujoco.studio import web_viewer
+    from mujoco.studio.web import web_server
+
+    web_server.serve = _guarded(web_server.serve)
 
     class LoopbackViewer(web_viewer.WebViewer):
         """See ``_loopback_viewer``."""

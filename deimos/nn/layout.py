@@ -37,15 +37,63 @@ def count(seen: Seen, obs_dim: int) -> int:
     return len(range(obs_dim)[seen]) if isinstance(seen, slice) else len(seen)
 
 
+def goal_field(layout: Sequence[ObsField]) -> ObsField:
+    """The field named ``goal``.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    for field in layout:
+        if field.name == "goal":
+            return field
+    raise ValueError("The layout has no field named 'goal'.")
+
+
 def goal_slice(layout: tuple[ObsField, ...]) -> slice:
     """Where the field named ``goal`` stands in the observation.
 
     Raises:
         ValueError: If there is none.
     """
-    start = 0
-    for field in layout:
-        if field.name == "goal":
-            return slice(start, start + field.size)
-        start += field.size
-    raise ValueError("The layout has no field named 'goal'.")
+    field = goal_field(layout)
+    start = sum(other.size for other in layout[: layout.index(field)])
+    return slice(start, start + field.size)
+
+
+@dataclass(frozen=True)
+class GoalComponent:
+    """One component of the goal."""
+
+    name: str
+    """That of its group, with x, y, z where the group has up to three, and its number from 0 on where it has more."""
+    unit: str
+    """Of the physical value; 1 for none."""
+    scale: float
+    """The policy sees the physical value times this."""
+
+    @property
+    def label(self) -> str:
+        """The name with the unit."""
+        return self.name if self.unit == "1" else f"{self.name} [{self.unit}]"
+
+
+def goal_components(
+    layout: Sequence[ObsField], groups: Sequence[slice], group_names: Sequence[str]
+) -> list[GoalComponent]:
+    """The components of the goal, in order.
+
+    Args:
+        layout: Of the observation.
+        groups: Components that belong together; every one is in one group.
+        group_names: What each of them is called.
+    """
+    field = goal_field(layout)
+    names, units = [""] * field.size, field.unit.split(", ")
+    if len(units) != field.size:
+        units = [field.unit] * field.size
+    for group, part in zip(group_names, groups, strict=True):
+        members = range(field.size)[part]
+        for k, place in enumerate(members):
+            names[place] = group if len(members) == 1 else f"{group} {'xyz'[k] if len(members) <= 3 else k}"
+    scales = field.scale if isinstance(field.scale, tuple) else (field.scale,) * field.size
+    return [GoalComponent(*entry) for entry in zip(names, units, scales, strict=True)]

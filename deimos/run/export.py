@@ -8,7 +8,6 @@ in the shape of Unitree's tools. No number is rounded.
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from deimos.checks import RunError
 from deimos.files import write_whole
 from deimos.goals.fear_selector import FearSelector
 from deimos.learn.policy import Policy, load_policy
-from deimos.nn.layout import ObsField
+from deimos.nn.layout import ObsField, goal_components
 from deimos.nn.threads import torch_on_one
 from deimos.run import export_controller, export_onnx, export_robot, export_unitree
 from deimos.run.config import kind
@@ -166,27 +165,16 @@ def _entry(field: ObsField) -> dict[str, Any]:
 
 def _describe_goal(env: Env, goal_period: int) -> dict[str, Any]:
     """Components of the goal with units and the box that training drew them from."""
-    field = next(field for field in env.layout if field.name == "goal")
-    names = [
-        group if part.stop - part.start == 1 else f"{group} {'xyz'[number] if number < 3 else number}"
-        for group, part in zip(env.goal_group_names, _parts(env), strict=True)
-        for number in range(part.stop - part.start)
-    ]
-    units = field.unit.split(", ") if ", " in field.unit else [field.unit] * field.size
-    half = [None] * field.size if env.goal_range is None else _plain(env.goal_range)
+    found = goal_components(env.layout, env.goal_groups, env.goal_group_names)
+    half = [None] * len(found) if env.goal_range is None else _plain(env.goal_range)
     return {
         "period": goal_period,
         "groups": list(env.goal_group_names),
         "components": [
-            {"name": name, "unit": unit, "low": None if side is None else -side, "high": side}
-            for name, unit, side in zip(names, units, half, strict=True)
+            {"name": component.name, "unit": component.unit, "low": None if side is None else -side, "high": side}
+            for component, side in zip(found, half, strict=True)
         ],
     }
-
-
-def _parts(env: Env) -> Sequence[slice]:
-    """The groups of the goal's components, with both ends."""
-    return [slice(*part.indices(env.goal_dim)[:2]) for part in env.goal_groups]
 
 
 def _plain(values: Tensor) -> list[float | None]:

@@ -15,6 +15,7 @@ from deimos.kernels.legged.arm import SEEN_BOUND
 from deimos.kernels.legged.arm_goals import FOOTPRINT, SHELL_HIGH, SHELL_LOW
 from deimos.kernels.legged.rewards import TRACKING_VARIANCE
 from deimos.kernels.legged.state import CRASH_FORCE, HEIGHT_BOUND
+from deimos.nn.layout import goal_field
 from deimos.sim.legged.engines.model import build_spec
 from deimos.sim.legged.robots import Arm
 from deimos.sim.legged.task import Locomotion
@@ -141,8 +142,7 @@ class Walk:
     """
 
     def __init__(self, env: Locomotion) -> None:
-        goal_field = next(field for field in env.layout if field.name == "goal")
-        scale = torch.tensor(goal_field.scale, dtype=torch.float64)
+        scale = torch.tensor(goal_field(env.layout).scale, dtype=torch.float64)
         self._start = {name: env.tensors[name].clone() for name in ("qpos", "qvel")}
         self._start["goal"] = env.goal.double() / scale
         self._env = env

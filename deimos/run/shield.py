@@ -21,6 +21,7 @@ from deimos.goals.shield import (
     threshold,
 )
 from deimos.learn.policy import load_policy
+from deimos.nn.layout import goal_field
 from deimos.nn.seeds import generator
 from deimos.nn.threads import torch_on_one
 from deimos.run.attack import Attack, Target, attacker, names, uniform_goals
@@ -340,7 +341,7 @@ class Trial:
 
 def _goal_scale(env: Env) -> Tensor:
     """What the policy sees components of a goal multiplied by, shape (goal_dim,)."""
-    field = next(field for field in env.layout if field.name == "goal")
+    field = goal_field(env.layout)
     return torch.as_tensor(field.scale, dtype=torch.float32, device=env.device).expand(field.size)
 
 

@@ -13,6 +13,7 @@ from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_worlds, record
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.kernels.structs import StructTable
+from deimos.nn.layout import goal_field
 from deimos.sim.env import Env, EnvConfig, ObsField, Step
 from deimos.sim.shared import Shared, check_stream, warp_device
 
@@ -66,7 +67,7 @@ class WarpEnv(Env):
         self.dt, self.goal_period, self.time_limit = dt, config.goal_period, time_limit
         self.crash_penalty = config.crash_penalty * config.largest_reward
         goal = self.goal_slice
-        scale = next(field.scale for field in self.layout if field.name == "goal")
+        scale = goal_field(self.layout).scale
         scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim
         if len(goal_range) != self.goal_dim:
             raise ValueError(f"goal_range must have {self.goal_dim} components, got {len(goal_range)}.")

@@ -1,4 +1,4 @@
-"""What the commands that show a policy load of its run: the policy, its worlds, its fear network."""
+"""A run as others use it: its policy, its worlds, its fear network."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,19 +11,19 @@ from deimos.learn.policy import Policy, load_policy
 from deimos.run.fear import load_fear
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
-from deimos.run.training import read_config
+from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
 from deimos.sim.legged.config import LocomotionConfig
 
 
 @dataclass(frozen=True)
 class SavedRun:
-    """A run whose policy is shown."""
+    """A run whose policy is used."""
 
     folder: RunFolder
     """Its folder."""
     config: TrainConfig
-    """What it was started with; of the environment, what the worlds that are shown are built from."""
+    """What it was started with; of the environment, what the worlds of ``build`` are built from."""
 
     @classmethod
     def open(cls, path: Path, goal_period: int | None = None, terrain: str | None = None) -> "SavedRun":
@@ -68,9 +68,13 @@ class SavedRun:
         return policy
 
     def iteration(self) -> int:
-        """The iteration of the training that the run has come to; 0 where it has no log."""
+        """The iteration that the checkpoint was written after; that of the log where it holds networks alone.
+
+        The log is ahead of the checkpoint while the run goes on; 0 where there is neither.
+        """
+        state = load_checkpoint(self.folder) if (self.folder.path / "checkpoint.pt").exists() else {}
         rows = self.folder.read_csv("progress.csv")
-        return int(rows[-1]["iteration"]) if rows else 0
+        return int(state.get("iteration", rows[-1]["iteration"] if rows else 0))
 
     def build(self, num_envs: int, seed: int, world: int) -> Env:
         """Make worlds on the CPU, the first of the global number ``world``.
