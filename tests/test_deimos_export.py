@@ -248,7 +248,7 @@ def test_only_what_there_is_can_be_privileged():
 
 
 def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
-    """Other actions, a robot that falls, and a file that was exchanged are found."""
+    """Other actions, one that is not a number, a robot that falls, and a file that was exchanged are found."""
     folder = tmp_path / "changed"
     folder.mkdir()
     for path in walker.iterdir():
@@ -257,6 +257,13 @@ def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
         known = dict(file)
     np.savez(folder / "check.npz", **known | {"policy.action": known["policy.action"] + 2e-5})
     assert not export_controller.main(folder)
+    unknown = known["policy.action"].copy()
+    unknown[3, 5] = np.nan
+    np.savez(folder / "check.npz", **known | {"policy.action": unknown})
+    capsys.readouterr()
+    assert not export_controller.main(folder)
+    rows = len(unknown)
+    assert f"batches of 1, 7, {min(rows, 4096)}: largest difference nan" in capsys.readouterr().out
     start = known["walk.qpos"].copy()
     start[0, 3:7] = 0.0, 1.0, 0.0, 0.0  # upside down
     np.savez(folder / "check.npz", **known | {"walk.qpos": start})
