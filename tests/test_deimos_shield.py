@@ -152,8 +152,8 @@ def test_the_p_value_of_a_drift_is_scipys():
 def test_the_guard_has_the_last_word_and_the_asker_learns_of_the_asked():
     """Worlds pursue what the shield gives, and interactions hold the goals that were asked for."""
     env = FAST.build(32, CPU, seed=0)
-    env.guard = guard = Guard(env, Shield(-1.0, "stop", (0.0,) * 3, (1.0,) * 3), random_rule, candidates=4)
-    loop, rows = GoalLoop(env, uniform_goals(env)), torch.arange(32)
+    guard = Guard(Shield(-1.0, "stop", (0.0,) * 3, (1.0,) * 3), random_rule, candidates=4)
+    loop, rows = GoalLoop(env, uniform_goals(env), guard=guard), torch.arange(32)
     first = env.goal.clone()
     loop.choose(rows)
     assert guard.refused == 1.0
