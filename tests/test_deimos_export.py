@@ -290,9 +290,17 @@ def test_particles_with_fear_and_shield(particles, tmp_path, capsys):
     example = HOME / "examples" / "deploy" / "shield.py"
     done = subprocess.run([sys.executable, example, out], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    first, second = done.stdout.splitlines()
-    assert first.startswith("wanted [200. 200. 200.], fear ")
-    assert ("let through" in first) == (second == "pursue [200. 200. 200.]")
+    assert done.stdout.startswith("wanted [200. 200. 200.], fear ")
+    for limit, word, goal in ((1e9, "let through", "[200. 200. 200.]"), (-100.0, "refused", "[0. 0. 0.]")):
+        deploy["shield"]["threshold"] = dict.fromkeys(deploy["shield"]["threshold"], limit)
+        for mode in ("stop", "project"):
+            deploy["shield"]["mode"] = mode
+            (out / "deploy.json").write_text(json.dumps(deploy))
+            first, second = subprocess.run(
+                [sys.executable, example, out], capture_output=True, text=True, check=True
+            ).stdout.splitlines()
+            assert word in first
+            assert second == f"pursue {goal}"
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsys):
