@@ -10,7 +10,12 @@ import pytest
 import torch
 
 from deimos.checks import SimulationError
+from deimos.goals.shield import Shield
 from deimos.nn.random import Purpose, uniforms
+from deimos.run.attack import collect, uniform_goals
+from deimos.run.evaluation import EvalConfig, make_target, play
+from deimos.run.oracle import Clones
+from deimos.run.shield import Guard, random_rule
 from deimos.sim.check_env import check_env
 from deimos.sim.env import Env, EnvConfig, ObsField, Step
 from deimos.sim.envs import particle, quad, quad_arm
@@ -364,6 +369,28 @@ def test_an_environment_of_plain_torch_is_checked(torch_device):
     check_env(LineConfig().build(3, torch_device, 0))
     with pytest.raises(ValueError, match="Line: the step of a crash, and no other, must cost crash_penalty, taken off"):
         check_env(LineConfig(clip_last=True).build(3, torch_device, 0))
+
+
+def test_a_shield_decides_in_an_environment_of_plain_torch():
+    """A guard has the last word on goals that are played, that an attacker learns from, and that clones pursue."""
+    config, cpu = LineConfig(goal_period=12), torch.device("cpu")
+    env, stop = config.build(16, cpu, 0), Shield(-1.0, "stop", (0.0,), (1.0,))
+
+    def follow(obs):
+        return obs[:, 1:]
+
+    guards = [None, Guard(stop, random_rule, candidates=4)]
+    played = [play(config.build(16, cpu, 0), follow, uniform_goals(env), 120, guard=guard) for guard in guards]
+    target = make_target(follow, config, EvalConfig(worlds=16, attackers=()), cpu)
+    learnt = [collect([replace(target, guard=guard)], 120, own_goals=False)[1] for guard in guards]
+    assert guards[1].refused == 1.0
+    assert played[0]["interaction_crashes"] > 0 == played[1]["interaction_crashes"]
+    assert learnt[0].crashed.any()
+    assert not learnt[1].crashed.any()
+    clones = [Clones(lambda count: config.build(count, cpu, 0), follow, guard=guard) for guard in guards]
+    survived = [each.try_out(env, torch.arange(16), torch.ones(16, 1, 1)) for each in clones]
+    assert (survived[0] < 12).all()
+    assert (survived[1] == 12).all()
 
 
 def test_the_configuration_must_be_one(torch_device):

@@ -248,7 +248,7 @@ def test_only_what_there_is_can_be_privileged():
 
 
 def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
-    """Other actions, a robot that falls, and a file that was exchanged are found."""
+    """Other actions, one that is not a number, a robot that falls, and a file that was exchanged are found."""
     folder = tmp_path / "changed"
     folder.mkdir()
     for path in walker.iterdir():
@@ -257,6 +257,13 @@ def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
         known = dict(file)
     np.savez(folder / "check.npz", **known | {"policy.action": known["policy.action"] + 2e-5})
     assert not export_controller.main(folder)
+    unknown = known["policy.action"].copy()
+    unknown[3, 5] = np.nan
+    np.savez(folder / "check.npz", **known | {"policy.action": unknown})
+    capsys.readouterr()
+    assert not export_controller.main(folder)
+    rows = len(unknown)
+    assert f"batches of 1, 7, {min(rows, 4096)}: largest difference nan" in capsys.readouterr().out
     start = known["walk.qpos"].copy()
     start[0, 3:7] = 0.0, 1.0, 0.0, 0.0  # upside down
     np.savez(folder / "check.npz", **known | {"walk.qpos": start})
@@ -283,9 +290,17 @@ def test_particles_with_fear_and_shield(particles, tmp_path, capsys):
     example = HOME / "examples" / "deploy" / "shield.py"
     done = subprocess.run([sys.executable, example, out], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    first, second = done.stdout.splitlines()
-    assert first.startswith("wanted [200. 200. 200.], fear ")
-    assert ("let through" in first) == (second == "pursue [200. 200. 200.]")
+    assert done.stdout.startswith("wanted [200. 200. 200.], fear ")
+    for limit, word, goal in ((1e9, "let through", "[200. 200. 200.]"), (-100.0, "refused", "[0. 0. 0.]")):
+        deploy["shield"]["threshold"] = dict.fromkeys(deploy["shield"]["threshold"], limit)
+        for mode in ("stop", "project"):
+            deploy["shield"]["mode"] = mode
+            (out / "deploy.json").write_text(json.dumps(deploy))
+            first, second = subprocess.run(
+                [sys.executable, example, out], capture_output=True, text=True, check=True
+            ).stdout.splitlines()
+            assert word in first
+            assert second == f"pursue {goal}"
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsys):

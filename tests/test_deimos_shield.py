@@ -137,6 +137,16 @@ def test_a_drift_is_told_once(caplog):
         assert (shield.drift() < 1e-3) == bool(shift)
 
 
+@pytest.mark.parametrize(("before", "warnings"), [(0, 1), (1, 0)])
+def test_a_later_test_of_a_drift_takes_more(caplog, monkeypatch, before, warnings):
+    """A p-value of 4e-4 is below the level of the first test, 1e-3 / 2, and not below that of the second, 1e-3 / 6."""
+    shield, scores = Shield(9.0, "stop", (0.0,), (1.0,), reference=range(9), window=4), torch.zeros(4, 1)
+    for p_value in [1.0] * before + [4e-4]:
+        monkeypatch.setattr(shield, "drift", lambda p_value=p_value: p_value)
+        shield.choose(total, scores, scores)
+    assert len(caplog.records) == warnings
+
+
 def test_the_p_value_of_a_drift_is_scipys():
     """It is the first term of the series of Kolmogorov's distribution at the distance that SciPy finds."""
     random = np.random.default_rng(1)
@@ -152,8 +162,8 @@ def test_the_p_value_of_a_drift_is_scipys():
 def test_the_guard_has_the_last_word_and_the_asker_learns_of_the_asked():
     """Worlds pursue what the shield gives, and interactions hold the goals that were asked for."""
     env = FAST.build(32, CPU, seed=0)
-    env.guard = guard = Guard(env, Shield(-1.0, "stop", (0.0,) * 3, (1.0,) * 3), random_rule, candidates=4)
-    loop, rows = GoalLoop(env, uniform_goals(env)), torch.arange(32)
+    guard = Guard(Shield(-1.0, "stop", (0.0,) * 3, (1.0,) * 3), random_rule, candidates=4)
+    loop, rows = GoalLoop(env, uniform_goals(env), guard=guard), torch.arange(32)
     first = env.goal.clone()
     loop.choose(rows)
     assert guard.refused == 1.0

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -51,8 +50,8 @@ class ShieldOptions:
     """Who attacks, by name. By default every attacker that needs no file."""
     eval: Evaluation = field(default_factory=Evaluation)
     """How it is tried."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to simulate; auto takes the GPU where there is one."""
+    device: str = "auto"
+    """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
 
 
 def main(arguments: list[str], program: str) -> None:

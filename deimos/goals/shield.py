@@ -35,7 +35,7 @@ GUARANTEES: tuple[Guarantee, ...] = ("marginal", "conditional")
 CONFIDENCE = 0.95  # of the training-conditional guarantee
 SHRINKS = 10  # goals between the wanted one and the safe one, which is the last, that project looks at
 SCORES = 1001  # of the calibration that are kept to tell a drift by
-DRIFTED = 1e-3  # a p-value below is a drift
+DRIFTED = 1e-3  # chance of a false word on drift, as if scores were independent, over all tests together
 
 _log = logging.getLogger(__name__)
 
@@ -131,7 +131,7 @@ class Shield:
         self._range = torch.tensor(goal_range, dtype=torch.float32)
         self._reference = torch.tensor(reference, dtype=torch.float64).sort().values
         self._recent = torch.zeros(0, dtype=torch.float64)
-        self._untested, self._warned = 0, False
+        self._untested, self._tests, self._warned = 0, 0, False
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], mode: Mode | None = None, guarantee: Guarantee | None = None) -> "Shield":
@@ -206,8 +206,9 @@ class Shield:
         self._untested += len(fear)
         if self._untested < self.window:
             return
-        self._untested = 0
-        if not self._warned and self.drift() < DRIFTED:
+        self._untested, self._tests = 0, self._tests + 1
+        # The levels of all tests sum to DRIFTED, however many there will be.
+        if not self._warned and self.drift() < DRIFTED / (self._tests * (self._tests + 1)):
             self._warned = True
             _log.warning(
                 "The scores of the last %d goals are not those of the calibration (p = %.2g): what was promised of "
@@ -217,8 +218,8 @@ class Shield:
     def drift(self) -> float:
         """p-value, in [0, 1], of the last ``window`` scores being drawn as the calibration's; 1 where none is known.
 
-        By the largest distance D of the two distribution functions: 2 exp(-2 D^2 n m / (n + m)), the first term of
-        Kolmogorov's series for two samples of n and m.
+        It is computed as if scores were independent, by the largest distance D of the two distribution functions:
+        2 exp(-2 D^2 n m / (n + m)), the first term of Kolmogorov's series for two samples of n and m.
         """
         recent, reference = self._recent.sort().values, self._reference
         if not len(recent) or not len(reference):

@@ -21,7 +21,7 @@ from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.goals.selectors import director, uniform
 from deimos.run import attackers
-from deimos.run.loop import GoalLoop, spaces
+from deimos.run.loop import GoalGuard, GoalLoop, spaces
 from deimos.sim.env import Env
 
 Policy = Callable[[Tensor], Tensor]
@@ -49,6 +49,8 @@ class Target:
     """A fear network, and how it learns."""
     pool: Path | None = None
     """The file of ``pooled``."""
+    guard: GoalGuard | None = None
+    """Has the last word on the goals of its worlds, such as a shield; ``None`` for nobody."""
     progress: Callable[[float], None] = lambda share: None
     """Called now and then with the share of the preparation that is done."""
     learnt: dict[tuple[int, bool], tuple[Fear, dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
@@ -156,7 +158,10 @@ def collect(targets: Sequence[Target], steps: int, *, own_goals: bool) -> tuple[
     first = targets[0]
     envs = [target.build(target.worlds, target.seed + 1) for target in targets]
     fear = Fear(first.fear, envs[0].state_dim, envs[0].goal_dim, envs[0].device, first.seed)
-    loops = [GoalLoop(env, Explorer(env, fear) if own_goals else uniform_goals(env), window=steps) for env in envs]
+    loops = [
+        GoalLoop(env, Explorer(env, fear) if own_goals else uniform_goals(env), window=steps, guard=target.guard)
+        for target, env in zip(targets, envs, strict=True)
+    ]
     pause = max(envs[0].goal_period, steps // FITS)
     for t in range(1, steps + 1):
         for target, env, loop in zip(targets, envs, loops, strict=True):

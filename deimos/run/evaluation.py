@@ -29,7 +29,7 @@ from deimos.run import memory
 from deimos.run.attack import Attack, Policy, Target, attacker, uniform_goals
 from deimos.run.config import to_dict
 from deimos.run.folder import RunFolder
-from deimos.run.loop import GoalLoop
+from deimos.run.loop import GoalGuard, GoalLoop
 from deimos.sim.env import Env, EnvConfig
 
 EVALUATION = "evaluation.json"
@@ -336,9 +336,10 @@ def score_scale(
 
 @torch.no_grad()
 def play(
-    env: Env, policy: Policy, selector: GoalSelector, steps: int, progress: Callable[[float], None] = lambda share: None
-) -> dict:
-    """Let a policy act under a selector's goals and count.
+    env: Env, policy: Policy, selector: GoalSelector, steps: int,
+    progress: Callable[[float], None] = lambda share: None, *, guard: GoalGuard | None = None,
+) -> dict:  # fmt: skip
+    """Let a policy act under a selector's goals, on which ``guard`` has the last word, and count.
 
     Returns:
         ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions`` (issued early enough
@@ -351,7 +352,7 @@ def play(
         the same and more by kind of world, where there are kinds, and ``errors`` the median of each of ``Env.errors``
         over all goals that were survived, at the end of their period.
     """
-    loop = GoalLoop(env, selector, window=steps)
+    loop = GoalLoop(env, selector, window=steps, guard=guard)
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
     reward, crashes, first_goal_steps, first_goal_crashes = totals
     tracking = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64, device=env.device)

@@ -1,5 +1,7 @@
 """What happens between two steps: interactions resolve, goals are chosen, episodes begin."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -7,6 +9,10 @@ from deimos.goals.core import Changes, GoalCore
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Spaces
 from deimos.sim.env import Env, Step
+
+GoalGuard = Callable[[Env, Tensor, Tensor], Tensor]
+"""Has the last word on goals: of the environment, the worlds, int64, shape (B,), and the goals, shape (B, goal_dim),
+that they are to get, it gives those that they do get."""
 
 
 def spaces(env: Env, total_steps: int = 0) -> Spaces:
@@ -24,10 +30,14 @@ class GoalLoop:
         env: The worlds.
         selector: Who chooses their goals.
         window: Steps that resolved interactions are kept for; ``None`` for 2 T.
+        guard: Has the last word on the selector's goals; ``None`` for nobody. Interactions, which selectors and
+            attackers learn from, hold the goals that were asked for.
     """
 
-    def __init__(self, env: Env, selector: GoalSelector, window: int | None = None) -> None:
-        self.env = env
+    def __init__(
+        self, env: Env, selector: GoalSelector, window: int | None = None, guard: GoalGuard | None = None
+    ) -> None:
+        self.env, self._guard = env, guard
         self.core = GoalCore(selector, spaces(env), window)
         self.selector, self.interactions, self.weight = selector, self.core.interactions, self.core.weight
         if selector.first_goals_scaled:  # the goals that the environment was built with are not
@@ -69,7 +79,7 @@ class GoalLoop:
             env, obs = self.env, self.env.obs[rows]
             candidates = env.sample_goals(rows, self.selector.num_candidates, self.selector.goal_range())
             goal = self.core.choose(rows, env.state(obs), obs[:, env.goal_slice], candidates, env.draw(rows))
-            env.set_goals(rows, goal)
+            env.set_goals(rows, goal if self._guard is None else self._guard(env, rows, goal))
 
     def begin(self, mask: Tensor) -> None:
         """Begin an episode where ``mask``, bool, shape (num_envs,), is true; nothing may be pending there."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from deimos.goals import picks
 from deimos.goals.fear import Fear
 from deimos.goals.selector import GoalSelector, Proposal
+from deimos.run.loop import GoalGuard
 from deimos.sim.env import Env
 
 MOST = {"cpu": 10_000, "cuda": 200_000}
@@ -44,11 +45,15 @@ class Clones:
         act: The policy: observations (n, obs_dim) to actions (n, action_dim).
         limit: Largest number of clones at a time; a decision gets as many as it has candidates in any case. ``None``
             for ``MOST`` of the device: a GPU is idle with fewer, and a CPU's caches are full with more.
+        guard: Has the last word on the candidates that they pursue; ``None`` for nobody.
     """
 
-    def __init__(self, build: Callable[[int], Env], act: Callable[[Tensor], Tensor], limit: int | None = None) -> None:
+    def __init__(
+        self, build: Callable[[int], Env], act: Callable[[Tensor], Tensor], limit: int | None = None,
+        guard: GoalGuard | None = None,
+    ) -> None:  # fmt: skip
         self.act = act
-        self._build, self._limit = build, limit
+        self._build, self._limit, self._guard = build, limit, guard
         self._sets: dict[int, Env] = {}
 
     @torch.no_grad()
@@ -75,7 +80,8 @@ class Clones:
         probe = self._sets[size]
         clones = torch.arange(len(rows) * count, device=rows.device)
         probe.copy_worlds(rows.repeat_interleave(count), clones, origin=env)
-        probe.set_goals(clones, candidates.flatten(0, 1))
+        goals = candidates.flatten(0, 1)
+        probe.set_goals(clones, goals if self._guard is None else self._guard(probe, clones, goals))
         survived = torch.zeros(probe.num_envs, dtype=torch.int64, device=rows.device)
         alive = torch.ones(probe.num_envs, dtype=torch.bool, device=rows.device)
         for _ in range(env.goal_period):

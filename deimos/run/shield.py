@@ -146,24 +146,22 @@ def plain_rule(env: Env) -> tuple[str, Rule] | None:
 
 
 class Guard:
-    """A shield in the loop, see ``Env.guard``; counts what it is asked and what it refuses.
+    """A shield in the loop, a ``GoalGuard``; counts what it is asked and what it refuses.
 
     Args:
-        env: The worlds whose goals it decides over.
         shield: Decides.
         rule: By what.
         candidates: Uniform goals that it may take instead, at least 1.
     """
 
-    def __init__(self, env: Env, shield: Shield, rule: Rule, candidates: int) -> None:
-        self._env, self._shield, self._rule, self._candidates = env, shield, rule, candidates
+    def __init__(self, shield: Shield, rule: Rule, candidates: int) -> None:
+        self._shield, self._rule, self._candidates = shield, rule, candidates
         self._refused: list[Tensor] = []
         self.scores: list[Tensor] = []
         """Scores of the goals that were asked for, one tensor for every step with any."""
 
-    def __call__(self, rows: Tensor, goal: Tensor) -> Tensor:
+    def __call__(self, env: Env, rows: Tensor, goal: Tensor) -> Tensor:
         """The goals that the listed worlds get."""
-        env = self._env
         candidates = env.sample_goals(rows, self._candidates)
         made = self._shield.choose(
             lambda goals: self._rule(env, rows, goals), env.goal[rows], goal.detach(), candidates
@@ -214,9 +212,9 @@ class Trial:
     def _shield(self, score: float) -> Shield:
         return Shield(score, self.config.mode, self._safe, self._range.tolist())
 
-    def _guard(self, rule: Rule, score: float) -> Callable[[Env], Guard]:
-        """Makes the guard of some worlds; by a rule that tells no goals apart, project stops."""
-        return lambda env: Guard(env, self._shield(score), rule, self.config.candidates)
+    def _guard(self, rule: Rule, score: float) -> Callable[[], Guard]:
+        """Makes guards that have counted nothing yet; by a rule that tells no goals apart, project stops."""
+        return lambda: Guard(self._shield(score), rule, self.config.candidates)
 
     def run(self) -> dict[str, Any]:
         """Calibrate, test, and try under Naive, under every attacker, and beside both baselines.
@@ -270,19 +268,17 @@ class Trial:
 
     def _scores(self, rule: Rule) -> Tensor:
         """What a rule makes of uniform goals that nobody refuses, shape (n,)."""
-        env = self._target.build(self._eval.worlds, self._eval.seed)
-        env.guard = guard = self._guard(rule, float("inf"))(env)
-        play(env, self._target.policy, uniform_goals(env), self._eval.steps, partial(self._progress, "baseline"))
+        env, guard = self._target.build(self._eval.worlds, self._eval.seed), self._guard(rule, float("inf"))()
+        report = partial(self._progress, "baseline")
+        play(env, self._target.policy, uniform_goals(env), self._eval.steps, report, guard=guard)
         return torch.cat(guard.scores)
 
-    def measure(
-        self, shield: str, guard: Callable[[Env], Guard] | None, attackers: Sequence[str]
-    ) -> list[dict[str, Any]]:
+    def measure(self, shield: str, guard: Callable[[], Guard] | None, attackers: Sequence[str]) -> list[dict[str, Any]]:
         """Try a shield under Naive and under attackers, which learn with it in their worlds.
 
         Args:
             shield: What it is called.
-            guard: Makes the guard of some worlds; ``None`` for no shield.
+            guard: Makes the shield's guards; ``None`` for no shield.
             attackers: Their names.
 
         Returns:
@@ -290,26 +286,19 @@ class Trial:
             (all that were asked for, refused or not), and ``tracking``, how well the goals that were given instead
             are met, in [0, 1]; see ``evaluation.play``. With the facts of an attacker.
         """
-
-        def build(worlds: int, seed: int) -> Env:
-            env = self._target.build(worlds, seed)
-            env.guard = guard(env) if guard else None
-            return env
-
-        target, rows = replace(self._target, build=build, learnt={}), []
+        target, rows = replace(self._target, guard=guard and guard(), learnt={}), []
         for goals in ("naive", *attackers):
             stage = f"{shield}, {goals}"
             attack = Attack(uniform_goals)
             if goals != "naive":
                 attack = attacker(goals).prepare(replace(target, progress=partial(self._progress, f"{stage} learns")))
-            env = build(self._eval.worlds_against(goals), self._eval.seed)
+            env, own = target.build(self._eval.worlds_against(goals), self._eval.seed), guard and guard()
             row = play(
-                env, target.policy, attack.selector(env), self._eval.steps, partial(self._progress, stage)
+                env, target.policy, attack.selector(env), self._eval.steps, partial(self._progress, stage), guard=own
             ) | attack.facts  # fmt: skip
-            refused = env.guard.refused if isinstance(env.guard, Guard) else 0.0
             tracking = row.get("matching", row["return_per_step"])
             rows.append({
-                "shield": shield, "goals": goals, "refused": refused, "tracking": tracking,
+                "shield": shield, "goals": goals, "refused": own.refused if own else 0.0, "tracking": tracking,
                 **{name: row[name] for name in ("crash_rate", "interactions", "interaction_crashes", "crashes")},
                 **attack.facts,
             })  # fmt: skip

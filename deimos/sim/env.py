@@ -165,10 +165,6 @@ class Env(abc.ABC):
     """How much each of them counts in the score, at least 0; empty where all count alike."""
     goal_range: Tensor | None = None
     """Half side of the box that goals are drawn from, in physical units, shape (goal_dim,); ``None`` for no box."""
-    guard: Callable[[Tensor, Tensor], Tensor] | None = None
-    """Has the last word on the goals of ``set_goals``: of the worlds, int64, shape (B,), and the goals, shape
-    (B, goal_dim), that they are to get, it gives those that they do get. ``None`` for nobody. What selectors and
-    attackers learn from are the goals that they asked for."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
     """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
     shape (num_envs,). Empty where ``Step.tracking`` says enough."""

@@ -220,7 +220,6 @@ class WarpEnv(Env):
     @final
     def set_goals(self, rows: Tensor, goal: Tensor) -> None:
         """See ``Env.set_goals``."""
-        goal = goal if self.guard is None else self.guard(rows, goal)
         self._set_rows(rows)
         self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))

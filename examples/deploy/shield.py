@@ -15,7 +15,8 @@ deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
 shield, network = Shield.from_dict(deploy["shield"]), onnxruntime.InferenceSession(folder / "fear.onnx")
 state = np.zeros((1, sum(entry["size"] for entry in deploy["fear"]["state"])), np.float32)  # what the robot measures
 active = np.zeros((1, len(deploy["goal"]["components"])), np.float32)  # what it pursues
-wanted = np.array([[component["high"] for component in deploy["goal"]["components"]]], np.float32)  # what comes next
+low, high = (np.array([entry[key] for entry in deploy["goal"]["components"]], np.float32) for key in ("low", "high"))
+wanted = high[None]  # what comes next
 
 
 def score(goals: torch.Tensor) -> torch.Tensor:
@@ -24,6 +25,7 @@ def score(goals: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(network.run(["logit"], inputs)[0])
 
 
-given = shield.choose(score, torch.from_numpy(active), torch.from_numpy(wanted))
+candidates = np.random.default_rng().uniform(low, high, (1, 100, len(low))).astype(np.float32)  # for the mode project
+given = shield.choose(score, torch.from_numpy(active), torch.from_numpy(wanted), torch.from_numpy(candidates))
 print(f"wanted {wanted[0]}, fear {given.score.item():.2f}, {'refused' if given.refused.item() else 'let through'}")
 print(f"pursue {given.goal.numpy()[0]}")

@@ -20,5 +20,5 @@ class Config(argmax_long.Config):
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``."""
         fear, facts = learn_fear(target, self.longer * target.steps, own_goals=True)
-        clones = Clones(lambda count: target.build(count, target.seed), target.policy)
+        clones = Clones(lambda count: target.build(count, target.seed), target.policy, guard=target.guard)
         return Attack(lambda env: Oracle(env, clones, fear=fear), facts | {"uninformed": False})

@@ -31,7 +31,7 @@ class Config(argmax_long.Config):
         config = q_fear.Config(rule="argmax", probe=0.5, beta=self.beta, fear=target.fear)
         selector = config.build(spaces(env), target.seed)
         # The last T steps: of interactions before them nobody knows any more what could have followed.
-        loop = GoalLoop(env, selector, window=env.goal_period)
+        loop = GoalLoop(env, selector, window=env.goal_period, guard=target.guard)
         interactions = crashes = 0
         steps, quality = self.longer * target.steps, torch.nan
         for t in range(1, steps + 1):
