@@ -74,7 +74,7 @@ def share(iterations: int, num_envs: int = 4096) -> float:
     """
     from rsl_rl.runners import OnPolicyRunner
 
-    env = runpy.run_path(str(EXAMPLE))["Carts"](num_envs, Timed("p75", 40, goal_box=([-1.0], [1.0])))
+    env = runpy.run_path(str(EXAMPLE))["Carts"](Timed("p75", 40, goal_box=([-1.0], [1.0])), num_envs)
     model = {"class_name": "MLPModel"}
     config = {"actor": model | {"distribution_cfg": {"class_name": "GaussianDistribution"}}, "critic": model}
     config |= {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "algorithm": {"class_name": "PPO"}}

@@ -13,11 +13,11 @@ from deimos import GoalDirector
 class Carts(VecEnv):
     """Carts on a track of 2 m. An action accelerates [m/s^2]; the goal is a speed [m/s]; off the track is a crash."""
 
-    def __init__(self, director: GoalDirector) -> None:
-        self.num_envs, self.num_actions, self.max_episode_length, self.device, self.cfg = 256, 1, 500, "cpu", {}
-        self.director, self.state = director, torch.zeros(256, 2)  # position, speed
-        self.goal = director.propose(None, self.state, torch.zeros(256, 1))
-        self.episode_length_buf = torch.zeros(256, dtype=torch.long)
+    def __init__(self, director: GoalDirector, num_envs: int = 256) -> None:
+        self.num_envs, self.num_actions, self.max_episode_length, self.device, self.cfg = num_envs, 1, 500, "cpu", {}
+        self.director, self.state = director, torch.zeros(num_envs, 2)  # position, speed
+        self.goal = director.propose(None, self.state, torch.zeros(num_envs, 1))
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
 
     def get_observations(self) -> TensorDict:  # noqa: D102
         return TensorDict({"policy": torch.cat([self.state, self.goal], dim=1)}, batch_size=[self.num_envs])

@@ -43,6 +43,7 @@ class Purpose(IntEnum):
     """The learner's noise, which torch draws (``deimos.nn.random``), as it draws ``GOAL`` for a GoalDirector."""
     AUDIT = 17
     AUDIT_CONTEXT = 18
+    CANDIDATES = 19
 
 
 class vec4u(wp.types.vector(length=4, dtype=wp.uint32)):

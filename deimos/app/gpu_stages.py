@@ -266,7 +266,7 @@ def _graph_against_eager(device: torch.device) -> dict[str, Any]:
 def _walk_at_random(env: Env, steps: int) -> dict[str, Any]:
     """Control steps per second under random actions, what became invalid, and how full the buffers were."""
     generator = torch.Generator().manual_seed(0)
-    actions = torch.randn(8, env.num_envs, env.action_dim, generator=generator).to(env.device)
+    actions = torch.randn(8, env.num_envs, env.action_dim, generator=generator, dtype=torch.float32).to(env.device)
     env.step(actions[0])
     begin = time.perf_counter()
     for t in range(steps):

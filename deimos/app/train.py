@@ -48,14 +48,14 @@ class FirstOptions:
     branch_from: Path | None = None
     """Start with networks, optimiser, worlds and levels of the run in this folder, and with its settings: method,
     env.crash-penalty, env.goal-period, env.engine, seed and budget may differ."""
+    out: Path | None = None
+    """Folder of the run, which must not exist. By default runs/ENV-METHOD-sSEED-TIME."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FolderOptions(TrainConfig, FirstOptions):
     """What people ask for first, ``TrainConfig``, and what belongs to the folder."""
 
-    out: Path | None = None
-    """Folder of the run, which must not exist. By default runs/ENV-METHOD-sSEED-TIME."""
     init_from: Path | None = None
     """Start with the networks of the run in this folder."""
 

@@ -249,7 +249,7 @@ class Session:
         first, second = self.axes
         low, high = self.bounds()
         goals = self.env.goal[0].expand(SIDE, SIDE, -1).clone()
-        line = torch.linspace(0.0, 1.0, SIDE)
+        line = torch.linspace(0.0, 1.0, SIDE, dtype=torch.float32)
         for axis, shape in ((first, (1, SIDE)), (second, (SIDE, 1))):
             goals[..., axis] = ((low + (high - low) * line[:, None])[:, axis] * self._scale[axis]).view(shape)
         found = self._risks(goals.view(1, SIDE * SIDE, -1))
