@@ -97,8 +97,8 @@ class Page:
 
 
 @contextmanager
-def viewing(run: Path) -> Iterator[Page]:
-    """``deimos view`` in a process of its own, with a page that watches it.
+def serving(run: Path) -> Iterator[int]:
+    """``deimos view`` in a process of its own; gives its port.
 
     Raises:
         RunError: If it does not start.
@@ -113,8 +113,7 @@ def viewing(run: Path) -> Iterator[Page]:
                     break
             if found is None:
                 raise RunError(f"{' '.join(command)} did not start.")
-            with Page(int(found[1])) as page:
-                yield page
+            yield int(found[1])
         finally:
             process.send_signal(signal.SIGINT)
             with suppress(subprocess.TimeoutExpired):
@@ -130,12 +129,12 @@ def measure(rounds: int, seconds: float = 20.0, options: list[str] | None = None
         seconds: How long frames are counted [s], positive.
         options: Of ``train.py``; by default the main job, shortened, on one thread.
     """
-    with viewing(ROBOT) as page:
+    with serving(ROBOT) as port, Page(port) as page:
         sent = _frames_per_second(page, seconds)
     speeds: dict[str, list[float]] = {"alone": [], "beside the viewer": []}
     for _ in range(rounds):
         speeds["alone"].append(train_once(HOME, options or TRAINING)["FPS"])
-        with viewing(ROBOT) as page:
+        with serving(ROBOT) as port, Page(port) as page:
             _await_frames(page)
             speeds["beside the viewer"].append(train_once(HOME, options or TRAINING)["FPS"])
     ratio = statistics.median(

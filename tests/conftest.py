@@ -1,6 +1,8 @@
 """Fixtures of all tests: the devices that they run on, and the reference of every random draw."""
 
 import contextlib
+import os
+import subprocess
 import sys
 from collections import namedtuple
 from importlib.util import find_spec
@@ -23,6 +25,30 @@ if find_spec("warp"):  # a base install, which .ci/nightly tests, has none
     wp.config.log_level = wp.LOG_WARNING
     if wp.get_cuda_device_count() > 0 and torch.cuda.is_available():  # a torch without CUDA cannot share its memory
         DEVICES.append("cuda:0")
+
+
+OWN_PROCESS = "DEIMOS_TEST_OWN_PROCESS"  # set in the process that a test has for itself
+OWN_PATIENCE = 600.0  # [s] for such a test, on a machine that does other things
+
+
+def pytest_configure(config):
+    """Make the markers of these tests known."""
+    config.addinivalue_line("markers", "own_process: run the test in a process of its own")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Run a test that asks for it in a process of its own; what it says there is said here."""
+    if pyfuncitem.get_closest_marker("own_process") is None or OWN_PROCESS in os.environ:
+        return None
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", pyfuncitem.nodeid]
+    done = subprocess.run(
+        command, cwd=pyfuncitem.config.rootpath, env=os.environ | {OWN_PROCESS: "1"}, capture_output=True, text=True,
+        timeout=OWN_PATIENCE,
+    )  # fmt: skip
+    if done.returncode != 0:
+        pytest.fail(f"{done.stdout}{done.stderr}\nexit code {done.returncode}", pytrace=False)
+    return True
 
 
 @pytest.fixture

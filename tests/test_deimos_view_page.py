@@ -27,7 +27,9 @@ from deimos.sim.envs.particle import Config
 
 PATIENCE = 120.0  # [s] for frames, on a machine that does other things
 
-# MuJoCo's server leaves the connection between its own halves to the garbage collector.
+own_process = pytest.mark.own_process  # MuJoCo's viewer does not survive a second one beside it (docs/lab/viewer.md)
+
+# Its server leaves the connection between its own halves to the garbage collector.
 pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
@@ -64,6 +66,13 @@ def robot():
     return Session(run, 1, seed=5, afraid=some_fear)
 
 
+@pytest.fixture(scope="module")
+def port():
+    """Where ``deimos view`` serves, in a process of its own, a Go1 that walks."""
+    with viewer.serving(viewer.ROBOT) as port:
+        yield port
+
+
 def meet(session, during=lambda page, panel: None, frames=4):
     """Serve a session until a page has received some frames; gives the page, the panel and what the page loaded."""
     scene = build_scene(session)
@@ -90,6 +99,7 @@ def meet(session, during=lambda page, panel: None, frames=4):
     return page, panel, loaded
 
 
+@own_process
 def test_a_page_gets_the_model_and_moving_states(robot):
     """The page, its program and the model are served as browsers need them; states follow, the last as it stands."""
 
@@ -115,6 +125,7 @@ def test_a_page_gets_the_model_and_moving_states(robot):
     assert page.drawn > 0
 
 
+@own_process
 def test_particles_have_a_page(particles):
     """Particles, their goals and the map of fear are served like robots."""
     page, panel, _ = meet(particles)
@@ -122,6 +133,7 @@ def test_particles_have_a_page(particles):
     assert panel.frames >= 3
 
 
+@own_process
 def test_what_a_person_does_reaches_the_worlds(particles):
     """What is asked for in the panel's thread is done between two steps of the simulation."""
 
@@ -148,16 +160,14 @@ def own_addresses():
     return sorted(found - {("127.0.0.1", socket.AF_INET)})
 
 
-def test_no_other_address_is_served(robot):
+def test_no_other_address_is_served(port):
     """On the same port, this machine's other addresses refuse what 127.0.0.1 accepts."""
-    panel = Panel(build_scene(robot))
-    with serve(panel, 0) as (_, port):
-        with socket.create_connection(("127.0.0.1", port), timeout=10):
-            pass
-        for address, family in own_addresses():
-            with socket.socket(family) as caller:
-                caller.settimeout(10)
-                assert caller.connect_ex((address, port)) in (errno.ECONNREFUSED, errno.EADDRNOTAVAIL), address
+    with socket.create_connection(("127.0.0.1", port), timeout=10):
+        pass
+    for address, family in own_addresses():
+        with socket.socket(family) as caller:
+            caller.settimeout(10)
+            assert caller.connect_ex((address, port)) in (errno.ECONNREFUSED, errno.EADDRNOTAVAIL), address
 
 
 def answer_to(port, path, host="127.0.0.1:{port}", origin=None):
@@ -176,32 +186,30 @@ def answer_to(port, path, host="127.0.0.1:{port}", origin=None):
         caller.close()
 
 
-def test_only_its_own_page_is_answered(robot):
+def test_only_its_own_page_is_answered(port):
     """Another page in the browser, or one by another name of this machine, gets nothing; nobody can send files."""
-    with serve(Panel(build_scene(robot)), 0) as (_, port):
-        for path, status in (("/", 200), ("/model", 200), ("/ui?sid=a", 101), ("/state?sid=a", 101)):
-            for host in ("127.0.0.1:{port}", "localhost:{port}", "localhost:9", "localhost"):
-                assert answer_to(port, path, host) == status
-                assert answer_to(port, path, host, f"http://{host}") == status
-                for origin in ("null", "http://example.org", "http://127.0.0.1:1", "https://127.0.0.1:{port}", ""):
-                    assert answer_to(port, path, host, origin) == 403, (path, host, origin)
-            for host in ("example.org:{port}", "127.0.0.1.example.org", "127.0.0.1:{port}@example.org", "", "10.0.0.1"):
-                assert answer_to(port, path, host) == 403, (path, host)
-                assert answer_to(port, path, host, f"http://{host}") == 403, (path, host)
-        for path in ("/drop", "/drop?sid=a", "/dropped"):
-            assert answer_to(port, path) == 403
-            assert answer_to(port, path, origin="http://127.0.0.1:{port}") == 403
+    for path, status in (("/", 200), ("/model", 200), ("/ui?sid=a", 101), ("/state?sid=a", 101)):
+        for host in ("127.0.0.1:{port}", "localhost:{port}", "localhost:9", "localhost"):
+            assert answer_to(port, path, host) == status
+            assert answer_to(port, path, host, f"http://{host}") == status
+            for origin in ("null", "http://example.org", "http://127.0.0.1:1", "https://127.0.0.1:{port}", ""):
+                assert answer_to(port, path, host, origin) == 403, (path, host, origin)
+        for host in ("example.org:{port}", "127.0.0.1.example.org", "127.0.0.1:{port}@example.org", "", "10.0.0.1"):
+            assert answer_to(port, path, host) == 403, (path, host)
+            assert answer_to(port, path, host, f"http://{host}") == 403, (path, host)
+    for path in ("/drop", "/drop?sid=a", "/dropped"):
+        assert answer_to(port, path) == 403
+        assert answer_to(port, path, origin="http://127.0.0.1:{port}") == 403
 
 
-def test_a_request_with_two_hosts_or_origins_is_refused(robot):
+def test_a_request_with_two_hosts_or_origins_is_refused(port):
     """Which of two headers counts is not left to the server."""
     own = "127.0.0.1:{port}"
-    with serve(Panel(build_scene(robot)), 0) as (_, port):
-        for extra in (["Host: example.org"], [f"Origin: http://{own}", "Origin: http://example.org"]):
-            lines = ["GET / HTTP/1.1", f"Host: {own}", *extra, "", ""]
-            with socket.create_connection(("127.0.0.1", port), timeout=60) as caller:
-                caller.sendall("\r\n".join(lines).format(port=port).encode())
-                assert b" 403 " in caller.recv(100), extra
+    for extra in (["Host: example.org"], [f"Origin: http://{own}", "Origin: http://example.org"]):
+        lines = ["GET / HTTP/1.1", f"Host: {own}", *extra, "", ""]
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as caller:
+            caller.sendall("\r\n".join(lines).format(port=port).encode())
+            assert b" 403 " in caller.recv(100), extra
 
 
 def free_port():
@@ -210,14 +218,15 @@ def free_port():
         return server.getsockname()[1]
 
 
+@own_process
 def test_a_port_is_free_again(robot):
     """Once it is closed, the page is gone and its port can be had again."""
     wanted = free_port()
-    for _ in range(2):
-        with serve(Panel(build_scene(robot)), wanted) as (_, port):
-            assert port == wanted
+    with serve(Panel(build_scene(robot)), wanted) as (_, port):
+        assert port == wanted
     with socket.socket() as caller:
         assert caller.connect_ex(("127.0.0.1", wanted)) == errno.ECONNREFUSED
+    check_port(wanted)
 
 
 def test_a_port_that_cannot_be_opened_says_why(monkeypatch):
@@ -246,6 +255,7 @@ def test_a_viewer_that_does_not_start_says_why(robot, monkeypatch):
         pass
 
 
+@own_process
 def test_a_broken_panel_stops_the_simulation(robot, monkeypatch):
     """A fault in the viewer's thread ends the simulation with it, instead of leaving a page that stands still."""
 

@@ -148,7 +148,6 @@ def simulate(
     """
     every = _stride(session, fps)
     due = looked = time.monotonic()
-    handle.set_model(scene.model, data=scene.data)
     for tick in itertools.count():
         if seconds is not None and session.steps * session.seconds_per_step >= seconds:
             return

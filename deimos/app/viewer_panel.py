@@ -88,7 +88,8 @@ class Panel:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+        self.scene = scene
+        """What the picture shows."""
         self._shown: Moment | None = None
         self._asked: queue.SimpleQueue[Command] = queue.SimpleQueue()
         self._colours = np.round(255 * palette()).astype(np.uint8)
@@ -121,7 +122,7 @@ class Panel:
         import mujoco
         from mujoco.studio import ux
 
-        camera, scene = viewer.camera, self._scene
+        camera, scene = viewer.camera, self.scene
         camera.distance, camera.azimuth, camera.elevation = scene.distance, 130.0, scene.elevation
         follows = self._follows and scene.body > 0
         camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING if follows else mujoco.mjtCamera.mjCAMERA_FREE)
@@ -172,13 +173,13 @@ class Panel:
         if changed:
             self.ask(lambda session: session.choose(shown.names[chosen]))
         imgui.PopItemWidth()
-        if self._scene.body:
+        if self.scene.body:
             changed, self._follows = imgui.Checkbox("follow", self._follows)
             if changed:
                 self.place_camera(viewer)
-        if self._scene.is_flat:
+        if self.scene.is_flat:
             imgui.SameLine()
-            _, self._scene.has_tiles = imgui.Checkbox("tiles of fear", self._scene.has_tiles)
+            _, self.scene.has_tiles = imgui.Checkbox("tiles of fear", self.scene.has_tiles)
 
     def _draw_goal(self, imgui: Any, shown: Moment) -> None:
         """A slider per component of the goal: to move one is to choose by hand."""
