@@ -7,7 +7,13 @@ from collections.abc import Iterable
 
 
 class RunError(Exception):
-    """A run cannot continue for a reason outside the program: a folder, a file, a disk, a device."""
+    """A run cannot continue for a reason outside the program: a folder, a file, a disk, a device.
+
+    It quotes what stands in files, and says as escapes what no terminal should be sent.
+    """
+
+    def __str__(self) -> str:
+        return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in super().__str__())
 
 
 class SimulationError(RuntimeError):

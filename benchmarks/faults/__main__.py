@@ -25,7 +25,7 @@ from deimos.run.training import provenance
 KINDS = {
     "options": options, "tomls": tomls, "files": files, "injections": injections, "kills": kills, "memory": memory
 }  # fmt: skip
-"""By name: a module with ``COUNT``, how many attacks issue 20 asks for, and ``attack``, a ``trial.Attack``."""
+"""By name: a module with ``COUNT``, how many attacks there are, and ``attack``, a ``trial.Attack``."""
 
 
 @dataclass(frozen=True, kw_only=True)

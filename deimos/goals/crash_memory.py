@@ -49,10 +49,10 @@ class CrashMemory(Stateful):
         self._upto = -1  # step that interactions have been looked at up to
         self.generator = generator(seed, "crash memory", device)
 
-    def must_be_finite(self) -> Mapping[str, Any]:
+    def must_be_sound(self) -> Mapping[str, Any]:
         """See ``Stateful``: what the network sees, but not the components after it."""
         inputs = slice(self._inputs)
-        return {**super().must_be_finite(), "crash": self._crash[:, inputs], "partners": self._partners[..., inputs]}
+        return {**super().must_be_sound(), "crash": self._crash[:, inputs], "partners": self._partners[..., inputs]}
 
     @torch.no_grad()
     def store(self, rows: Tensor, window: Resolved, now: int) -> None:

@@ -21,8 +21,8 @@ class Stateful:
     saved: ClassVar[tuple[str, ...]] = ()
     """Names of the attributes; ``state_dict`` has them without a leading underscore."""
     unknown: ClassVar[tuple[str, ...]] = ()
-    """Names of those among them where NaN or an infinity says that something is not known, or not there. All other
-    numbers must be finite, or the run stops."""
+    """Names of those among them where NaN says that something is not known, or not there. All other numbers must be
+    sound, see ``is_sound``, or the run stops."""
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
@@ -38,11 +38,19 @@ class Stateful:
         for name in self.saved:
             setattr(self, name, _restored(getattr(self, name), state[name.lstrip("_")]))
 
-    def must_be_finite(self) -> Mapping[str, Any]:
-        """By name, what ``state_dict`` is made of, but for ``unknown``."""
+    def must_be_sound(self) -> Mapping[str, Any]:
+        """By name, what ``state_dict`` is made of, with 0 for the NaN of what is unknown."""
         if type(self).state_dict is not Stateful.state_dict:  # its own, which may hold anything
             return self.state_dict()
-        return {name.lstrip("_"): getattr(self, name) for name in self.saved if name not in self.unknown}
+        found = {name.lstrip("_"): getattr(self, name) for name in self.saved}
+        return found | {name.lstrip("_"): _known(getattr(self, name)) for name in self.unknown}
+
+
+def _known(value: Any) -> Any:
+    """A number or a tensor with 0 for NaN."""
+    if isinstance(value, Tensor):
+        return value.where(~value.isnan(), 0.0)
+    return 0.0 if math.isnan(value) else value
 
 
 def _state(value: Any) -> Any:
@@ -77,26 +85,35 @@ def _restored(value: Any, state: Any) -> Any:
     return value
 
 
-def not_finite(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
-    """Names and tensors of what ``value`` would save in which a number is not finite that must be; see ``unknown``.
+LARGEST = 1e15
+"""Numbers beyond it come of a fault, and their squares leave the range of float32 (3.4e38) soon."""
+
+
+def is_sound(value: Tensor) -> Tensor:
+    """Where numbers are finite and at most ``LARGEST``."""
+    return value.abs() <= LARGEST
+
+
+def unsound(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
+    """What ``value`` would save in which a number is not sound that must be: its name, and where; see ``unknown``.
 
     Args:
         name: What ``value`` is called.
         value: Anything that an attribute of ``Stateful.saved`` may be, or a mapping of such.
     """
     if isinstance(value, float):
-        value = torch.tensor(value) if not math.isfinite(value) else None
+        value = torch.tensor(value, dtype=torch.float64, device="cpu")
     if isinstance(value, Tensor):
-        if value.is_floating_point() and not bool(value.isfinite().all()):
-            yield name, value.detach()
+        if value.is_floating_point() and not bool((sound := is_sound(value.detach())).all()):
+            yield name, ~sound
         return
     if isinstance(value, nn.Module):
         parts: Any = weights_of(value)
     elif isinstance(value, tuple | list):
         parts = {str(i): item for i, item in enumerate(value)}
     elif isinstance(value, Stateful):
-        parts = value.must_be_finite()
+        parts = value.must_be_sound()
     else:
         parts = value.state_dict() if hasattr(value, "state_dict") else value
     for key, part in parts.items() if isinstance(parts, Mapping) else ():
-        yield from not_finite(f"{name}.{key}".lstrip("."), part)
+        yield from unsound(f"{name}.{key}".lstrip("."), part)

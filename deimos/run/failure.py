@@ -9,7 +9,7 @@ from torch import Tensor
 from deimos.checks import RunError, SimulationError
 from deimos.files import save_tensors
 from deimos.learn.rollout import Rollout
-from deimos.nn.stateful import not_finite
+from deimos.nn.stateful import LARGEST, unsound
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import Trainer
 
@@ -19,30 +19,29 @@ SCHEMA = 1  # of both files
 
 
 def check_finite(trainer: Trainer) -> None:
-    """Raise ``SimulationError`` if a number is not finite that a checkpoint would keep and that must be."""
-    for name, tensor in not_finite("", _parts(trainer)):
-        count, where = int((~tensor.isfinite()).sum()), _places(tensor)[:1]
+    """Raise ``SimulationError`` if a number is not finite that a checkpoint would keep and that must be, or is huge."""
+    for name, bad in unsound("", _parts(trainer)):
         raise SimulationError(
-            f"Iteration {trainer.iteration}: {count} of the {tensor.numel()} numbers of {name} are not finite, the "
-            f"first in row {where[0] if where else 0}."
+            f"Iteration {trainer.iteration}: {int(bad.sum())} of the {bad.numel()} numbers of {name} are not finite, "
+            f"or beyond {LARGEST:g}, the first in row {_places(bad)[0]}."
         )
 
 
 def dump(trainer: Trainer, folder: RunFolder, error: SimulationError, versions: dict[str, str]) -> None:
     """Write down what stopped a run: ``failure.json`` for reading, ``failure.pt`` with all its numbers.
 
-    The report lists every tensor with a number that is not finite: its shape, how many there are, and in which worlds
-    (or rows, where a tensor has no worlds); and the first steps of the rollout on which a world broke, with what it
-    observed and did before. The state holds the whole rollout.
+    The report lists every tensor with a number that is not finite, or that is huge: its shape, how many there are, and
+    in which worlds (or rows, where a tensor has no worlds); and the first steps of the rollout on which a world broke,
+    with what it observed and did before. The state holds the whole rollout.
     """
     rollout = {name: value for name, value in vars(trainer.rollout).items() if isinstance(value, Tensor)}
-    found = [*not_finite("", _parts(trainer)), *not_finite("rollout", rollout)]
+    found = [*unsound("", _parts(trainer)), *unsound("rollout", rollout)]
     report = {
         "schema": SCHEMA, "error": str(error), "iteration": trainer.iteration, "versions": versions,
         "not_finite": [
-            {"name": name, "shape": list(tensor.shape), "count": int((~tensor.isfinite()).sum()),
-             "worlds" if trainer.config.num_envs in tensor.shape else "rows": _places(tensor, trainer.config.num_envs)}
-            for name, tensor in found
+            {"name": name, "shape": list(bad.shape), "count": int(bad.sum()),
+             "worlds" if trainer.config.num_envs in bad.shape else "rows": _places(bad, trainer.config.num_envs)}
+            for name, bad in found
         ],
         "invalid": _invalid(trainer.rollout),
         "last_rows": folder.read_csv("progress.csv")[-10:],
@@ -65,13 +64,13 @@ def _parts(trainer: Trainer) -> dict[str, Any]:
     return {"ppo": trainer.ppo, "env": trainer.env, "goals": trainer.loop.core}
 
 
-def _places(tensor: Tensor, worlds: int | None = None) -> list[int]:
-    """The first worlds with a number that is not finite; along the first axis where none has that many."""
-    axis = list(tensor.shape).index(worlds) if worlds is not None and worlds in tensor.shape else 0
-    if tensor.dim() == 0:
+def _places(bad: Tensor, worlds: int | None = None) -> list[int]:
+    """The first worlds where something is true; along the first axis where none has that many."""
+    axis = list(bad.shape).index(worlds) if worlds is not None and worlds in bad.shape else 0
+    if bad.dim() == 0:
         return [0]
-    bad = (~tensor.isfinite()).movedim(axis, 0).flatten(1).any(1) if tensor.dim() > 1 else ~tensor.isfinite()
-    return bad.nonzero().squeeze(1)[:SHOWN].tolist()
+    found = bad.movedim(axis, 0).flatten(1).any(1) if bad.dim() > 1 else bad
+    return found.nonzero().squeeze(1)[:SHOWN].tolist()
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ things that the resumed one says again: each log says below how it comes to have
 
 import re
 import shutil
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -40,6 +41,11 @@ class TensorBoard:
     def __init__(self, folder: RunFolder, facts: dict[str, Any], iteration: int) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
+        # Files are read in the order of their names, which have the second and then the process: a resumed run must not
+        # begin in the second of its predecessor.
+        begun = (path.name.split(".")[3] for path in folder.path.glob("events.out.tfevents.*"))
+        newest = max((int(second) for second in begun if second.isdigit()), default=0)
+        time.sleep(min(max(newest + 1 - time.time(), 0.0), 1.0))
         self._board = SummaryWriter(str(folder.path), purge_step=iteration + 1)
         self.flush, self.close = self._board.flush, self._board.close
 

@@ -1,5 +1,6 @@
 """A run in memory: what is trained, and one iteration of it."""
 
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -159,7 +160,10 @@ class Trainer:
             SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
         """
         with tf32_products(self.config.tf32 and self.env.device.type == "cuda"):
-            return self._iterate()
+            row = self._iterate()
+        if infinite := [name for name, value in row.items() if math.isinf(value)]:
+            raise SimulationError(f"Iteration {self.iteration}: {', '.join(infinite)} would be infinite.")
+        return row
 
     def _iterate(self) -> dict[str, float]:
         """See ``iterate``."""

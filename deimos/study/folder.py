@@ -139,7 +139,7 @@ class StudyFolder:
         except OSError as error:
             raise RunError(f"{path} cannot be read ({first_line(error)}).") from error
         for line in lines:
-            with contextlib.suppress(ValueError, KeyError, TypeError):  # a kill may leave half a line
+            with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):  # a kill may leave half a line
                 found.append(str(json.loads(line)["error"]))
         return found
 

@@ -146,7 +146,7 @@ def read_cell(path: Path) -> Cell:
             raise ValueError(f"its schema is {found}, not {SCHEMA}")
         import_plugins(data["plugins"])
         return from_dict(Cell, data)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, RunError, TypeError, ValueError) as error:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
 
 

@@ -279,20 +279,26 @@ def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     except (OSError, ValueError) as error:
         raise RunError(f"{path} cannot be read ({first_line(error)}).") from error
     lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())  # version 0.1.0 may have left half a line
-    names = [FORMER_NAMES.get(name, name) for name in next(lines, columns)]
+    rows: list[Row] = []
+    try:
+        names = _names(path, next(lines, columns), columns)
+        for values in lines:
+            rows.append(_row(columns, dict(zip(names, values, strict=True))))
+    except (csv.Error, RecursionError, ValueError) as error:  # the second where a cell is nested too deeply
+        raise RunError(
+            f"{path}, line {lines.line_num}, does not fit its columns ({ascii(one_line(error))[1:-1]})."
+        ) from error
+    return rows
+
+
+def _names(path: Path, found: Iterable[str], columns: dict[str, type]) -> list[str]:
+    """Today's names of a table's columns; ``RunError`` if they are not those that it must have."""
+    names = [FORMER_NAMES.get(name, name) for name in found]
     missing, unknown = [n for n in columns if n not in {*names, *LATER_COLUMNS}], [n for n in names if n not in columns]
     if missing or unknown:
         lists = f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}"
         raise RunError(f"{path} is a table of another schema; {ascii(lists)[1:-1]}.")
-    rows = []
-    for number, values in enumerate(lines, start=2):
-        try:
-            rows.append(_row(columns, dict(zip(names, values, strict=True))))
-        except ValueError as error:
-            raise RunError(
-                f"{path}, line {number}, does not fit its columns ({ascii(one_line(error))[1:-1]})."
-            ) from error
-    return rows
+    return names
 
 
 def write_table(path: Path, columns: dict[str, type], rows: Iterable[Row]) -> None:

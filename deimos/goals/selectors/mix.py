@@ -61,9 +61,9 @@ class Mix(Delegate):
         """See ``GoalSelector.state_dict``."""
         return self.current.state_dict()
 
-    def must_be_finite(self) -> Mapping[str, Any]:
-        """See ``GoalSelector.must_be_finite``."""
-        return self.current.must_be_finite()
+    def must_be_sound(self) -> Mapping[str, Any]:
+        """See ``GoalSelector.must_be_sound``."""
+        return self.current.must_be_sound()
 
     def load_state_dict(self, state: dict) -> None:
         """See ``GoalSelector.load_state_dict``."""

@@ -5,8 +5,10 @@ Director this tests whether it matters. A level's score is its positive value lo
 interaction of max(advantage, 0).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -57,7 +59,6 @@ class PLR(GoalSelector):
 
     needs_rollout = True
     saved = ("_level", "_score", "_made", "_seen", "_upto", "_carry", "_learnt_at", "replaying")
-    unknown = ("_score",)
 
     def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config
@@ -106,6 +107,10 @@ class PLR(GoalSelector):
             "plr/filled": (self._score > -torch.inf).float().mean().item(),
             "plr/replayed": (~done.probe).float().mean().item(),
         }
+
+    def must_be_sound(self) -> Mapping[str, Any]:
+        """See ``Stateful``; free places have no score."""
+        return {**super().must_be_sound(), "score": self._score[self._score > -torch.inf]}
 
     def _positive_value_loss(self, interactions: Interactions, done: Resolved, rollout: Transitions) -> Tensor:
         """Mean of max(advantage, 0) over every resolved interaction, shape (n,); interactions span rollouts."""
