@@ -22,7 +22,7 @@ STATE, GOAL = 9, 3  # components, as in Particle Gym
 CRASHES = 0.001  # per world and step
 DRAWN, OBSERVED = "candidates drawn", "their clock"
 WAYS = ("uniform", "p25", "rnd", f"p25, {DRAWN}", f"p25, {OBSERVED}")
-EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "rsl_rl_director.py"
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 WARM_UP = 100  # periods at most until a fear network has learnt
 
 
@@ -49,7 +49,7 @@ def measure(
             "us per step": {way: 1e6 * value / period for way, value in seconds.items()},
             "world-steps/s": {way: num_envs * period / value for way, value in seconds.items()},
         })  # fmt: skip
-    return {"period": period, "sizes": rows, "share of rsl_rl": share(rounds)}
+    return {"period": period, "sizes": rows, "shares": {name: work(rounds) for name, work in SHARES.items()}}
 
 
 class Timed(GoalDirector):
@@ -65,7 +65,7 @@ class Timed(GoalDirector):
         return given
 
 
-def share(iterations: int, num_envs: int = 4096) -> float:
+def share_of_rsl_rl(iterations: int, num_envs: int = 4096) -> float:
     """Share of the time of rsl_rl's iterations, at its defaults on a CPU, that a Director's steps take.
 
     Args:
@@ -74,7 +74,9 @@ def share(iterations: int, num_envs: int = 4096) -> float:
     """
     from rsl_rl.runners import OnPolicyRunner
 
-    env = runpy.run_path(str(EXAMPLE))["Carts"](Timed("p75", 40, goal_box=([-1.0], [1.0])), num_envs)
+    env = runpy.run_path(str(EXAMPLES / "rsl_rl_director.py"))["Carts"](
+        Timed("p75", 40, goal_box=([-1.0], [1.0])), num_envs
+    )
     model = {"class_name": "MLPModel"}
     config = {"actor": model | {"distribution_cfg": {"class_name": "GaussianDistribution"}}, "critic": model}
     config |= {"obs_groups": {"actor": ["policy"], "critic": ["policy"]}, "algorithm": {"class_name": "PPO"}}
@@ -84,6 +86,33 @@ def share(iterations: int, num_envs: int = 4096) -> float:
         env.director.seconds, begin = 0.0, time.perf_counter()
         runner.learn(iterations)
     return env.director.seconds / (time.perf_counter() - begin)
+
+
+def share_of_sb3(iterations: int, num_envs: int = 64, num_steps: int = 2048) -> float:
+    """Share of the time of Stable-Baselines3's iterations of PPO, at its defaults, that a Director's steps take.
+
+    Args:
+        iterations: How many are timed; one comes first, so that fear has been learnt.
+        num_envs: Worlds of the example, CartPole.
+        num_steps: Steps of a rollout.
+    """
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+
+    from deimos.adapters.stable_baselines3 import DirectedVecEnv
+
+    example = runpy.run_path(str(EXAMPLES / "stable_baselines3_director.py"))
+    director = Timed("p75", 50, goal_box=([-1.0], [1.0]), learn_every=num_steps)
+    worlds = DirectedVecEnv(make_vec_env(example["GoalCart"], num_envs), director, slice(4, 5), example["closeness"])
+    learner = PPO("MlpPolicy", worlds, n_steps=num_steps, device="cpu")
+    learner.learn(num_envs * num_steps)
+    director.seconds, begin = 0.0, time.perf_counter()
+    learner.learn(iterations * num_envs * num_steps, reset_num_timesteps=False)
+    return director.seconds / (time.perf_counter() - begin)
+
+
+SHARES = {"rsl_rl, 4096 worlds": share_of_rsl_rl, "Stable-Baselines3, 64 worlds": share_of_sb3}
+"""By whose iterations they are: what measures the share of them that a Director's steps take."""
 
 
 def periods(way: str, num_envs: int, period: int, device: torch.device) -> Callable[[], None]:
@@ -139,4 +168,5 @@ def show(result: dict[str, Any]) -> None:
         cells = (f"{value:.0f} ({short(row['world-steps/s'][way])})" for way, value in row["us per step"].items())
         table.add_row(str(row["num_envs"]), *cells)
     wide_console().print(table)
-    wide_console().print(f"Share of an iteration of rsl_rl at 4096 worlds: {result['share of rsl_rl']:.1%}")
+    for name, share in result["shares"].items():
+        wide_console().print(f"Share of an iteration of {name}: {share:.1%}")

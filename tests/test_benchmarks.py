@@ -3,6 +3,7 @@
 import json
 import types
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -166,7 +167,9 @@ def test_quad_is_measured(capsys):
 
 def test_director_is_measured(capsys, monkeypatch):
     """The Director in other people's loops has a time per step for each way and number of worlds, and a share."""
-    monkeypatch.setattr(director, "share", lambda rounds, few=director.share: few(rounds, num_envs=32))
+    small = {"rsl_rl": partial(director.share_of_rsl_rl, num_envs=32)}
+    small |= {"sb3": partial(director.share_of_sb3, num_envs=2, num_steps=64)}
+    monkeypatch.setattr(director, "SHARES", small)
     ways = ("uniform", "p25", "p25, candidates drawn", "p25, their clock")
     result = director.measure(CPU, 1, sizes=(1, 50), period=10, ways=ways)
     assert [row["num_envs"] for row in result["sizes"]] == [1, 50]
@@ -174,7 +177,7 @@ def test_director_is_measured(capsys, monkeypatch):
         assert set(row["us per step"]) == set(ways)
         for way, value in row["us per step"].items():
             assert row["world-steps/s"][way] == pytest.approx(row["num_envs"] / value * 1e6)
-    assert 0 < result["share of rsl_rl"] < 1
+    assert all(0 < result["shares"][name] < 1 for name in small)
     director.show(result)
     assert "world-steps/s" in capsys.readouterr().out
 
@@ -198,7 +201,7 @@ def test_numbers_are_written(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         director, "measure",
         lambda device, rounds: {
-            "period": 1, "sizes": [{"num_envs": 1, "us per step": {}}], "share of rsl_rl": 0.0, "rounds": rounds,
+            "period": 1, "sizes": [{"num_envs": 1, "us per step": {}}], "shares": {"rsl_rl": 0.0}, "rounds": rounds,
         },
     )  # fmt: skip
     path = tmp_path / "numbers.json"

@@ -86,6 +86,28 @@ def test_a_goal_by_hand_stays(scared):
     assert session.goal != pytest.approx([20.0, -30.0, 10.0])
 
 
+def test_the_shield_looks_at_every_goal(scared, tmp_path):
+    """What the run's shield refuses, by whomever it was asked for, the policy does not get, and it is counted."""
+    path = Path(shutil.copytree(scared, tmp_path / "run"))
+    small = "--alpha 0.3 --worlds 3000 --attackers scripted --eval.worlds 16 --eval.steps 100 --alphas 0.3 --device cpu"
+    assert cli.main(["shield", str(path), *small.split()]) == 0
+    session = Session(SavedRun.open(path), 3, seed=5, shield="stop")
+    corners = [[x, y, z] for x in (-200.0, 200.0) for y in (-200.0, 200.0) for z in (-200.0, 200.0)]
+    for goal, refused in ((min(corners, key=session.risk), 0.0), (max(corners, key=session.risk), 0.5)):
+        session.ask(goal)
+        assert session.refused == refused
+    assert session.goal == [0.0, 0.0, 0.0]
+    assert session.refused == 0.5
+    shown = Moment.of(session, build_scene(session))
+    assert "the shield has refused 50 % of the goals" in caption(shown)
+
+
+def test_a_shield_that_is_not_there_is_one_line(bold):
+    """A run without a shield says how to make one."""
+    with pytest.raises(RunError, match=r"has no shield; make one by deimos shield\."):
+        Session(SavedRun.open(bold), 1, seed=5, shield="stop")
+
+
 def test_to_choose_by_hand_begins_with_the_active_goal(scared):
     """Who takes over by hand keeps the goal that is active; somebody unknown is refused."""
     session = session_of(scared)

@@ -22,6 +22,7 @@ from deimos.app.viewer_scene import Scene, build_scene, palette, shades
 from deimos.app.viewer_session import UNIFORM, Session, prepare
 from deimos.app.viewer_web import HOST, check_port, serve
 from deimos.checks import RunError, check_at_least, check_positive, check_range
+from deimos.goals.shield import Mode
 from deimos.run.attack import names as attacker_names
 from deimos.run.saved import SavedRun
 
@@ -46,6 +47,9 @@ class ViewOptions:
     attackers: tuple[str, ...] = ()
     """Attackers that may choose the goals: argmax, scripted, ... One that learns does so before the page is there, and
     where the run has no fear network, the map shows what it has learnt."""
+    shield: Mode | None = None
+    """Have the run's shield, which deimos shield makes, look at every goal before the policy gets it, those by hand
+    too: what becomes of one that it refuses."""
     attacker_worlds: int = 256
     """Worlds that attackers learn in, at least 1."""
     terrain: str | None = None
@@ -96,7 +100,7 @@ def main(arguments: list[str], program: str) -> None:
     with console.progress("attackers learn") as report:
         attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report)
     worlds = options.worlds or (1 if run.has_robots else 8)
-    session = Session(run, worlds, options.seed, options.world, attacks, afraid)
+    session = Session(run, worlds, options.seed, options.world, attacks, afraid, options.shield)
     if options.goals not in session.names:
         possible = sorted({*session.names[:-1], *attacker_names()})
         raise RunError(
@@ -213,7 +217,7 @@ def _recorder(session: Session, scene: Scene, options: ViewOptions) -> Iterator[
 def caption(moment: Moment) -> str:
     """What stands in the corner of a picture: the time, who chooses the goals, the goal and its risk."""
     goal = "  ".join(f"{value + 0.0:+.2f}" for value in np.round(moment.goal, 2))
-    lines = [moment.text[0], f"goals: {moment.current}   {goal}"]
+    lines = [moment.text[0], f"goals: {moment.current}   {goal}", *moment.text[2:]]
     if moment.risk is not None:
         lines.append(f"predicted crash probability {percent(moment.risk)}")
     return "\n".join(lines)

@@ -66,10 +66,12 @@ class Moment:
         goal, next_goal, fear = session.goal, session.next_goal(), session.fear_map()
         seconds = session.steps * session.seconds_per_step
         time_text = f"{seconds:.1f} s" if session.env.has_seconds else f"step {session.steps}"
-        text = (
+        text: tuple[str, ...] = (
             f"{time_text}   crashes {session.crashes}   episodes {session.episodes}",
             f"T = {session.env.goal_period} steps   iteration {session.iteration}",
         )
+        if session.refused is not None:
+            text += (f"the shield has refused {percent(session.refused)} of the goals",)
         return cls(
             text=text, names=session.names, current=session.goals.current, world=session.world, paused=session.paused,
             components=session.components, low=low.tolist(), high=high.tolist(), goal=goal, next_goal=next_goal,

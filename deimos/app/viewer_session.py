@@ -10,6 +10,7 @@ from torch import Tensor
 from deimos.checks import RunError, check_choice
 from deimos.goals.fear_selector import FearSelector
 from deimos.goals.selector import GoalSelector, Proposal
+from deimos.goals.shield import Mode
 from deimos.nn.layout import goal_components
 from deimos.run.attack import Attack, argmax_director, attacker, uniform_goals
 from deimos.run.evaluation import make_target
@@ -77,17 +78,19 @@ class Session:
         world: Global number of the first.
         attacks: Attackers that are ready, by name; see ``prepare``.
         afraid: Whose fear is shown where the run itself has no fear network.
+        shield: What becomes of goals that the run's shield refuses; ``None`` for no shield.
 
     Raises:
-        RunError: If the policy or the worlds cannot be had.
+        RunError: If the policy, the worlds or the shield cannot be had.
     """
 
     def __init__(
         self, run: SavedRun, worlds: int, seed: int, world: int = 0,
         attacks: Mapping[str, Attack] | None = None, afraid: Callable[[Env], FearSelector] | None = None,
+        shield: Mode | None = None,
     ) -> None:  # fmt: skip
         self._run, self._worlds, self._seed = run, worlds, seed
-        self._attacks, self._fallback = dict(attacks or {}), afraid
+        self._attacks, self._fallback, self._shield = dict(attacks or {}), afraid, shield
         self.paused = False
         self.axes = (0, 1)
         self.crashes = self.steps = self.episodes = 0
@@ -119,7 +122,8 @@ class Session:
         choices |= {name: attack.selector(self.env) for name, attack in self._attacks.items()}
         self.goals = Steered(choices)
         self.goals.current, self.goals.own = current if current in (*choices, BY_HAND) else UNIFORM, own
-        self._loop = GoalLoop(self.env, self.goals)
+        self._guard = self._run.guard(self.env, self._shield) if self._shield else None
+        self._loop = GoalLoop(self.env, self.goals, guard=self._guard)
 
     def _stamps(self) -> list[tuple[int, int]]:
         """What tells whether the files of a run are those that were loaded."""
@@ -197,6 +201,14 @@ class Session:
     def _count_anew(self) -> None:
         self.crashes = self.steps = self.episodes = 0
         self.restarts += 1
+
+    @property
+    def refused(self) -> float | None:
+        """Share of the goals since the policy was loaded that the shield refused, NaN before the first one.
+
+        ``None`` without a shield.
+        """
+        return self._guard.refused if self._guard else None
 
     @property
     def goal(self) -> list[float]:

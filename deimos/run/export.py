@@ -27,7 +27,7 @@ from deimos.run.config import kind
 from deimos.run.evaluation import weights_hash
 from deimos.run.fear import load_fear
 from deimos.run.folder import RunFolder
-from deimos.run.shield import SHIELD
+from deimos.run.shield import read_shield
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import provenance, read_config
 from deimos.sim.env import Env
@@ -132,25 +132,9 @@ def _describe(
         "action": {"size": env.action_dim, "low": low, "high": high},
         "goal": _describe_goal(env, config.env.goal_period),
         "fear": fear,
-        "shield": _shield(folder, files["policy"]["weights"]),
+        "shield": read_shield(folder, files["policy"]["weights"]),
         "robot": None,
     }
-
-
-def _shield(folder: RunFolder, weights: str) -> dict[str, Any] | None:
-    """The shield that the run has, if it has one; ``RunError`` if that was made for a policy of other weights."""
-    if not (folder.path / SHIELD).exists():
-        return None
-    try:
-        shield = folder.read_json(SHIELD)["deploy"]
-        known = shield["weights"]
-    except (KeyError, TypeError) as error:
-        raise RunError(f"{folder.path / SHIELD} is not that of a shield; make it again by deimos shield.") from error
-    if known != weights:
-        raise RunError(
-            f"{folder.path / SHIELD} was made for an earlier policy; make it again by deimos shield, or delete it."
-        )
-    return shield
 
 
 def _entry(field: ObsField) -> dict[str, Any]:

@@ -7,9 +7,11 @@ import torch
 
 from deimos.checks import RunError
 from deimos.goals.fear_selector import FearSelector
+from deimos.goals.shield import Mode
 from deimos.learn.policy import Policy, load_policy
 from deimos.run.fear import load_fear
 from deimos.run.folder import RunFolder
+from deimos.run.shield import Guard, stored_guard
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
@@ -86,6 +88,14 @@ class SavedRun:
             return self.config.env.build(num_envs, torch.device("cpu"), seed, world)
         except ValueError as error:
             raise RunError(str(error)) from error
+
+    def guard(self, env: Env, mode: Mode) -> Guard:
+        """The shield that was made for the run, in the loop of its worlds.
+
+        Raises:
+            RunError: If the run has none that fits.
+        """
+        return stored_guard(self.folder, self.policy(env), env, self.fear(env), mode)
 
     def fear(self, env: Env) -> FearSelector | None:
         """The selector with the fear network that the run has learnt by now, if it has one."""

@@ -20,7 +20,7 @@ from deimos.goals.shield import (
     crashes_needed,
     threshold,
 )
-from deimos.learn.policy import load_policy
+from deimos.learn.policy import Policy, load_policy
 from deimos.nn.layout import goal_field
 from deimos.nn.seeds import generator
 from deimos.nn.threads import torch_on_one
@@ -377,3 +377,53 @@ def shield_run(
     found["deploy"] = {"weights": weights_hash(policy.actor)} | found["deploy"]
     folder.write_json(SHIELD, found)
     return found
+
+
+def read_shield(folder: RunFolder, weights: str) -> dict[str, Any] | None:
+    """What a deployment needs of a run's shield; ``None`` where there is none.
+
+    Args:
+        folder: The run.
+        weights: Hash of the weights of its policy.
+
+    Raises:
+        RunError: If the shield was made for a policy of other weights, or its file is broken.
+    """
+    if not (folder.path / SHIELD).exists():
+        return None
+    try:
+        shield = folder.read_json(SHIELD)["deploy"]
+        known = shield["weights"]
+    except (KeyError, TypeError) as error:
+        raise RunError(f"{folder.path / SHIELD} is not that of a shield; make it again by deimos shield.") from error
+    if known != weights:
+        raise RunError(
+            f"{folder.path / SHIELD} was made for an earlier policy; make it again by deimos shield, or delete it."
+        )
+    return shield
+
+
+def stored_guard(folder: RunFolder, policy: Policy, env: Env, afraid: FearSelector | None, mode: Mode) -> Guard:
+    """The shield of a run, for its own worlds.
+
+    Args:
+        folder: The run.
+        policy: Its policy.
+        env: The worlds.
+        afraid: Whose fear network the shield was calibrated for: the run's.
+        mode: What becomes of the goals that it refuses.
+
+    Raises:
+        RunError: If the run has no shield that fits.
+    """
+    stored = read_shield(folder, weights_hash(policy.actor))
+    if stored is None or afraid is None:
+        raise RunError(f"{folder.path} has no shield; make one by deimos shield.")
+    scale = _goal_scale(env).tolist()
+    safe = [None if value is None else value * each for value, each in zip(stored["safe_goal"], scale, strict=True)]
+    reach = [value * each for value, each in zip(stored["goal_range"], scale, strict=True)]
+    try:
+        shield = Shield.from_dict(stored | {"safe_goal": safe, "goal_range": reach}, mode)
+    except ValueError as error:
+        raise RunError(f"{folder.path / SHIELD}: {error}") from error
+    return Guard(shield, fear_rule(afraid), ShieldConfig.candidates)
