@@ -65,9 +65,12 @@ def test_what_was_cut_off_goes_on(tmp_path, monkeypatch, capsys):
     cut = made.copy()
     faults.run(faults.FaultOptions(kind="tomls", count=4, seed=3, json=tmp_path / "y.json"))
     assert made[4:] == cut
-    assert [verdict.fault for verdict in found] == ["", "", "bad", ""]
+    assert found["outcomes"] == {"refused": 3, "fault": 1}
+    assert [(each["outcome"], "fault" in each) for each in found["kept"][1:]] == [
+        ("refused", False), ("fault", True), ("refused", False),
+    ]  # fmt: skip
     assert "2: it\n  bad: said" in capsys.readouterr().out
-    assert len(json.loads((tmp_path / "x.json").read_text())["tomls"]["attacks"]) == 4
+    assert len(json.loads((tmp_path / "x.json").read_text())["tomls"]["kept"]) == 4
     with pytest.raises(RunError, match="holds attacks of seed 3, got 0"):
         faults.run(faults.FaultOptions(kind="tomls", json=tmp_path / "x.json"))
 
