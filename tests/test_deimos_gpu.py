@@ -272,7 +272,7 @@ def test_products_are_rounded_on_a_gpu_alone(monkeypatch):
             trainer.env.device = device
             seen = []
             monkeypatch.setattr(
-                trainer, "_iterate", lambda seen=seen: seen.append(torch.get_float32_matmul_precision())
+                trainer, "_iterate", lambda seen=seen: seen.append(torch.get_float32_matmul_precision()) or {}
             )
             trainer.iterate()
             assert seen == [expected]
