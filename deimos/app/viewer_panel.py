@@ -1,5 +1,6 @@
 """What stands beside the picture in the browser: the map of fear, the goals, and what a person can ask for."""
 
+import math
 import queue
 import time
 from collections.abc import Callable, Iterator
@@ -70,7 +71,7 @@ class Moment:
             f"{time_text}   crashes {session.crashes}   episodes {session.episodes}",
             f"T = {session.env.goal_period} steps   iteration {session.iteration}",
         )
-        if session.refused is not None:
+        if session.refused is not None and not math.isnan(session.refused):
             text += (f"the shield has refused {percent(session.refused)} of the goals",)
         return cls(
             text=text, names=session.names, current=session.goals.current, world=session.world, paused=session.paused,

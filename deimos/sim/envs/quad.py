@@ -50,8 +50,9 @@ PRESETS = {
         "eval": {"worlds": 256, "steps": 1000},
     },
     "quad-walk": _WALK,
-    # The same without what a robot cannot measure: the actor does not see how fast the base moves, the critic does.
-    "quad-proprioceptive": _WALK | {"env": _WALK["env"] | {"privileged": ("linear_velocity",)}},
+    # The same without what a robot cannot measure: the actor does not see how fast the base moves, the critic does. It
+    # takes longer.
+    "quad-proprioceptive": _WALK | {"env": _WALK["env"] | {"privileged": ("linear_velocity",)}, "env_steps": 12_000},
     # From that policy over slopes, stairs and rectangles: goals of five seconds and episodes of two of them, so that
     # what a robot achieves says soon which tile is right for it.
     "quad-rough": _WALK | {
