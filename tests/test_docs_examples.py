@@ -66,6 +66,7 @@ ELSEWHERE = {
     r"deimos pool |.* --pool ": "tests/test_deimos_attackers.py, with policies that crash",
     r"python examples/\w+\.py$": "tests/test_examples.py",
     r"deimos shield ": "tests/test_deimos_shield.py, with policies that crash",
+    r"deimos view .* --shield ": "tests/test_deimos_view.py, with a policy that crashes",
     r"deimos export docs/.* --check|python deploy/go1/|python examples/deploy/": "tests/test_deimos_export.py",
     r"pip install 'deimos-rl\[|ray start |.* --engine ray": ".ci/check_ray.py; Ray is in no environment of the tests",
     r"sbatch ": "tests/test_deimos_study_cluster.py, without Slurm",
@@ -129,7 +130,7 @@ class Session:
         self.write(
             Block("toml", (folder / "examples" / "study.toml").read_text(encoding="utf-8")), "examples/study.toml"
         )
-        for name in ("quad_flat", "quad_arm_stand"):
+        for name in ("quad_flat", "quad_rough_walk", "quad_arm_stand"):
             shutil.copytree(DOCS / "results" / name, folder / "docs" / "results" / name)
         monkeypatch.chdir(folder)
         monkeypatch.syspath_prepend(str(folder))
