@@ -148,7 +148,7 @@ def _loopback_viewer() -> Any:
             return self._http_port
 
         def _start_server(self) -> None:
-            """Not yet: MuJoCo 4.0.0 crashes about once in two if a page connects before there is a model."""
+            """Not yet: MuJoCo 4.0.0 has crashed where a page connected before there was a model."""
             self._web_server = None
 
         def _update_model(self) -> None:
