@@ -45,6 +45,12 @@ def pool(variant: str, root: Path) -> None:
         print(variant, make_pool(targets, POOL / f"{variant}.pt"), flush=True)
 
 
+def note_checksums() -> None:
+    """Write the checksums of all pools, by which a test knows them."""
+    sums = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(POOL.glob("*.pt"))}
+    (POOL / "SHA256SUMS").write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()))
+
+
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -54,8 +60,7 @@ def main() -> None:
     for variant in options.variants:
         if not (POOL / f"{variant}.pt").exists():
             pool(variant, options.root)
-    sums = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(POOL.glob("*.pt"))}
-    (POOL / "SHA256SUMS").write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()))
+    note_checksums()
 
 
 if __name__ == "__main__":

@@ -12,12 +12,13 @@ from deimos.run.trainer import TrainConfig
 from deimos.sim.shared import one_stream
 
 
-def finished(config: TrainConfig, path: Path) -> tuple[RunFolder, list[dict]]:
+def finished(config: TrainConfig, path: Path, init_from: Path | None = None) -> tuple[RunFolder, list[dict]]:
     """Train and evaluate a run on the CPU, from wherever it stands.
 
     Args:
         config: The run; of one that has begun the stored configuration counts.
         path: Its folder.
+        init_from: Folder of a run whose networks it begins with.
 
     Returns:
         The folder, and the rows of its evaluation: none where ``config.evaluation`` is false.
@@ -27,7 +28,7 @@ def finished(config: TrainConfig, path: Path) -> tuple[RunFolder, list[dict]]:
             trainer, folder = training.resume(path)
         else:
             shutil.rmtree(path, ignore_errors=True)  # it was killed before its first checkpoint
-            trainer, folder = training.start(config, path, None)
+            trainer, folder = training.start(config, path, init_from)
         if trainer.iteration < trainer.config.iterations:
             training.train(trainer, folder)
         if not config.evaluation:
