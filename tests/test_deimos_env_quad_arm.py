@@ -235,7 +235,7 @@ def test_evaluation_is_quads(torch_device):
 
 def test_presets():
     """The command line's names, however spelled, lead to the environment; all presets but one ask it to walk too."""
-    for name in ("quad-arm", "quad_arm", "quad-arm-stand", "quad-arm-walk", "quad-arm-large"):
+    for name in ("quad-arm", "quad_arm", "quad-arm-stand", "quad-arm-walk", "quad-arm-reach", "quad-arm-large"):
         assert plugins.load(envs, presets.environment(name)) is quad_arm
         assert presets.preset(name).env.speed == (0.0 if name == "quad-arm-stand" else 1.0)
         assert not presets.preset(name).env.hold_trunk
