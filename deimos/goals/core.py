@@ -13,7 +13,7 @@ from deimos.nn.stateful import Stateful
 
 @dataclass(frozen=True)
 class Changes:
-    """Where a step calls for a new goal."""
+    """Where a step calls for a new goal; in dense form all worlds are listed, since nobody has counted them."""
 
     due: Tensor
     """Worlds that live and whose goal's time is up, int64, shape (m,)."""
@@ -21,6 +21,8 @@ class Changes:
     """Worlds whose episode has ended, int64, shape (m,): they begin with a first goal."""
     cut_off: Tensor
     """Those of them that were truncated, int64, shape (m,)."""
+    where: Tensor | None = None
+    """In dense form, which of the worlds in ``due`` are meant, bool, shape (num_envs,)."""
 
 
 class GoalCore(Stateful):
@@ -58,13 +60,15 @@ class GoalCore(Stateful):
         """Percentile of the active goal's fear among the candidates that it was chosen from, in [0, 100], shape
         (num_envs,): 50 for first goals and whatever else is uniform, NaN where the selector has no fear to rank by."""
         self._delivered, self._steps = torch.zeros_like(self.weight), 0  # its sum since the last call of learn
-        nobody = torch.zeros(0, dtype=torch.int64, device=spaces.device)
+        self._everybody = torch.arange(spaces.num_envs, dtype=torch.int64, device=spaces.device)
+        nobody = self._everybody[:0]
         self._nothing = Changes(nobody, nobody, nobody)
 
     def advance(
-        self, terminated: Tensor, truncated: Tensor, due: Tensor, reward: Tensor, tracking: Tensor | None = None
-    ) -> Changes:
-        """Count a step, and resolve the interactions that it ended, in one synchronisation.
+        self, terminated: Tensor, truncated: Tensor, due: Tensor, reward: Tensor, tracking: Tensor | None = None, *,
+        dense: bool = False,
+    ) -> Changes:  # fmt: skip
+        """Count a step, and resolve the interactions that it ended.
 
         Call it before anything is reset: an interaction whose T-th step is the time limit keeps its label.
 
@@ -75,11 +79,18 @@ class GoalCore(Stateful):
             reward: Rewards, shape (num_envs,).
             tracking: How well each group of goal components is met, in [0, 1], shape (num_envs, groups); ``None``
                 where there is one group and the reward says it.
+            dense: Whether the changes shall be in dense form, which reads nothing from the device. Otherwise three
+                counts are read at once, and what follows is done for those worlds alone.
         """
         self.interactions.advance(reward, terminated, tracking)
         self._delivered += self.percentile
         self._steps += 1
         done = terminated | truncated
+        if dense:
+            everybody = self._everybody
+            self.interactions.resolve(everybody, terminated, due, due | done)
+            assign(self.percentile, everybody, 50.0, done)
+            return Changes(everybody, everybody, everybody, due & ~done)
         masks = torch.stack([due & ~done, done, truncated])
         counts = masks.sum(1).tolist()
         if not any(counts):
@@ -97,23 +108,25 @@ class GoalCore(Stateful):
     @torch.no_grad()
     def choose(
         self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor,
-        horizon: Tensor | None = None,
+        horizon: Tensor | None = None, where: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """Choose the next goals of the listed worlds, and begin their interactions.
 
         For the arguments see ``GoalSelector.propose``; each world is listed once, and nothing is pending in it.
-        ``horizon`` holds the steps that each goal is to last, int64, shape (B,); ``None`` for T.
+        ``horizon`` holds the steps that each goal is to last, int64, shape (B,); ``None`` for T. In dense form ``rows``
+        are all worlds, and ``where`` says in which of them the goals are issued, bool, shape (num_envs,).
 
         Returns:
             Goals, shape (B, goal_dim).
         """
         chosen = self.selector.propose(rows, state, goal, candidates, draws)
+        self.selector.issued(rows, state, goal, candidates, chosen, where)
         self.interactions.open(
             rows, state, goal, chosen.goal, chosen.score, self.goal_period if horizon is None else horizon,
-            probe=chosen.probe, note=chosen.note,
+            probe=chosen.probe, note=chosen.note, where=where,
         )  # fmt: skip
-        assign(self.weight, rows, 1.0 if chosen.weight is None else chosen.weight)
-        assign(self.percentile, rows, torch.nan if chosen.percentile is None else chosen.percentile)
+        assign(self.weight, rows, 1.0 if chosen.weight is None else chosen.weight, where)
+        assign(self.percentile, rows, torch.nan if chosen.percentile is None else chosen.percentile, where)
         return chosen.goal
 
     def learn(self, rollout: Transitions | None) -> dict[str, float]:

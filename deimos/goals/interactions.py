@@ -54,15 +54,29 @@ class Resolved:
         return Resolved(**{name: getattr(self, name)[mask] for name in self.__dataclass_fields__})
 
 
-def assign(tensor: Tensor, rows: Tensor, value: Tensor | float) -> None:
-    """Write a value into rows, int64, shape (m,): a number for all, or a tensor with a row for each.
+def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | None = None) -> None:
+    """Write a value into rows without a wait for the device.
 
-    ``tensor[rows] = number`` would copy the number from the host, which a GPU waits for.
+    ``tensor[rows] = number`` would copy the number from the host, and ``tensor[mask] = rows`` count what is in the
+    mask: a GPU waits for both.
+
+    Args:
+        tensor: Written, shape (n, ...).
+        rows: Which rows, int64, shape (m,), each once.
+        value: A number for all, or a tensor with a row for each, of the dtype of ``tensor``.
+        where: Which of ``rows`` are meant, bool, shape (n,), where these are all rows in order; ``None`` for all.
     """
+    if where is None:
+        if isinstance(value, Tensor):
+            tensor[rows] = value
+        else:
+            tensor.index_fill_(0, rows, value)
+        return
+    where = where.view(-1, *[1] * (tensor.dim() - 1))
     if isinstance(value, Tensor):
-        tensor[rows] = value
+        torch.where(where, value, tensor, out=tensor)
     else:
-        tensor.index_fill_(0, rows, value)
+        tensor.masked_fill_(where, value)
 
 
 class Interactions(Stateful):
@@ -126,7 +140,7 @@ class Interactions(Stateful):
             self._pending[:, self._reward].addcmul_(gain, alive.unsqueeze(1))
 
     @torch.no_grad()
-    def resolve(self, rows: Tensor, crashed: Tensor, survived: Tensor) -> None:
+    def resolve(self, rows: Tensor, crashed: Tensor, survived: Tensor, where: Tensor | None = None) -> None:
         """Close what this step has decided, and drop what it has cut off.
 
         Args:
@@ -134,8 +148,11 @@ class Interactions(Stateful):
             crashed: True where it ends in a crash, bool, shape (m,).
             survived: True where its time was up, bool, shape (m,); a crash outweighs it. Where neither is true, the
                 episode was cut off, and the interaction is dropped.
+            where: Which of ``rows`` are meant; see ``assign``.
         """
         decided = self.active[rows] & (crashed | survived)
+        if where is not None:
+            decided &= where
         cursor = self._cursor[rows]
         slot = cursor % self._capacity
         marks = torch.stack(
@@ -145,28 +162,29 @@ class Interactions(Stateful):
         self._ring[rows, slot] = torch.where(keep, self._pending[rows], self._ring[rows, slot])
         self._marks[rows, slot] = torch.where(keep, marks, self._marks[rows, slot])
         self._cursor[rows] = cursor + decided
-        assign(self.active, rows, False)
+        assign(self.active, rows, False, where)
 
     @torch.no_grad()
     def open(
         self, rows: Tensor, state: Tensor, goal: Tensor, next_goal: Tensor, score: Tensor, horizon: int | Tensor,
-        probe: Tensor | None = None, note: Tensor | None = None,
+        probe: Tensor | None = None, note: Tensor | None = None, where: Tensor | None = None,
     ) -> None:  # fmt: skip
         """Start an interaction in each listed world.
 
         The arguments are fields of ``Resolved``, with one row for each of ``rows``, int64, shape (m,), each once. Goals
         are those that are issued; ``horizon`` may be one number, at least 1; ``probe`` is ``None`` for nowhere, and
-        ``note`` for 0, its numbers being below 2^24.
+        ``note`` for 0, its numbers being below 2^24. For ``where`` see ``assign``.
         """
         rest = torch.zeros(len(rows), 3 + self._sizes[-1], dtype=torch.float32, device=score.device)
         if probe is not None:
             rest[:, 0] = probe
         if note is not None:
             rest[:, 1] = note
-        self._pending[rows] = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1).float()
-        assign(self.issued_at, rows, self.now)
-        assign(self._horizon, rows, horizon)
-        assign(self.active, rows, True)
+        pending = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1).float()
+        assign(self._pending, rows, pending, where)
+        assign(self.issued_at, rows, self.now, where)
+        assign(self._horizon, rows, horizon, where)
+        assign(self.active, rows, True, where)
 
     @torch.no_grad()
     def execute(self, rows: Tensor, goal: Tensor) -> None:

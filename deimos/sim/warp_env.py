@@ -218,9 +218,9 @@ class WarpEnv(Env):
         return self._draw.tensor[: len(rows)]
 
     @final
-    def set_goals(self, rows: Tensor, goal: Tensor) -> None:
+    def set_goals(self, rows: Tensor, goal: Tensor, where: Tensor | None = None) -> None:
         """See ``Env.set_goals``."""
-        self._set_rows(rows)
+        self._set_rows(rows if where is None else rows.masked_fill(~where, -1))
         self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
