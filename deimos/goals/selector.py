@@ -154,10 +154,8 @@ class GoalSelector(Stateful, abc.ABC):
     ) -> None:  # fmt: skip
         """Take note of goals that were issued.
 
-        Args:
-            rows, state, goal, candidates: What ``propose`` was given.
-            chosen: What it gave.
-            where: In which of the rows, which are all worlds then, bool, shape (num_envs,); ``None`` for all rows.
+        The first arguments are those of ``propose``, ``chosen`` is what it gave, and ``where`` says in which of the
+        rows, which are all worlds then, bool, shape (num_envs,); ``None`` for all of them.
         """
 
     def critic(self) -> Callable[[Tensor], Tensor] | None:
