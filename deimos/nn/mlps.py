@@ -51,6 +51,7 @@ class MLPs:
         """Shape (K, numbers) each."""
         for module, *rows in zip(self.modules, *memory, strict=True):
             _move(module, *rows)
+        self._layers, self._slopes = ([self._layer(k, of) for k in range(len(self.weights))] for of in memory)
         self._workspace = workspace * 2**20
         self._kernel = _kernel(self)
 
@@ -76,8 +77,8 @@ class MLPs:
         x = self._rounded(x)
         if self._kernel is not None:
             return self._kernel.forward(x)
-        parts = [self._layers(x[..., rows, :].expand(len(self), -1, -1))[-1] for rows in self.parts(x.shape[-2])]
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+        x = x.expand(len(self), -1, -1)
+        return _joined([self._outputs(x[:, rows])[-1] for rows in self.parts(x.shape[1])], dim=1)
 
     @torch.no_grad()
     def score(self, context: Tensor, candidates: Tensor) -> Tensor:
@@ -99,7 +100,7 @@ class MLPs:
                 f"{self.units[0]} inputs, got {tuple(context.shape)} and {tuple(candidates.shape)}."
             )
         context, candidates = context.float(), candidates.float()
-        weight, bias = self._layer(0)
+        weight, bias = self._layers[0]
         with torch_on_one() if self._kernel is not None else nullcontext():
             start = torch.baddbmm(bias, context.expand(len(self), -1, -1), weight[..., :known].mT)
         if self._kernel is not None:
@@ -108,8 +109,8 @@ class MLPs:
         parts = []
         for few in self.parts(rows, count):
             hidden = torch.matmul(candidates[few], weight[:, None, :, known:].mT) + start[:, few, None]
-            parts.append(self._layers(hidden.flatten(1, 2), first=1)[-1])
-        return torch.cat(parts, dim=1).view(len(self), rows, count, self.units[-1])
+            parts.append(self._outputs(hidden.flatten(1, 2), first=1)[-1])
+        return _joined(parts, dim=1).view(len(self), rows, count, self.units[-1])
 
     @torch.no_grad()
     def gradient(self, x: Tensor, loss: Loss) -> Tensor:
@@ -129,31 +130,31 @@ class MLPs:
 
     def _gradient(self, x: Tensor, loss: Loss) -> Tensor:
         """``gradient`` by torch's products."""
-        activations = self._layers(x.expand(len(self), -1, -1))
+        activations = self._outputs(x.expand(len(self), -1, -1))
         sums, delta, free = by_outputs(loss, activations.pop(), self.parameters[:, self.free])
-        self.grad[:, self.free] = free
+        if free.shape[1]:
+            self.grad[:, self.free] = free
         for layer in reversed(range(len(self.weights))):
             below = activations.pop()
-            weight, bias = self._layer(layer, self.grad)
-            weight.copy_(torch.bmm(delta.mT, below))
-            bias.copy_(delta.sum(1, keepdim=True))
+            weight, bias = self._slopes[layer]
+            torch.bmm(delta.mT, below, out=weight)
+            torch.sum(delta, 1, keepdim=True, out=bias)
             if layer:
-                delta = _times_slope(torch.bmm(delta, self._layer(layer)[0]), below, self.activation)
+                delta = _times_slope(torch.bmm(delta, self._layers[layer][0]), below, self.activation)
         return sums
 
-    def _layers(self, x: Tensor, first: int = 0) -> list[Tensor]:
+    def _outputs(self, x: Tensor, first: int = 0) -> list[Tensor]:
         """The inputs and the outputs of all layers; from ``first`` on, whose inputs are those before the activation."""
         outputs = [x] if first == 0 else [_activated(x, self.activation)]
-        for layer in range(first, len(self.weights)):
-            weight, bias = self._layer(layer)
+        for layer, (weight, bias) in enumerate(self._layers[first:], first + 1):
             x = torch.baddbmm(bias, outputs[-1], weight.mT)
-            outputs.append(x if layer == len(self.weights) - 1 else _activated(x, self.activation))
+            outputs.append(x if layer == len(self.weights) else _activated(x, self.activation))
         return outputs
 
-    def _layer(self, layer: int, of: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def _layer(self, layer: int, of: Tensor) -> tuple[Tensor, Tensor]:
         """Views of a layer's weights, shape (K, outputs, inputs), and biases, (K, 1, outputs), in a vector of them."""
         inputs, outputs = self.units[layer : layer + 2]
-        numbers = (self.parameters if of is None else of)[:, self.weights[layer] :]
+        numbers = of[:, self.weights[layer] :]
         weight, bias = numbers.split([inputs * outputs, outputs, numbers.shape[1] - (inputs + 1) * outputs], dim=1)[:2]
         return weight.unflatten(1, (outputs, inputs)), bias.unsqueeze(1)
 
@@ -246,10 +247,17 @@ def _activated(x: Tensor, activation: str) -> Tensor:
 
 
 def _times_slope(delta: Tensor, y: Tensor, activation: str) -> Tensor:
-    """``delta`` times the derivative of an activation, which its output ``y`` determines."""
+    """``delta`` times the derivative of an activation, which its output ``y`` determines: autograd's own, one call."""
     if activation == "tanh":
-        return delta * (1.0 - y.square())
-    return torch.where(y <= 0.0, delta * (y + 1.0) if activation == "elu" else 0.0, delta)
+        return torch.ops.aten.tanh_backward(delta, y)
+    if activation == "elu":
+        return torch.ops.aten.elu_backward(delta, 1.0, 1.0, 1.0, True, y)
+    return torch.ops.aten.threshold_backward(delta, y, 0.0)
+
+
+def _joined(parts: list[Tensor], dim: int) -> Tensor:
+    """The parts end to end; one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim)
 
 
 def _kernel(nets: MLPs) -> "Kernel | None":
