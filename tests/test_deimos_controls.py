@@ -488,7 +488,7 @@ def test_a_fitted_director_delivers_its_nominal_percentile(percentile, expected)
 def test_percentiles_count_ties_half():
     """A constant score has the percentile 50, the largest of N different ones 100 (N - 1/2) / N."""
     score = torch.tensor([[3.0, 3.0, 3.0, 3.0], [1.0, 2.0, 3.0, 4.0], [1.0, 1.0, 2.0, 3.0]])
-    assert picks.percentile(score, torch.tensor([1, 3, 0])).tolist() == [50.0, 87.5, 25.0]
+    assert picks.percentile(score, torch.tensor([3.0, 4.0, 1.0])).tolist() == [50.0, 87.5, 25.0]
 
 
 def test_vds_needs_no_candidates_for_uniform_goals():

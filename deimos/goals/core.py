@@ -21,6 +21,8 @@ class Changes:
     """Worlds whose episode has ended, int64, shape (m,): they begin with a first goal."""
     cut_off: Tensor
     """Those of them that were truncated, int64, shape (m,)."""
+    ended: Tensor
+    """True where an episode has ended, bool, shape (num_envs,)."""
     where: Tensor | None = None
     """In dense form, which of the worlds in ``due`` are meant, bool, shape (num_envs,)."""
 
@@ -61,8 +63,7 @@ class GoalCore(Stateful):
         (num_envs,): 50 for first goals and whatever else is uniform, NaN where the selector has no fear to rank by."""
         self._delivered, self._steps = torch.zeros_like(self.weight), 0  # its sum since the last call of learn
         self._everybody = torch.arange(spaces.num_envs, dtype=torch.int64, device=spaces.device)
-        nobody = self._everybody[:0]
-        self._nothing = Changes(nobody, nobody, nobody)
+        self._nobody = self._everybody[:0]
 
     def advance(
         self, terminated: Tensor, truncated: Tensor, due: Tensor, reward: Tensor, tracking: Tensor | None = None, *,
@@ -87,19 +88,19 @@ class GoalCore(Stateful):
         self._steps += 1
         done = terminated | truncated
         if dense:
-            everybody = self._everybody
-            self.interactions.resolve(everybody, terminated, due, due | done)
+            everybody, changing = self._everybody, due | done
+            self.interactions.resolve(everybody, terminated, due, changing)
             assign(self.percentile, everybody, 50.0, done)
-            return Changes(everybody, everybody, everybody, due & ~done)
+            return Changes(everybody, everybody, everybody, done, changing ^ done)
         masks = torch.stack([due & ~done, done, truncated])
         counts = masks.sum(1).tolist()
-        if not any(counts):
-            return self._nothing
         # A known count spares the device another wait.
         changes = Changes(*(
-            torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nothing.due
+            torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nobody
             for mask, count in zip(masks, counts, strict=True)
-        ))  # fmt: skip
+        ), done)  # fmt: skip
+        if not any(counts):
+            return changes
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])
         assign(self.percentile, changes.done, 50.0)

@@ -97,7 +97,7 @@ class FearSelector(GoalSelector):
             self.memory = CrashMemory(config.memory, spaces.goal_period, inputs, spaces.device, seed, extra)
         self._age = -1  # rollouts since the last fit, -1 before the first
         self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
-        self._issued: int | Tensor = 0  # goals since the last call of learn; where a device counts them, its own number
+        self._issued: int | Tensor = 0  # goals since the last call of learn; of every world where the device counts
         self._said = False  # that there is no fear yet
 
     @property
@@ -127,15 +127,16 @@ class FearSelector(GoalSelector):
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
         # As a forecast it keeps the prior at issue time, whatever the crash rate is when it is evaluated.
-        forecast = picks.take(score, pick) + self.calibration.prior
-        return Proposal(picks.take(candidates, pick), forecast, probe=probe, percentile=picks.percentile(score, pick))
+        picked = picks.take(score, pick)
+        forecast, percentile = picked + self.calibration.prior, picks.percentile(score, picked)
+        return Proposal(picks.take(candidates, pick), forecast, probe=probe, percentile=percentile)
 
     def issued(
         self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
         where: Tensor | None = None,
     ) -> None:  # fmt: skip
         """See ``GoalSelector.issued``."""
-        self._issued += len(rows) if where is None else where.sum()
+        self._issued = self._issued + (len(rows) if where is None else where)
 
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
         """What ``choose`` goes by, shape (B, N): the logits of fear, ``score``, unless somebody knows better.
@@ -150,7 +151,8 @@ class FearSelector(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
-        chosen = float(self.afraid) if self._issued else math.nan  # it has not changed since the last time
+        any_issued = bool(torch.as_tensor(self._issued).any())
+        chosen = float(self.afraid) if any_issued else math.nan  # it has not changed since the last time
         self._issued = 0
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at

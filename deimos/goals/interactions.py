@@ -79,6 +79,11 @@ def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | 
         tensor.masked_fill_(where, value)
 
 
+def taken(tensor: Tensor, rows: Tensor, where: Tensor | None) -> Tensor:
+    """The rows of a tensor that ``assign`` would write: a copy, or the tensor itself where ``rows`` are all rows."""
+    return tensor[rows] if where is None else tensor
+
+
 class Interactions(Stateful):
     """One pending interaction per world, and the resolved ones of the last steps.
 
@@ -112,10 +117,11 @@ class Interactions(Stateful):
         # State, goal, next goal, score, probe, note, reward, tracking.
         self._sizes = [state_dim, goal_dim, goal_dim, 1, 1, 1, 1, groups]
         self._next_goal = slice(state_dim + goal_dim, state_dim + 2 * goal_dim)
-        self._reward = slice(-1 - groups, None)  # and the tracking: what grows with every step
         width = sum(self._sizes)
         # One row per interaction, not one tensor per field: a few decisions per step cost what their calls cost.
         self._pending = torch.zeros(num_envs, width, dtype=torch.float32, device=device)
+        self._gained = self._pending[:, -1 - groups :]  # reward and tracking: what grows with every step
+        self._zeros = torch.zeros(num_envs, 1 + groups, dtype=torch.float32, device=device)
         self.issued_at, self._horizon, self._cursor = torch.zeros(3, num_envs, dtype=torch.int64, device=device)
         """Step that the pending interaction was issued after, int64, shape (num_envs,)."""
         self._ring = torch.zeros(num_envs, capacity, width, dtype=torch.float32, device=device)
@@ -132,12 +138,9 @@ class Interactions(Stateful):
             tracking: How well each group of goal components was met, in [0, 1], shape (num_envs, groups).
         """
         self.now += 1
-        alive = (~terminated).float()
-        if tracking is None:
-            self._pending[:, -1].addcmul_(reward, alive)
-        else:
-            gain = torch.cat([reward.unsqueeze(1), tracking], dim=1)
-            self._pending[:, self._reward].addcmul_(gain, alive.unsqueeze(1))
+        gain = reward.unsqueeze(1)
+        gain = gain if tracking is None else torch.cat([gain, tracking], dim=1)
+        self._gained.add_(gain.masked_fill(terminated.unsqueeze(1), 0.0))
 
     @torch.no_grad()
     def resolve(self, rows: Tensor, crashed: Tensor, survived: Tensor, where: Tensor | None = None) -> None:
@@ -148,20 +151,19 @@ class Interactions(Stateful):
             crashed: True where it ends in a crash, bool, shape (m,).
             survived: True where its time was up, bool, shape (m,); a crash outweighs it. Where neither is true, the
                 episode was cut off, and the interaction is dropped.
-            where: Which of ``rows`` are meant; see ``assign``.
+            where: Which of ``rows`` are meant; see ``assign``. The others neither crashed nor survived.
         """
-        decided = self.active[rows] & (crashed | survived)
-        if where is not None:
-            decided &= where
-        cursor = self._cursor[rows]
-        slot = cursor % self._capacity
-        marks = torch.stack(
-            [crashed.long(), self.issued_at[rows], torch.full_like(slot, self.now), self._horizon[rows]], dim=1
+        active, cursor, issued_at, horizon, pending = (
+            taken(tensor, rows, where)
+            for tensor in (self.active, self._cursor, self.issued_at, self._horizon, self._pending)
         )
+        decided = active & (crashed | survived)
+        slot = cursor % self._capacity
+        marks = torch.stack([crashed, issued_at, torch.full_like(slot, self.now), horizon], dim=1)
         keep = decided.unsqueeze(1)
-        self._ring[rows, slot] = torch.where(keep, self._pending[rows], self._ring[rows, slot])
+        self._ring[rows, slot] = torch.where(keep, pending, self._ring[rows, slot])
         self._marks[rows, slot] = torch.where(keep, marks, self._marks[rows, slot])
-        self._cursor[rows] = cursor + decided
+        assign(self._cursor, rows, cursor + decided, where)
         assign(self.active, rows, False, where)
 
     @torch.no_grad()
@@ -175,12 +177,9 @@ class Interactions(Stateful):
         are those that are issued; ``horizon`` may be one number, at least 1; ``probe`` is ``None`` for nowhere, and
         ``note`` for 0, its numbers being below 2^24. For ``where`` see ``assign``.
         """
-        rest = torch.zeros(len(rows), 3 + self._sizes[-1], dtype=torch.float32, device=score.device)
-        if probe is not None:
-            rest[:, 0] = probe
-        if note is not None:
-            rest[:, 1] = note
-        pending = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1).float()
+        gained = self._zeros[: len(rows)]
+        columns = [gained[:, :1] if values is None else values.unsqueeze(1) for values in (score, probe, note)]
+        pending = torch.cat([state, goal, next_goal, *columns, gained], dim=1).float()
         assign(self._pending, rows, pending, where)
         assign(self.issued_at, rows, self.now, where)
         assign(self._horizon, rows, horizon, where)

@@ -51,6 +51,9 @@ class Rollout:
         self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.weight = zeros(num_steps, n).fill_(1.0)
         """Weight of the transition in everything learnt: 0 leaves it out."""
+        numbers = self.reward, self.weight, self.last_obs
+        flags = self.terminated, self.truncated, self.invalid
+        self._numbers, self._flags = (list(zip(*kind, strict=True)) for kind in (numbers, flags))  # of every step
 
     @torch.no_grad()
     def record(
@@ -69,13 +72,9 @@ class Rollout:
             weight: Weight of every world's transition, shape (num_envs,).
             cut_off: Worlds, int64, shape (m,), with all in which ``truncated`` is true.
         """
-        self.reward[t] = reward
-        self.terminated[t] = terminated
-        self.truncated[t] = truncated
-        self.invalid[t] = invalid
-        self.weight[t] = weight
-        if len(cut_off):
-            self.last_obs[t] = obs
+        kinds = 3 if len(cut_off) else 2
+        torch._foreach_copy_(self._numbers[t][:kinds], (reward, weight, obs)[:kinds])  # a GPU copies all at once
+        torch._foreach_copy_(self._flags[t], (terminated, truncated, invalid))
 
     def exclude_invalid(self) -> None:
         """Give weight 0 to what led to an invalid state: every transition of that world since its last reset."""

@@ -65,20 +65,24 @@ class MLPs:
         )
 
     @torch.no_grad()
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, out: Tensor | None = None) -> Tensor:
         """Outputs of all networks, shape (K, n, outputs).
 
         Args:
             x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own; rounded to float32.
+            out: Where they shall lie, float32, contiguous; ``None`` allocates it.
 
         Raises:
             ValueError: If the shape or the device is another one.
         """
         x = self._rounded(x)
         if self._kernel is not None:
-            return self._kernel.forward(x)
+            return self._kernel.forward(x, out=out)
         x = x.expand(len(self), -1, -1)
-        return _joined([self._outputs(x[:, rows])[-1] for rows in self.parts(x.shape[1])], dim=1)
+        parts = list(self.parts(x.shape[1]))
+        if len(parts) == 1:
+            return self._outputs(x, out=out)[-1]
+        return torch.cat([self._outputs(x[:, rows])[-1] for rows in parts], dim=1, out=out)
 
     @torch.no_grad()
     def score(self, context: Tensor, candidates: Tensor) -> Tensor:
@@ -110,7 +114,8 @@ class MLPs:
         for few in self.parts(rows, count):
             hidden = torch.matmul(candidates[few], weight[:, None, :, known:].mT) + start[:, few, None]
             parts.append(self._outputs(hidden.flatten(1, 2), first=1)[-1])
-        return _joined(parts, dim=1).view(len(self), rows, count, self.units[-1])
+        y = parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+        return y.view(len(self), rows, count, self.units[-1])
 
     @torch.no_grad()
     def gradient(self, x: Tensor, loss: Loss) -> Tensor:
@@ -143,13 +148,13 @@ class MLPs:
                 delta = _times_slope(torch.bmm(delta, self._layers[layer][0]), below, self.activation)
         return sums
 
-    def _outputs(self, x: Tensor, first: int = 0) -> list[Tensor]:
+    def _outputs(self, x: Tensor, first: int = 0, out: Tensor | None = None) -> list[Tensor]:
         """The inputs and the outputs of all layers; from ``first`` on, whose inputs are those before the activation."""
         outputs = [x] if first == 0 else [_activated(x, self.activation)]
-        for layer, (weight, bias) in enumerate(self._layers[first:], first + 1):
-            x = torch.baddbmm(bias, outputs[-1], weight.mT)
-            outputs.append(x if layer == len(self.weights) else _activated(x, self.activation))
-        return outputs
+        *hidden, (weight, bias) = self._layers[first:]
+        for layer in hidden:
+            outputs.append(_activated(torch.baddbmm(layer[1], outputs[-1], layer[0].mT), self.activation))
+        return [*outputs, torch.baddbmm(bias, outputs[-1], weight.mT, out=out)]
 
     def _layer(self, layer: int, of: Tensor) -> tuple[Tensor, Tensor]:
         """Views of a layer's weights, shape (K, outputs, inputs), and biases, (K, 1, outputs), in a vector of them."""
@@ -253,11 +258,6 @@ def _times_slope(delta: Tensor, y: Tensor, activation: str) -> Tensor:
     if activation == "elu":
         return torch.ops.aten.elu_backward(delta, 1.0, 1.0, 1.0, True, y)
     return torch.ops.aten.threshold_backward(delta, y, 0.0)
-
-
-def _joined(parts: list[Tensor], dim: int) -> Tensor:
-    """The parts end to end; one is not copied."""
-    return parts[0] if len(parts) == 1 else torch.cat(parts, dim)
 
 
 def _kernel(nets: MLPs) -> "Kernel | None":

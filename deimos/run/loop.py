@@ -83,7 +83,7 @@ class GoalLoop:
         """The second half of ``advance``: new goals where they are due, new episodes where one has ended."""
         self.choose(changes.due, changes.where)
         if len(changes.done):
-            self.begin(step.terminated | step.truncated)
+            self.begin(changes.ended)
 
     def choose(self, rows: Tensor, where: Tensor | None = None) -> None:
         """Give the listed worlds, int64, shape (m,), the selector's next goals; for ``where`` see ``Changes``."""
