@@ -25,13 +25,13 @@ WAITING = {
 """Operations that wait for CUDA: they give the host a number, or a size that depends on numbers."""
 READING = {"tolist", "numpy", "cpu", "item", "__array__", "__bool__", "__int__", "__float__", "__index__"}
 """Methods of tensors that hand numbers to the host; on a CPU not all of them come by an operation."""
-BUDGET = {"uniform": (53, 5), "p75": (67, 5)}
+BUDGET = {"uniform": (51, 5), "p75": (65, 5)}
 """Calls of torch that start work on the device, and launches of Warp, in a step of a rollout with goals of a method."""
-VIEWS = {"uniform": 36, "p75": 60}
+VIEWS = {"uniform": 35, "p75": 59}
 """Calls of torch in a step that start no work: views."""
-NOISE = 150
+NOISE = 136
 """Calls for the exploration of a whole rollout."""
-MINIBATCH, MINIBATCH_VIEWS = 130, 56
+MINIBATCH, MINIBATCH_VIEWS = 127, 53
 """Calls in a minibatch of the update, under torch's products."""
 
 

@@ -95,10 +95,11 @@ class GoalCore(Stateful):
         masks = torch.stack([due & ~done, done, truncated])
         counts = masks.sum(1).tolist()
         # A known count spares the device another wait.
-        changes = Changes(*(
+        due_rows, done_rows, cut_off = (
             torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nobody
             for mask, count in zip(masks, counts, strict=True)
-        ), done)  # fmt: skip
+        )
+        changes = Changes(due_rows, done_rows, cut_off, done)
         if not any(counts):
             return changes
         rows = torch.cat([changes.due, changes.done])
