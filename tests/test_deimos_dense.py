@@ -1,5 +1,6 @@
 """Goals as a GPU asks for them, for all worlds at every step: the same as those of the worlds that are due alone."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -88,6 +89,15 @@ def test_all_worlds_get_the_goals_of_those_that_are_due(name, monkeypatch):
     done = dense.loop.interactions.resolved()
     assert done.crashed.any()
     assert not done.crashed.all()
+
+
+def test_goals_that_outlast_a_rollout_are_counted_alike(monkeypatch):
+    """Where a rollout issues no goal, the log says so, whoever is asked about every world at each of its steps."""
+    env = replace(PARTICLES, goal_period=30, stagger_goals=False, max_speed=30.0, time_limit=45)
+    config = TrainConfig(env=env, method="p75", ppo=PPO, num_envs=64, env_steps=72, evaluation=False)
+    hold_to_each_other(config, monkeypatch, 6)
+    said = [row["fear/chosen"] for row in run(config, 4)[1]]
+    assert [math.isnan(share) for share in said] == [True, True, False, True]
 
 
 @pytest.mark.parametrize("env", [quad.Config, quad_arm.Config])

@@ -151,9 +151,8 @@ class FearSelector(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
-        any_issued = bool(torch.as_tensor(self._issued).any())
-        chosen = float(self.afraid) if any_issued else math.nan  # it has not changed since the last time
-        self._issued = 0
+        issued, self._issued = int(torch.as_tensor(self._issued).sum()), 0
+        chosen = float(self.afraid) if issued else math.nan  # it has not changed since the last time
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at
         self._learnt_at = interactions.now

@@ -128,8 +128,9 @@ class GoalSelector(Stateful, abc.ABC):
     crash_penalty: float = 0.0
     """What a crash takes from the learner's reward, at least 0, in units of the largest reward of a step."""
     dense: bool = False
-    """Whether ``propose`` may be asked about all worlds at every step, as on a GPU, which waits to tell which of them
-    are due. It must then change nothing of the selector, for most of its answers are dropped: ``issued`` does."""
+    """Whether ``propose`` may be asked about all worlds at every step, as a GPU does, which would have to wait to learn
+    how many are due. It must then change nothing of the selector, since most of its answers are dropped; what was
+    issued is noted by ``issued``."""
 
     def goal_range(self) -> Tensor | None:
         """Share of the goal range to draw candidates from, shape (goal_dim,), in (0, 1]; ``None`` for all of it."""

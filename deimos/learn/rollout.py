@@ -44,8 +44,8 @@ class Rollout:
         self.terminated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.last_obs = torch.empty(num_steps, n, obs_dim, dtype=torch.float32, device=device)
-        """Observations that steps ended in, before any reset, where ``truncated``. On a CPU a step takes no memory here
-        before it is written, and it is where worlds are truncated."""
+        """Observations that steps ended in, before any reset; only those of steps that truncated a world are written,
+        and a CPU gives memory to no others."""
         self.advantage = zeros(num_steps, n)
         """Advantages in units of scaled rewards, before they are normalised; see ``estimate``."""
         self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
@@ -70,7 +70,7 @@ class Rollout:
             truncated: True where the episode was cut off without a crash, bool, shape (num_envs,).
             invalid: True where the state is not physical any more, bool, shape (num_envs,).
             weight: Weight of every world's transition, shape (num_envs,).
-            cut_off: Worlds, int64, shape (m,), with all in which ``truncated`` is true.
+            cut_off: Worlds, int64, shape (m,), among them all in which ``truncated`` is true.
         """
         kinds = 3 if len(cut_off) else 2
         torch._foreach_copy_(self._numbers[t][:kinds], (reward, weight, obs)[:kinds])  # a GPU copies all at once

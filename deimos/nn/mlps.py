@@ -73,9 +73,13 @@ class MLPs:
             out: Where they shall lie, float32, contiguous; ``None`` allocates it.
 
         Raises:
-            ValueError: If the shape or the device is another one.
+            ValueError: If the shape or the device is another one, or ``out`` is not as it must be.
         """
-        x = self._rounded(x)
+        x, shape = self._rounded(x), (len(self), x.shape[-2], self.units[-1])
+        if out is not None and (out.shape != shape or out.dtype != torch.float32 or not out.is_contiguous()):
+            raise ValueError(
+                f"out must be contiguous, float32 and of the shape {shape}, got {out.dtype} and {tuple(out.shape)}."
+            )
         if self._kernel is not None:
             return self._kernel.forward(x, out=out)
         x = x.expand(len(self), -1, -1)
