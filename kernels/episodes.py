@@ -177,6 +177,8 @@ def _set_goals(
 ):
     i = wp.tid()
     env = row[i]
+    if env < 0:
+        return
     for k in range(goal.shape[1]):
         target = goal[i, k] / worlds.goal_scale[k]
         if worlds.origin.shape[0] > 0:
@@ -191,7 +193,7 @@ def set_goals(row: wp.array, goal: wp.array, worlds: Worlds) -> wp.Launch:
     """Record giving the listed worlds a new goal, which starts its clock and shows in their observations.
 
     Args:
-        row: Worlds, int32, shape (n,), each in [0, num_envs) and at most once.
+        row: Worlds, int32, shape (n,), each in [0, num_envs) and at most once; below 0 for none.
         goal: Goals as the policy sees them, scaled, float32, shape (n, goal_dim).
         worlds: The worlds.
 

@@ -67,8 +67,9 @@ class Ranked(GoalSelector):
         """See ``GoalSelector.propose``."""
         score = self._danger(self._env, rows, state, goal, candidates)
         pick = picks.by_rule(score, draws[:, 0], self._rule, self._percentile)
-        self._delivered.append(picks.percentile(score, pick))
-        return Proposal(picks.take(candidates, pick), picks.take(score, pick), percentile=self._delivered[-1])
+        picked = picks.take(score, pick)
+        self._delivered.append(picks.percentile(score, picked))
+        return Proposal(picks.take(candidates, pick), picked, percentile=self._delivered[-1])
 
     @property
     def delivered(self) -> float:

@@ -173,17 +173,29 @@ def forget_count(self, result, rows, count, scale=None):
     return result + 0.01 * count
 
 
-def forget_to_count(self, result, rows, goal):
+def forget_to_count(self, result, rows, goal, where=None):
     """New goals that do not count."""
     self.tensors["goal_count"][rows] -= 1
 
 
-def forget_others(self, result, rows, goal):
+def forget_the_mask(self, result, rows, goal, where=None):
+    """New goals that are told of to worlds outside of the mask."""
+    if where is not None:
+        self.tensors["goal_clock"][rows[~where]] = 0
+
+
+def forget_the_goals(self, result, rows, goal, where=None):
+    """No new goals where there is a mask."""
+    if where is not None:
+        self.tensors["goal_count"][rows[where]] -= 1
+
+
+def forget_others(self, result, rows, goal, where=None):
     """New goals that move other worlds."""
     self.tensors["position"] += 1
 
 
-def forget_to_show(self, result, rows, goal):
+def forget_to_show(self, result, rows, goal, where=None):
     """New goals that are not seen."""
     self.obs[rows, 9:] = 0.5
 
@@ -252,6 +264,8 @@ BUGS = [
     ("set_goals", forget_to_count, "sample_goals must give other goals once a goal was set: count it"),
     ("set_goals", forget_others, "set_goals must leave the other worlds alone, but position changed"),
     ("set_goals", forget_to_show, "set_goals must show the goals that it was given"),
+    ("set_goals", forget_the_mask, "set_goals must leave the rows outside of where alone, but goal_clock changed"),
+    ("set_goals", forget_the_goals, "set_goals must give a goal to the rows in where"),
     ("step", forget_the_view, "position must stay where it is: write into it, never rebind it"),
     ("step", forget_the_seed, "the same seed must give the same numbers"),
     ("step", forget_the_clock, "a goal must be not be due before T = 6 steps, but not so after 5 steps"),
@@ -352,8 +366,10 @@ class Line(Env):
         """See ``Env.draw``."""
         return uniforms(self._seed, Purpose.GOAL, self._world[rows], self.tensors["goal_count"][rows])
 
-    def set_goals(self, rows, goal):
+    def set_goals(self, rows, goal, where=None):
         """See ``Env.set_goals``."""
+        if where is not None:
+            rows, goal = rows[where], goal[where]
         self.obs[rows, 1:] = goal
         self.tensors["goal_clock"][rows] = 0
         self.tensors["goal_count"][rows] += 1

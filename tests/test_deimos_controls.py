@@ -324,7 +324,8 @@ def test_alpha_and_mix_span_from_uniform_to_the_director():
 def test_effective_share_and_state_shift_are_told():
     """The share is 1 / E_u[u / q] = 0.625 at a mix of 0.5; the shift is 0.5 where goals move no states."""
     selector = history(weighted.Config(candidates=100, mix=0.5, alpha=1.0).build(SPACES, 0), across)
-    selector.propose(*decisions(candidates=100))
+    arguments = decisions(candidates=100)
+    selector.issued(*arguments[:4], selector.propose(*arguments))
     interactions = Interactions(WORLDS, STATE, GOAL, 3, 10, CPU)
     for shift, low, high in ((0.0, 0.35, 0.65), (3.0, 0.9, 1.0)):
         rows, generator = torch.arange(WORLDS), torch.Generator().manual_seed(0)
@@ -437,7 +438,7 @@ def test_q_targets_are_discounted_worst_fears():
     """A survival's target is beta times the fear of the most feared candidate that followed, a crash's is 1."""
     selector = history(q_fear.Config(candidates=20, beta=0.5).build(SPACES, 0), across)
     rows, state, goal, options, draws = decisions(count=WORLDS)
-    selector.propose(rows, state, goal, options, draws)
+    selector.issued(rows, state, goal, options, selector.propose(rows, state, goal, options, draws))
     fits = []
     selector.fear.fit_rows = lambda inputs, crashed, weight, target: fits.append((crashed, target)) or 0.0
     worst = selector.score(state, goal, options).amax(1)
@@ -487,7 +488,7 @@ def test_a_fitted_director_delivers_its_nominal_percentile(percentile, expected)
 def test_percentiles_count_ties_half():
     """A constant score has the percentile 50, the largest of N different ones 100 (N - 1/2) / N."""
     score = torch.tensor([[3.0, 3.0, 3.0, 3.0], [1.0, 2.0, 3.0, 4.0], [1.0, 1.0, 2.0, 3.0]])
-    assert picks.percentile(score, torch.tensor([1, 3, 0])).tolist() == [50.0, 87.5, 25.0]
+    assert picks.percentile(score, torch.tensor([3.0, 4.0, 1.0])).tolist() == [50.0, 87.5, 25.0]
 
 
 def test_vds_needs_no_candidates_for_uniform_goals():

@@ -94,7 +94,8 @@ def adaptive(bins=8, **changes):
     """A grid selector that knows that goals lie in [-1, 1]^3."""
     selector = grid.Config(bins=bins, **changes).build(SPACES, 0)
     corners = torch.tensor([[[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]]])
-    selector.propose(torch.zeros(1).long(), torch.zeros(1, 2), torch.zeros(1, 3), corners, torch.zeros(1, 4))
+    decision = torch.zeros(1).long(), torch.zeros(1, 2), torch.zeros(1, 3), corners
+    selector.issued(*decision, selector.propose(*decision, torch.zeros(1, 4)))
     selector.learn(Interactions(10, 2, 3, 5, 10, CPU, groups=2), None)
     assert selector.fitted
     return selector

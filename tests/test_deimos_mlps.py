@@ -74,6 +74,20 @@ def test_outputs_and_gradients_are_autograds(backend, activation, units, rows):
     assert error.max() * grads.abs().max() <= near + 1e-5 * grads.abs().max()
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("workspace", [64, 0])
+def test_outputs_lie_where_they_are_wanted(backend, workspace):
+    """Outputs are written into memory that is given, in parts too; memory of another shape or order is refused."""
+    built = build(networks((5, 8, 3), 2, "relu"), backend, workspace=workspace)
+    x, out = torch.randn(40, 5, generator=torch.Generator().manual_seed(0)), torch.full((2, 40, 3), torch.nan)
+    expected = built.forward(x)
+    assert built.forward(x, out=out).data_ptr() == out.data_ptr()
+    assert torch.equal(out, expected)
+    for wrong in (out[:, :39], out.double(), torch.zeros(2, 3, 40).mT):
+        with pytest.raises(ValueError, match=r"out must be contiguous, float32 and of the shape \(2, 40, 3\), got"):
+            built.forward(x, out=wrong)
+
+
 @pytest.mark.parametrize("units", SHAPES)
 @pytest.mark.parametrize("count", [1, 10])
 def test_backends_agree(units, count):

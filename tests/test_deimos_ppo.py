@@ -104,8 +104,7 @@ def filled(ppo, seed=1, *, truncations=False):
 
 def end_in(rollout, final_obs):
     """Let the truncated steps end in these observations, shape (num_steps, num_envs, obs_dim)."""
-    rows = [truncated.nonzero().squeeze(1) for truncated in rollout.truncated]
-    rollout.ends = [(torch.full_like(worlds, t), worlds, final_obs[t, worlds]) for t, worlds in enumerate(rows)]
+    rollout.last_obs.copy_(torch.where(rollout.truncated.unsqueeze(2), final_obs, torch.nan))
 
 
 def statistics(normalizer):

@@ -40,6 +40,7 @@ class World:
         arguments = self.decision()
         proposal = self.selector.propose(*arguments)
         chosen = proposal.goal if choose is None else choose(arguments[3])
+        self.selector.issued(*arguments[:4], proposal)
         self.interactions.now += 1
         self.interactions.open(ROWS, arguments[1], arguments[2], chosen, proposal.score, horizon=5)
         return self.selector.learn(self.interactions, None)
@@ -173,7 +174,8 @@ def test_goals_that_somebody_else_chose_do_not_whiten():
     assert not world.selector.fitted
     world.interactions.now = 2
     world.interactions.open(ROWS, state, goal, candidates[:, 0], draws[:, 0], horizon=5)
-    world.selector.propose(ROWS[:50], state[:50], goal[:50], candidates[:50], draws[:50])
+    decision = ROWS[:50], state[:50], goal[:50], candidates[:50]
+    world.selector.issued(*decision, world.selector.propose(*decision, draws[:50]))
     assert math.isfinite(world.selector.learn(world.interactions, None)["rnd/loss"])
     assert world.selector._moments[0, 0] == 50
 

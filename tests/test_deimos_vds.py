@@ -35,10 +35,7 @@ def random_rollout(env, seed=0):
     if env.time_limit:
         rollout.truncated.bernoulli_(0.05, generator=generator)
         rollout.truncated &= ~rollout.terminated
-        for t, truncated in enumerate(rollout.truncated):
-            rows = truncated.nonzero().squeeze(1)
-            last = torch.randn(len(rows), env.obs_dim, generator=generator)
-            rollout.ends.append((torch.full_like(rows, t), rows, last))
+        rollout.last_obs.normal_(generator=generator).masked_fill_(~rollout.truncated.unsqueeze(2), torch.nan)
     rollout.weight.bernoulli_(0.9, generator=generator)
     return rollout
 

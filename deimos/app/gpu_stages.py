@@ -122,20 +122,28 @@ def tests(device: torch.device, sizes: Sizes) -> dict[str, Any]:
 
 
 def waits(device: torch.device, sizes: Sizes) -> dict[str, Any]:
-    """Where three iterations under the Director wait for the GPU, and how often: one count in a step is expected."""
+    """Where rollouts under the Director wait for the GPU, which they must not, and where whole iterations do."""
     if device.type != "cuda":
         raise Skipped("only CUDA says where it waits")
     trainer = _particles(device, sizes.worlds)
     for _ in range(5):
         trainer.iterate()
+    in_rollouts, in_iterations = (_waits_in(part) for part in (trainer.collect, trainer.iterate))
+    return {
+        "waits in a rollout": in_rollouts, "waits in an iteration": in_iterations, "passed": not in_rollouts
+    }  # fmt: skip
+
+
+def _waits_in(work: Callable[[], object]) -> dict[str, float]:
+    """How often each line waits for the GPU in a piece of work, on average over three."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
         for _ in range(3):
-            trainer.iterate()
+            work()
         torch.cuda.set_sync_debug_mode("default")
     places = Counter(f"{Path(each.filename).name}:{each.lineno}" for each in said)
-    return {"waits in an iteration": len(said) / 3, "places": dict(places.most_common())}
+    return {place: count / 3 for place, count in places.most_common()}
 
 
 def agreement(device: torch.device, sizes: Sizes) -> dict[str, Any]:

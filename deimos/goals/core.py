@@ -13,7 +13,7 @@ from deimos.nn.stateful import Stateful
 
 @dataclass(frozen=True)
 class Changes:
-    """Where a step calls for a new goal."""
+    """Where a step calls for a new goal; in dense form all worlds are listed, since nobody has counted them."""
 
     due: Tensor
     """Worlds that live and whose goal's time is up, int64, shape (m,)."""
@@ -21,6 +21,10 @@ class Changes:
     """Worlds whose episode has ended, int64, shape (m,): they begin with a first goal."""
     cut_off: Tensor
     """Those of them that were truncated, int64, shape (m,)."""
+    ended: Tensor
+    """True where an episode has ended, bool, shape (num_envs,)."""
+    where: Tensor | None = None
+    """In dense form, which of the worlds in ``due`` are meant, bool, shape (num_envs,)."""
 
 
 class GoalCore(Stateful):
@@ -58,13 +62,14 @@ class GoalCore(Stateful):
         """Percentile of the active goal's fear among the candidates that it was chosen from, in [0, 100], shape
         (num_envs,): 50 for first goals and whatever else is uniform, NaN where the selector has no fear to rank by."""
         self._delivered, self._steps = torch.zeros_like(self.weight), 0  # its sum since the last call of learn
-        nobody = torch.zeros(0, dtype=torch.int64, device=spaces.device)
-        self._nothing = Changes(nobody, nobody, nobody)
+        self._everybody = torch.arange(spaces.num_envs, dtype=torch.int64, device=spaces.device)
+        self._nobody = self._everybody[:0]
 
     def advance(
-        self, terminated: Tensor, truncated: Tensor, due: Tensor, reward: Tensor, tracking: Tensor | None = None
-    ) -> Changes:
-        """Count a step, and resolve the interactions that it ended, in one synchronisation.
+        self, terminated: Tensor, truncated: Tensor, due: Tensor, reward: Tensor, tracking: Tensor | None = None, *,
+        dense: bool = False,
+    ) -> Changes:  # fmt: skip
+        """Count a step, and resolve the interactions that it ended.
 
         Call it before anything is reset: an interaction whose T-th step is the time limit keeps its label.
 
@@ -75,20 +80,28 @@ class GoalCore(Stateful):
             reward: Rewards, shape (num_envs,).
             tracking: How well each group of goal components is met, in [0, 1], shape (num_envs, groups); ``None``
                 where there is one group and the reward says it.
+            dense: Whether the changes shall be in dense form, which reads nothing from the device. Otherwise three
+                counts are read at once, and what follows is done for those worlds alone.
         """
         self.interactions.advance(reward, terminated, tracking)
         self._delivered += self.percentile
         self._steps += 1
         done = terminated | truncated
+        if dense:
+            everybody, changing = self._everybody, due | done
+            self.interactions.resolve(everybody, terminated, due, changing)
+            assign(self.percentile, everybody, 50.0, done)
+            return Changes(everybody, everybody, everybody, done, changing ^ done)
         masks = torch.stack([due & ~done, done, truncated])
         counts = masks.sum(1).tolist()
-        if not any(counts):
-            return self._nothing
         # A known count spares the device another wait.
-        changes = Changes(*(
-            torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nothing.due
+        due_rows, done_rows, cut_off = (
+            torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nobody
             for mask, count in zip(masks, counts, strict=True)
-        ))  # fmt: skip
+        )
+        changes = Changes(due_rows, done_rows, cut_off, done)
+        if not any(counts):
+            return changes
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])
         assign(self.percentile, changes.done, 50.0)
@@ -97,23 +110,25 @@ class GoalCore(Stateful):
     @torch.no_grad()
     def choose(
         self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor,
-        horizon: Tensor | None = None,
+        horizon: Tensor | None = None, where: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
         """Choose the next goals of the listed worlds, and begin their interactions.
 
         For the arguments see ``GoalSelector.propose``; each world is listed once, and nothing is pending in it.
-        ``horizon`` holds the steps that each goal is to last, int64, shape (B,); ``None`` for T.
+        ``horizon`` holds the steps that each goal is to last, int64, shape (B,); ``None`` for T. In dense form ``rows``
+        are all worlds, and ``where`` says in which of them the goals are issued, bool, shape (num_envs,).
 
         Returns:
             Goals, shape (B, goal_dim).
         """
         chosen = self.selector.propose(rows, state, goal, candidates, draws)
+        self.selector.issued(rows, state, goal, candidates, chosen, where)
         self.interactions.open(
             rows, state, goal, chosen.goal, chosen.score, self.goal_period if horizon is None else horizon,
-            probe=chosen.probe, note=chosen.note,
+            probe=chosen.probe, note=chosen.note, where=where,
         )  # fmt: skip
-        assign(self.weight, rows, 1.0 if chosen.weight is None else chosen.weight)
-        assign(self.percentile, rows, torch.nan if chosen.percentile is None else chosen.percentile)
+        assign(self.weight, rows, 1.0 if chosen.weight is None else chosen.weight, where)
+        assign(self.percentile, rows, torch.nan if chosen.percentile is None else chosen.percentile, where)
         return chosen.goal
 
     def learn(self, rollout: Transitions | None) -> dict[str, float]:

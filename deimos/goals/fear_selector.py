@@ -75,10 +75,11 @@ class FearSelector(GoalSelector):
     """Learns fear online and leaves the choice to ``choose``. Until it has seen both classes it is uniform."""
 
     config: FearSelectorConfig
+    dense = True
     inputs_per_row: ClassVar[int] = 1
     """Inputs of the network in a row of ``rows``."""
     saved: ClassVar[tuple[str, ...]] = (
-        "fear", "memory", "calibration", "_learnt_at", "_age", "_auroc", "_issued", "_chosen",
+        "fear", "memory", "calibration", "_learnt_at", "_age", "_auroc", "_issued",
     )  # fmt: skip
     unknown: ClassVar[tuple[str, ...]] = ("_auroc",)
 
@@ -96,7 +97,7 @@ class FearSelector(GoalSelector):
             self.memory = CrashMemory(config.memory, spaces.goal_period, inputs, spaces.device, seed, extra)
         self._age = -1  # rollouts since the last fit, -1 before the first
         self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
-        self._issued, self._chosen = 0, 0  # goals since the last call of learn, and those of them that fear chose
+        self._issued: int | Tensor = 0  # goals since the last call of learn; of every world where the device counts
         self._said = False  # that there is no fear yet
 
     @property
@@ -118,18 +119,24 @@ class FearSelector(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are log odds before the temperature."""
-        self._issued += len(rows)
         if not self.afraid:
             return uniform_proposal(candidates, draws[:, 0])
-        self._chosen += len(rows)
         score = self.score(state, goal, candidates)
         pick, probe = self.choose(self.ranking(state, goal, candidates, score, draws), draws[:, 0]), None
         if self.config.probe:
             probe = draws[:, 1] < self.config.probe
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
         # As a forecast it keeps the prior at issue time, whatever the crash rate is when it is evaluated.
-        forecast = picks.take(score, pick) + self.calibration.prior
-        return Proposal(picks.take(candidates, pick), forecast, probe=probe, percentile=picks.percentile(score, pick))
+        picked = picks.take(score, pick)
+        forecast, percentile = picked + self.calibration.prior, picks.percentile(score, picked)
+        return Proposal(picks.take(candidates, pick), forecast, probe=probe, percentile=percentile)
+
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """See ``GoalSelector.issued``."""
+        self._issued = self._issued + (len(rows) if where is None else where)
 
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
         """What ``choose`` goes by, shape (B, N): the logits of fear, ``score``, unless somebody knows better.
@@ -144,6 +151,8 @@ class FearSelector(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
+        issued, self._issued = int(torch.as_tensor(self._issued).sum()), 0
+        chosen = float(self.afraid) if issued else math.nan  # it has not changed since the last time
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at
         self._learnt_at = interactions.now
@@ -159,9 +168,8 @@ class FearSelector(GoalSelector):
             "fear/resolved": float(recent.sum()),
             "fear/score": window.score[recent].nanmean().item(),
             "fear/temperature": self.calibration.temperature,
-            "fear/chosen": self._chosen / self._issued if self._issued else math.nan,
+            "fear/chosen": chosen,
         }
-        self._issued = self._chosen = 0
         quality = evaluate(self.calibration.of_log_odds(window.score[fresh]), window.crashed[fresh])
         row |= {f"calibration/{name}": value for name, value in quality.items()}
         # The temperature is fitted to scores from before the network learnt from their outcomes.

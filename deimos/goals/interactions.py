@@ -54,15 +54,34 @@ class Resolved:
         return Resolved(**{name: getattr(self, name)[mask] for name in self.__dataclass_fields__})
 
 
-def assign(tensor: Tensor, rows: Tensor, value: Tensor | float) -> None:
-    """Write a value into rows, int64, shape (m,): a number for all, or a tensor with a row for each.
+def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | None = None) -> None:
+    """Write a value into rows without a wait for the device.
 
-    ``tensor[rows] = number`` would copy the number from the host, which a GPU waits for.
+    ``tensor[rows] = number`` would copy the number from the host, and ``tensor[mask] = rows`` count what is in the
+    mask: a GPU waits for both.
+
+    Args:
+        tensor: Written, shape (n, ...).
+        rows: Which rows, int64, shape (m,), each once.
+        value: A number for all, or a tensor with a row for each, of the dtype of ``tensor``.
+        where: Which of ``rows`` are meant, bool, shape (n,), where these are all rows in order; ``None`` for all.
     """
+    if where is None:
+        if isinstance(value, Tensor):
+            tensor[rows] = value
+        else:
+            tensor.index_fill_(0, rows, value)
+        return
+    where = where.view(-1, *[1] * (tensor.dim() - 1))
     if isinstance(value, Tensor):
-        tensor[rows] = value
+        torch.where(where, value, tensor, out=tensor)
     else:
-        tensor.index_fill_(0, rows, value)
+        tensor.masked_fill_(where, value)
+
+
+def taken(tensor: Tensor, rows: Tensor, where: Tensor | None) -> Tensor:
+    """The rows of a tensor that ``assign`` would write: a copy, or the tensor itself where ``rows`` are all rows."""
+    return tensor[rows] if where is None else tensor
 
 
 class Interactions(Stateful):
@@ -98,10 +117,11 @@ class Interactions(Stateful):
         # State, goal, next goal, score, probe, note, reward, tracking.
         self._sizes = [state_dim, goal_dim, goal_dim, 1, 1, 1, 1, groups]
         self._next_goal = slice(state_dim + goal_dim, state_dim + 2 * goal_dim)
-        self._reward = slice(-1 - groups, None)  # and the tracking: what grows with every step
         width = sum(self._sizes)
         # One row per interaction, not one tensor per field: a few decisions per step cost what their calls cost.
         self._pending = torch.zeros(num_envs, width, dtype=torch.float32, device=device)
+        self._gained = self._pending[:, -1 - groups :]  # reward and tracking: what grows with every step
+        self._zeros = torch.zeros(num_envs, 1 + groups, dtype=torch.float32, device=device)
         self.issued_at, self._horizon, self._cursor = torch.zeros(3, num_envs, dtype=torch.int64, device=device)
         """Step that the pending interaction was issued after, int64, shape (num_envs,)."""
         self._ring = torch.zeros(num_envs, capacity, width, dtype=torch.float32, device=device)
@@ -118,15 +138,12 @@ class Interactions(Stateful):
             tracking: How well each group of goal components was met, in [0, 1], shape (num_envs, groups).
         """
         self.now += 1
-        alive = (~terminated).float()
-        if tracking is None:
-            self._pending[:, -1].addcmul_(reward, alive)
-        else:
-            gain = torch.cat([reward.unsqueeze(1), tracking], dim=1)
-            self._pending[:, self._reward].addcmul_(gain, alive.unsqueeze(1))
+        gain = reward.unsqueeze(1)
+        gain = gain if tracking is None else torch.cat([gain, tracking], dim=1)
+        self._gained.add_(gain.masked_fill(terminated.unsqueeze(1), 0.0))
 
     @torch.no_grad()
-    def resolve(self, rows: Tensor, crashed: Tensor, survived: Tensor) -> None:
+    def resolve(self, rows: Tensor, crashed: Tensor, survived: Tensor, where: Tensor | None = None) -> None:
         """Close what this step has decided, and drop what it has cut off.
 
         Args:
@@ -134,39 +151,39 @@ class Interactions(Stateful):
             crashed: True where it ends in a crash, bool, shape (m,).
             survived: True where its time was up, bool, shape (m,); a crash outweighs it. Where neither is true, the
                 episode was cut off, and the interaction is dropped.
+            where: Which of ``rows`` are meant; see ``assign``. The others neither crashed nor survived.
         """
-        decided = self.active[rows] & (crashed | survived)
-        cursor = self._cursor[rows]
-        slot = cursor % self._capacity
-        marks = torch.stack(
-            [crashed.long(), self.issued_at[rows], torch.full_like(slot, self.now), self._horizon[rows]], dim=1
+        active, cursor, issued_at, horizon, pending = (
+            taken(tensor, rows, where)
+            for tensor in (self.active, self._cursor, self.issued_at, self._horizon, self._pending)
         )
+        decided = active & (crashed | survived)
+        slot = cursor % self._capacity
+        marks = torch.stack([crashed, issued_at, torch.full_like(slot, self.now), horizon], dim=1)
         keep = decided.unsqueeze(1)
-        self._ring[rows, slot] = torch.where(keep, self._pending[rows], self._ring[rows, slot])
+        self._ring[rows, slot] = torch.where(keep, pending, self._ring[rows, slot])
         self._marks[rows, slot] = torch.where(keep, marks, self._marks[rows, slot])
-        self._cursor[rows] = cursor + decided
-        assign(self.active, rows, False)
+        assign(self._cursor, rows, cursor + decided, where)
+        assign(self.active, rows, False, where)
 
     @torch.no_grad()
     def open(
         self, rows: Tensor, state: Tensor, goal: Tensor, next_goal: Tensor, score: Tensor, horizon: int | Tensor,
-        probe: Tensor | None = None, note: Tensor | None = None,
+        probe: Tensor | None = None, note: Tensor | None = None, where: Tensor | None = None,
     ) -> None:  # fmt: skip
         """Start an interaction in each listed world.
 
         The arguments are fields of ``Resolved``, with one row for each of ``rows``, int64, shape (m,), each once. Goals
         are those that are issued; ``horizon`` may be one number, at least 1; ``probe`` is ``None`` for nowhere, and
-        ``note`` for 0, its numbers being below 2^24.
+        ``note`` for 0, its numbers being below 2^24. For ``where`` see ``assign``.
         """
-        rest = torch.zeros(len(rows), 3 + self._sizes[-1], dtype=torch.float32, device=score.device)
-        if probe is not None:
-            rest[:, 0] = probe
-        if note is not None:
-            rest[:, 1] = note
-        self._pending[rows] = torch.cat([state, goal, next_goal, score.unsqueeze(1), rest], dim=1).float()
-        assign(self.issued_at, rows, self.now)
-        assign(self._horizon, rows, horizon)
-        assign(self.active, rows, True)
+        gained = self._zeros[: len(rows)]
+        columns = [gained[:, :1] if values is None else values.unsqueeze(1) for values in (score, probe, note)]
+        pending = torch.cat([state, goal, next_goal, *columns, gained], dim=1).float()
+        assign(self._pending, rows, pending, where)
+        assign(self.issued_at, rows, self.now, where)
+        assign(self._horizon, rows, horizon, where)
+        assign(self.active, rows, True, where)
 
     @torch.no_grad()
     def execute(self, rows: Tensor, goal: Tensor) -> None:

@@ -53,13 +53,17 @@ def above_percentile(score: Tensor, draw: Tensor, percentile: float) -> Tensor:
     return take(score.topk(kept, dim=1, sorted=False).indices, pick)
 
 
-def percentile(score: Tensor, pick: Tensor) -> Tensor:
+def percentile(score: Tensor, picked: Tensor) -> Tensor:
     """Percentile of the picked score among those of its row, in (0, 100), ties counting half, shape (B,).
 
     Whatever the scores, a uniform pick has 50 on average.
+
+    Args:
+        score: Scores, shape (B, N).
+        picked: The one of each row, shape (B,).
     """
     # Above n of 100 and below m, it has 50 + (n - m) / 2. For few rows every operation costs what its call costs.
-    above = (take(score, pick).unsqueeze(1) - score).sign_().sum(1)
+    above = (picked.unsqueeze(1) - score).sign_().sum(1)
     return above * (50.0 / score.shape[1]) + 50.0
 
 

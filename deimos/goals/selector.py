@@ -127,6 +127,10 @@ class GoalSelector(Stateful, abc.ABC):
     """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
     crash_penalty: float = 0.0
     """What a crash takes from the learner's reward, at least 0, in units of the largest reward of a step."""
+    dense: bool = False
+    """Whether ``propose`` may be asked about all worlds at every step, as a GPU does, which would have to wait to learn
+    how many are due. It must then change nothing of the selector, since most of its answers are dropped; what was
+    issued is noted by ``issued``."""
 
     def goal_range(self) -> Tensor | None:
         """Share of the goal range to draw candidates from, shape (goal_dim,), in (0, 1]; ``None`` for all of it."""
@@ -143,6 +147,16 @@ class GoalSelector(Stateful, abc.ABC):
             candidates: Independent uniform goals for each, shape (B, num_candidates, goal_dim).
             draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All chance
                 in the choice comes from here, so that it is the same in any batch.
+        """
+
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """Take note of goals that were issued.
+
+        The first arguments are those of ``propose``, ``chosen`` is what it gave, and ``where`` says in which of the
+        rows, which are all worlds then, bool, shape (num_envs,); ``None`` for all of them.
         """
 
     def critic(self) -> Callable[[Tensor], Tensor] | None:
@@ -185,6 +199,7 @@ class Delegate(GoalSelector):
         """Who chooses."""
 
     needs_rollout = property(lambda self: any(part.needs_rollout for part in self.parts))
+    dense = property(lambda self: self.current.dense)
     num_candidates = property(lambda self: self.current.num_candidates)
     first_goals_scaled = property(lambda self: self.current.first_goals_scaled)
     crash_penalty = property(lambda self: self.current.crash_penalty)
@@ -196,6 +211,13 @@ class Delegate(GoalSelector):
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
         return self.current.propose(rows, state, goal, candidates, draws)
+
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """See ``GoalSelector.issued``."""
+        self.current.issued(rows, state, goal, candidates, chosen, where)
 
     def critic(self) -> Callable[[Tensor], Tensor] | None:
         """See ``GoalSelector.critic``."""

@@ -8,6 +8,7 @@ uses the value of the one before.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -94,17 +95,17 @@ class Batch:
     obs_dim: int
     """Components of an observation."""
 
-    @property
+    @cached_property
     def obs(self) -> Tensor:
         """Observations, shape (n, obs_dim): a view."""
         return self.table[: self.obs_dim].t()
 
-    @property
+    @cached_property
     def policy(self) -> Tensor:
         """The data of ``losses.Surrogate``: a view."""
         return self.table[self.obs_dim : -2].unsqueeze(0)
 
-    @property
+    @cached_property
     def value(self) -> Tensor:
         """The data of ``losses.ValueLoss``: a view."""
         return self.table[-3:].unsqueeze(0)
@@ -198,7 +199,8 @@ class PPO(Stateful):
             action: Actions, shape (n, action_dim). Written.
             mean: Means of their distribution, same shape. Written.
         """
-        mean.copy_(self._actor.forward(self._inputs(obs, self._normalized[: len(obs)])[:, self.actor.seen])[0])
+        inputs = self._inputs(obs, self._normalized[: len(obs)])[:, self.actor.seen]
+        self._actor.forward(inputs, out=mean.unsqueeze(0))
         torch.addcmul(mean, noise, self.actor.std, out=action)
 
     @torch.no_grad()
@@ -253,14 +255,16 @@ class PPO(Stateful):
             # Only now: the policy that acted is the one that learning starts from.
             for obs, weight in zip(rollout.obs[:-1], rollout.weight, strict=True):
                 self.actor.normalizer.update(obs, (weight > 0).float())
+        entropy = self.actor.std.log().sum() + len(std) * 0.5 * math.log(2 * math.pi * math.e)
+        after = {
+            "entropy": entropy, "learning_rate": self.learning_rate, "action_std": self.actor.std.mean(),
+            "explained_variance": explained,
+        }  # fmt: skip
         return {
             "value_loss": value_loss,
             "surrogate_loss": surrogate_loss,
             "kl": kl,
-            "entropy": (self.actor.std.log().sum() + len(std) * 0.5 * math.log(2 * math.pi * math.e)).item(),
-            "learning_rate": self.learning_rate.item(),
-            "action_std": self.actor.std.mean().item(),
-            "explained_variance": explained.item(),
+            **dict(zip(after, torch.stack(list(after.values())).tolist(), strict=True)),
         }
 
     @torch.no_grad()
@@ -339,10 +343,10 @@ class PPO(Stateful):
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         """Divide by 1.5 above twice the desired divergence, multiply below half of it; no host round trip."""
         rate, desired = self.learning_rate, self.config.desired_kl
-        factor = torch.where(kl > 2 * desired, 1 / 1.5, torch.where((kl < desired / 2) & (kl > 0), 1.5, 1.0)).float()
         low, high = LEARNING_RATE_RANGE
-        raised, lowered = (rate * factor).clamp(max=high), (rate * factor).clamp(min=low)
-        rate.copy_(torch.where(factor > 1, raised, torch.where(factor < 1, lowered, rate)))
+        raised, lowered = (rate * 1.5).clamp(max=high), (rate * (1 / 1.5)).clamp(min=low)
+        kept = torch.where((kl < desired / 2) & (kl > 0), raised, rate)
+        torch.where(kl > 2 * desired, lowered, kept, out=rate)
 
     def load_weights(self, state: dict) -> None:
         """Load the networks alone.

@@ -43,13 +43,17 @@ class Rollout:
         self.reward = zeros(num_steps, n)
         self.terminated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
-        self.ends: list[tuple[Tensor, Tensor, Tensor]] = []
-        """What ``cut_off`` joins, for every step that truncated worlds; where none does it takes no memory."""
+        self.last_obs = torch.empty(num_steps, n, obs_dim, dtype=torch.float32, device=device)
+        """Observations that steps ended in, before any reset; only those of steps that truncated a world are written,
+        and a CPU gives memory to no others."""
         self.advantage = zeros(num_steps, n)
         """Advantages in units of scaled rewards, before they are normalised; see ``estimate``."""
         self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.weight = zeros(num_steps, n).fill_(1.0)
         """Weight of the transition in everything learnt: 0 leaves it out."""
+        numbers = self.reward, self.weight, self.last_obs
+        flags = self.terminated, self.truncated, self.invalid
+        self._numbers, self._flags = (list(zip(*kind, strict=True)) for kind in (numbers, flags))  # of every step
 
     @torch.no_grad()
     def record(
@@ -59,24 +63,18 @@ class Rollout:
         """Copy what step ``t`` gave back.
 
         Args:
-            t: Index of the step, in [0, num_steps); step 0 begins a new rollout.
+            t: Index of the step, in [0, num_steps).
             obs: Observations that the step ended in, not yet reset, shape (num_envs, obs_dim).
             reward: Rewards, shape (num_envs,).
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where the episode was cut off without a crash, bool, shape (num_envs,).
             invalid: True where the state is not physical any more, bool, shape (num_envs,).
             weight: Weight of every world's transition, shape (num_envs,).
-            cut_off: The worlds where ``truncated`` is true, int64, shape (m,).
+            cut_off: Worlds, int64, shape (m,), among them all in which ``truncated`` is true.
         """
-        if t == 0:
-            self.ends.clear()
-        self.reward[t] = reward
-        self.terminated[t] = terminated
-        self.truncated[t] = truncated
-        self.invalid[t] = invalid
-        self.weight[t] = weight
-        if len(cut_off):
-            self.ends.append((torch.full_like(cut_off, t), cut_off, obs[cut_off]))
+        kinds = 3 if len(cut_off) else 2
+        torch._foreach_copy_(self._numbers[t][:kinds], (reward, weight, obs)[:kinds])  # a GPU copies all at once
+        torch._foreach_copy_(self._flags[t], (terminated, truncated, invalid))
 
     def exclude_invalid(self) -> None:
         """Give weight 0 to what led to an invalid state: every transition of that world since its last reset."""
@@ -88,9 +86,8 @@ class Rollout:
 
     def cut_off(self) -> tuple[Tensor, Tensor, Tensor]:
         """Steps and worlds that were truncated, int64, shape (m,) each, and their last observations, (m, obs_dim)."""
-        nobody = torch.zeros(0, dtype=torch.int64, device=self.obs.device)
-        step, world, obs = zip((nobody, nobody, self.obs[0, :0]), *self.ends, strict=True)
-        return torch.cat(step), torch.cat(world), torch.cat(obs)
+        step, world = self.truncated.nonzero(as_tuple=True)
+        return step, world, self.last_obs[step, world]
 
     def estimate(self, critic: Callable[[Tensor], Tensor]) -> Tensor:
         """Fill in ``advantage``.
@@ -103,8 +100,8 @@ class Rollout:
         """
         value = critic(self.obs)
         next_value = value[1:].clone()
-        if self.ends:
-            step, world, obs = self.cut_off()
+        step, world, obs = self.cut_off()
+        if len(step):
             next_value[step, world] = critic(obs)
         self.advantage.copy_(advantages(
             self.reward * self.reward_scale, value[:-1], next_value, self.terminated, self.truncated,

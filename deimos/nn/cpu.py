@@ -64,16 +64,17 @@ class Kernel:
         for name, value in fields.items():
             self._job[name] = value
 
-    def forward(self, x: Tensor, start: Tensor | None = None, shared: int = 1) -> Tensor:
+    def forward(self, x: Tensor, start: Tensor | None = None, shared: int = 1, out: Tensor | None = None) -> Tensor:
         """Outputs of all networks, shape (K, n, outputs).
 
         Args:
             x: Inputs, shape (n, inputs) or (K, n, inputs); the last ones, where the others' share is in ``start``.
             start: What the first layer's sums start from instead of its biases, shape (K, n / shared, units).
             shared: Consecutive rows that start from the same.
+            out: Where outputs shall lie, contiguous; ``None`` allocates it.
         """
         rows = x.shape[-2]
-        y = torch.empty(len(self._parameters), rows, self._outputs, dtype=torch.float32)
+        y = torch.empty(len(self._parameters), rows, self._outputs, dtype=torch.float32) if out is None else out
         start = None if start is None else start.contiguous()
         with POOL.lock:
             self._prepare(Mode.FORWARD, x, y)

@@ -22,7 +22,7 @@ class ValueLoss:
     """The squared error of values; clipped, it does not follow a value that has moved too far already.
 
     Where a value has moved too far and clipping makes the loss larger, the clipped loss counts, and that one is flat.
-    Inside the clip both are the same but for rounding, which must not decide. Gives one sum, the loss.
+    Inside the clip both are the same, without a rounding that could decide. Gives one sum, the loss.
     """
 
     data: Tensor
@@ -50,10 +50,10 @@ class ValueLoss:
         weight, old, target = self.data.unbind(1)
         value = value.squeeze(2)
         error, step = value - target, value - old
-        held = step.clamp(-self.clip, self.clip)
-        plain, clipped = error.square(), (old + held - target).square()
+        beyond = step - step.clamp(-self.clip, self.clip)  # exactly 0 inside the clip
+        plain, clipped = error.square(), (error - beyond).square()
         loss = (weight * torch.maximum(plain, clipped)).sum(1, keepdim=True)
-        slope = 2.0 * weight * error * ((step == held) | (plain >= clipped))  # 0 times NaN is NaN
+        slope = error * weight * (plain >= clipped) * 2.0  # 0 times NaN is NaN
         return loss, slope.unsqueeze(2), torch.zeros_like(free)
 
 
@@ -99,7 +99,8 @@ class Surrogate:
         mean, std = mean[0].t(), std[0].unsqueeze(1)  # with actions along the first axis, rows lie end to end
         z = (action - mean) / std
         ratio = (log_prob(z, std) - old_log_prob).exp()
-        plain, clipped = -advantage * ratio, -advantage * ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
+        cost = -advantage
+        plain, clipped = cost * ratio, cost * ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
         slope = weight * plain * (plain >= clipped)  # by log r
         loss = weight @ torch.maximum(plain, clipped)
         sums = torch.cat([loss.unsqueeze(0), (mean - old_mean).square() @ weight])

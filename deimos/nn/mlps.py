@@ -51,6 +51,7 @@ class MLPs:
         """Shape (K, numbers) each."""
         for module, *rows in zip(self.modules, *memory, strict=True):
             _move(module, *rows)
+        self._layers, self._slopes = ([self._layer(k, of) for k in range(len(self.weights))] for of in memory)
         self._workspace = workspace * 2**20
         self._kernel = _kernel(self)
 
@@ -64,20 +65,28 @@ class MLPs:
         )
 
     @torch.no_grad()
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, out: Tensor | None = None) -> Tensor:
         """Outputs of all networks, shape (K, n, outputs).
 
         Args:
             x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own; rounded to float32.
+            out: Where they shall lie, float32, contiguous; ``None`` allocates it.
 
         Raises:
-            ValueError: If the shape or the device is another one.
+            ValueError: If the shape or the device is another one, or ``out`` is not as it must be.
         """
-        x = self._rounded(x)
+        x, shape = self._rounded(x), (len(self), x.shape[-2], self.units[-1])
+        if out is not None and (out.shape != shape or out.dtype != torch.float32 or not out.is_contiguous()):
+            raise ValueError(
+                f"out must be contiguous, float32 and of the shape {shape}, got {out.dtype} and {tuple(out.shape)}."
+            )
         if self._kernel is not None:
-            return self._kernel.forward(x)
-        parts = [self._layers(x[..., rows, :].expand(len(self), -1, -1))[-1] for rows in self.parts(x.shape[-2])]
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+            return self._kernel.forward(x, out=out)
+        x = x.expand(len(self), -1, -1)
+        parts = list(self.parts(x.shape[1]))
+        if len(parts) == 1:
+            return self._outputs(x, out=out)[-1]
+        return torch.cat([self._outputs(x[:, rows])[-1] for rows in parts], dim=1, out=out)
 
     @torch.no_grad()
     def score(self, context: Tensor, candidates: Tensor) -> Tensor:
@@ -99,7 +108,7 @@ class MLPs:
                 f"{self.units[0]} inputs, got {tuple(context.shape)} and {tuple(candidates.shape)}."
             )
         context, candidates = context.float(), candidates.float()
-        weight, bias = self._layer(0)
+        weight, bias = self._layers[0]
         with torch_on_one() if self._kernel is not None else nullcontext():
             start = torch.baddbmm(bias, context.expand(len(self), -1, -1), weight[..., :known].mT)
         if self._kernel is not None:
@@ -108,8 +117,9 @@ class MLPs:
         parts = []
         for few in self.parts(rows, count):
             hidden = torch.matmul(candidates[few], weight[:, None, :, known:].mT) + start[:, few, None]
-            parts.append(self._layers(hidden.flatten(1, 2), first=1)[-1])
-        return torch.cat(parts, dim=1).view(len(self), rows, count, self.units[-1])
+            parts.append(self._outputs(hidden.flatten(1, 2), first=1)[-1])
+        y = parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+        return y.view(len(self), rows, count, self.units[-1])
 
     @torch.no_grad()
     def gradient(self, x: Tensor, loss: Loss) -> Tensor:
@@ -129,31 +139,31 @@ class MLPs:
 
     def _gradient(self, x: Tensor, loss: Loss) -> Tensor:
         """``gradient`` by torch's products."""
-        activations = self._layers(x.expand(len(self), -1, -1))
+        activations = self._outputs(x.expand(len(self), -1, -1))
         sums, delta, free = by_outputs(loss, activations.pop(), self.parameters[:, self.free])
-        self.grad[:, self.free] = free
+        if free.shape[1]:
+            self.grad[:, self.free] = free
         for layer in reversed(range(len(self.weights))):
             below = activations.pop()
-            weight, bias = self._layer(layer, self.grad)
-            weight.copy_(torch.bmm(delta.mT, below))
-            bias.copy_(delta.sum(1, keepdim=True))
+            weight, bias = self._slopes[layer]
+            torch.bmm(delta.mT, below, out=weight)
+            torch.sum(delta, 1, keepdim=True, out=bias)
             if layer:
-                delta = _times_slope(torch.bmm(delta, self._layer(layer)[0]), below, self.activation)
+                delta = _times_slope(torch.bmm(delta, self._layers[layer][0]), below, self.activation)
         return sums
 
-    def _layers(self, x: Tensor, first: int = 0) -> list[Tensor]:
+    def _outputs(self, x: Tensor, first: int = 0, out: Tensor | None = None) -> list[Tensor]:
         """The inputs and the outputs of all layers; from ``first`` on, whose inputs are those before the activation."""
         outputs = [x] if first == 0 else [_activated(x, self.activation)]
-        for layer in range(first, len(self.weights)):
-            weight, bias = self._layer(layer)
-            x = torch.baddbmm(bias, outputs[-1], weight.mT)
-            outputs.append(x if layer == len(self.weights) - 1 else _activated(x, self.activation))
-        return outputs
+        *hidden, (weight, bias) = self._layers[first:]
+        for layer in hidden:
+            outputs.append(_activated(torch.baddbmm(layer[1], outputs[-1], layer[0].mT), self.activation))
+        return [*outputs, torch.baddbmm(bias, outputs[-1], weight.mT, out=out)]
 
-    def _layer(self, layer: int, of: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def _layer(self, layer: int, of: Tensor) -> tuple[Tensor, Tensor]:
         """Views of a layer's weights, shape (K, outputs, inputs), and biases, (K, 1, outputs), in a vector of them."""
         inputs, outputs = self.units[layer : layer + 2]
-        numbers = (self.parameters if of is None else of)[:, self.weights[layer] :]
+        numbers = of[:, self.weights[layer] :]
         weight, bias = numbers.split([inputs * outputs, outputs, numbers.shape[1] - (inputs + 1) * outputs], dim=1)[:2]
         return weight.unflatten(1, (outputs, inputs)), bias.unsqueeze(1)
 
@@ -246,10 +256,12 @@ def _activated(x: Tensor, activation: str) -> Tensor:
 
 
 def _times_slope(delta: Tensor, y: Tensor, activation: str) -> Tensor:
-    """``delta`` times the derivative of an activation, which its output ``y`` determines."""
+    """``delta`` times the derivative of an activation, which its output ``y`` determines: autograd's own, one call."""
     if activation == "tanh":
-        return delta * (1.0 - y.square())
-    return torch.where(y <= 0.0, delta * (y + 1.0) if activation == "elu" else 0.0, delta)
+        return torch.ops.aten.tanh_backward(delta, y)
+    if activation == "elu":
+        return torch.ops.aten.elu_backward(delta, 1.0, 1.0, 1.0, True, y)
+    return torch.ops.aten.threshold_backward(delta, y, 0.0)
 
 
 def _kernel(nets: MLPs) -> "Kernel | None":

@@ -209,6 +209,8 @@ def quality(fear: Fear, held_out: Resolved) -> float:
 class Explorer(GoalSelector):
     """Half uniform goals, which are marked as probes, half the argmax of a fear network that is being trained."""
 
+    dense = True
+
     def __init__(self, env: Env, fear: Fear) -> None:
         self._uniform = uniform_goals(env)
         self._argmax = argmax_director(env, fear)

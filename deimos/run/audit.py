@@ -273,7 +273,7 @@ def _judge(trainer: Trainer, clones: Clones, decisions: list[_Decision]) -> Choi
         tensor[:] = torch.cat([each.worlds[name] for each in decisions])
     survived = clones.try_out(held, every, candidates)
     pick = (candidates == chosen.unsqueeze(1)).all(2).int().argmax(1)
-    percentile = picks.percentile(-survived, pick)[survived.amin(1) < survived.amax(1)].tolist()
+    percentile = picks.percentile(-survived, -picks.take(survived, pick))[survived.amin(1) < survived.amax(1)].tolist()
     crashed = survived < trainer.env.goal_period
     scores = [each.score for each in decisions if each.score is not None]
     pairs = zip(torch.cat(scores), crashed, strict=True) if scores else ()

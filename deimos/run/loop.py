@@ -10,6 +10,9 @@ from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Spaces
 from deimos.sim.env import Env, Step
 
+AS_ON_GPU = False
+"""Whether a CPU also asks for the next goals of all worlds at every step, as a GPU does: for tests."""
+
 GoalGuard = Callable[[Env, Tensor, Tensor], Tensor]
 """Has the last word on goals: of the environment, the worlds, int64, shape (B,), and the goals, shape (B, goal_dim),
 that they are to get, it gives those that they do get."""
@@ -64,22 +67,33 @@ class GoalLoop:
         self.renew(step, self.resolve(step))
 
     def resolve(self, step: Step) -> Changes:
-        """The first half of ``advance``: the outcomes of the goals; nothing is reset yet."""
-        return self.core.advance(step.terminated, step.truncated, step.goal_due, step.reward, step.tracking)
+        """The first half of ``advance``: the outcomes of the goals; nothing is reset yet.
+
+        A CPU lists the worlds that are due, which spares it the others. A GPU would wait for their number while it has
+        nothing to do, and scores the candidates of all worlds in less time; unless the selector, or a guard, wants to
+        be asked about those alone.
+        """
+        on_gpu = AS_ON_GPU or self.env.device.type == "cuda"
+        return self.core.advance(
+            step.terminated, step.truncated, step.goal_due, step.reward, step.tracking,
+            dense=on_gpu and self.selector.dense and self._guard is None,
+        )  # fmt: skip
 
     def renew(self, step: Step, changes: Changes) -> None:
         """The second half of ``advance``: new goals where they are due, new episodes where one has ended."""
-        self.choose(changes.due)
+        self.choose(changes.due, changes.where)
         if len(changes.done):
-            self.begin(step.terminated | step.truncated)
+            self.begin(changes.ended)
 
-    def choose(self, rows: Tensor) -> None:
-        """Give the listed worlds, int64, shape (m,), the selector's next goals."""
+    def choose(self, rows: Tensor, where: Tensor | None = None) -> None:
+        """Give the listed worlds, int64, shape (m,), the selector's next goals; for ``where`` see ``Changes``."""
         if len(rows):
-            env, obs = self.env, self.env.obs[rows]
+            env = self.env
+            obs = env.obs[rows] if where is None else env.obs
             candidates = env.sample_goals(rows, self.selector.num_candidates, self.selector.goal_range())
-            goal = self.core.choose(rows, env.state(obs), obs[:, env.goal_slice], candidates, env.draw(rows))
-            env.set_goals(rows, goal if self._guard is None else self._guard(env, rows, goal))
+            state, goal, draws = env.state(obs), obs[:, env.goal_slice], env.draw(rows)
+            goal = self.core.choose(rows, state, goal, candidates, draws, where=where)
+            env.set_goals(rows, goal if self._guard is None else self._guard(env, rows, goal), where)
 
     def begin(self, mask: Tensor) -> None:
         """Begin an episode where ``mask``, bool, shape (num_envs,), is true; nothing may be pending there."""

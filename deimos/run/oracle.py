@@ -122,5 +122,5 @@ class Oracle(GoalSelector):
             logit = self._fear.score(state, goal, candidates)
             score += logit.argsort(dim=1).argsort(dim=1) / candidates.shape[1]  # ranks: sigmoids would tie at 1
         pick = picks.by_rule(score, draws[:, 0], self._rule, self._percentile)
-        percentile = picks.percentile(score, pick)
-        return Proposal(picks.take(candidates, pick), picks.take(score, pick), percentile=percentile)
+        picked = picks.take(score, pick)
+        return Proposal(picks.take(candidates, pick), picked, percentile=picks.percentile(score, picked))

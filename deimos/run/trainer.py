@@ -133,11 +133,12 @@ class Trainer:
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
         clock = _Clock(self)
         ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
-        for t in range(rollout.num_steps):
-            rollout.obs[t] = env.obs
-            ppo.act(env.obs, rollout.noise[t], rollout.action[t], rollout.mean[t])
+        steps = zip(rollout.obs[:-1], rollout.noise, rollout.action, rollout.mean, strict=True)
+        for t, (obs, noise, action, mean) in enumerate(steps):
+            obs.copy_(env.obs)
+            ppo.act(env.obs, noise, action, mean)
             clock.lap("policy")
-            step = env.step(rollout.action[t])
+            step = env.step(action)
             clock.lap("env")
             changes = loop.resolve(step)
             rollout.record(

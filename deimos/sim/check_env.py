@@ -294,6 +294,11 @@ def _check_set_goals(env: Env, build: Build) -> Claims:
     yield shown, "set_goals must show the goals that it was given in the goal's slot of obs."
     yield env.tensors["goal_count"][rows] == before["goal_count"][rows] + 1, "set_goals must count in goal_count."
     yield env.state(env.obs)[rows] == env.state(before["obs"])[rows], "set_goals must leave the state alone."
+    after = env.state_dict()
+    env.set_goals(_rows(env), goals[:1].expand(env.num_envs, -1), _rows(env) == 4)
+    message = "set_goals must leave the rows outside of where alone, but {name} changed there."
+    yield from _are_equal(_at(env.tensors, others), _at(after, others), message)
+    yield env.tensors["goal_count"][4] == after["goal_count"][4] + 1, "set_goals must give a goal to the rows in where."
 
 
 def _check_repeats(env: Env, build: Build) -> Claims:

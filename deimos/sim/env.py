@@ -216,12 +216,13 @@ class Env(abc.ABC):
         """Four uniform numbers in [0, 1) per listed world for the choice of its next goal, shape (B, 4)."""
 
     @abc.abstractmethod
-    def set_goals(self, rows: Tensor, goal: Tensor) -> None:
+    def set_goals(self, rows: Tensor, goal: Tensor, where: Tensor | None = None) -> None:
         """Give the listed worlds a new goal, start its clock and refresh their observations.
 
         Args:
             rows: Worlds, int64, shape (B,), each at most once.
             goal: Goals as the policy sees them, shape (B, goal_dim).
+            where: Which of the rows are meant, bool, shape (B,); ``None`` for all.
         """
 
     @abc.abstractmethod

@@ -96,6 +96,9 @@ class WarpEnv(Env):
         self._draw = Shared.zeros(num_envs, wp.vec4, device)
         self._new_goal = Shared.zeros((num_envs, self.goal_dim), wp.float32, device)
         self._candidate_scale = Shared.zeros(self.goal_dim, wp.float32, device)
+        self._first_range = _Share(self.goal_range, views["first_range"])
+        self._candidate_range = _Share(self._seen_range, self._candidate_scale.tensor)
+        self._nobody = torch.full((num_envs,), -1, dtype=torch.int64, device=device)
         self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
         self.invalid_steps = 0
         """Invalid world-steps that ``check`` has found."""
@@ -173,8 +176,7 @@ class WarpEnv(Env):
         """See ``Env.reset``."""
         check_stream(self.device)
         self._views["mask"].copy_(mask)
-        share = 1.0 if goal_scale is None else goal_scale.detach()
-        torch.mul(self.goal_range, share, out=self._views["first_range"])
+        self._first_range.set(goal_scale)
         self._launch_reset()
 
     @final
@@ -184,8 +186,7 @@ class WarpEnv(Env):
             self._candidates[count] = self._record_candidates(count)
         candidates, launches = self._candidates[count]
         self._set_rows(rows)
-        share = 1.0 if scale is None else scale.detach()
-        torch.mul(self._seen_range, share, out=self._candidate_scale.tensor)
+        self._candidate_range.set(scale)
         for launch in launches:
             launch.set_dim((len(rows), launch.bounds.shape[1]))  # as many threads per row as were recorded
             launch.launch()
@@ -218,9 +219,9 @@ class WarpEnv(Env):
         return self._draw.tensor[: len(rows)]
 
     @final
-    def set_goals(self, rows: Tensor, goal: Tensor) -> None:
+    def set_goals(self, rows: Tensor, goal: Tensor, where: Tensor | None = None) -> None:
         """See ``Env.set_goals``."""
-        self._set_rows(rows)
+        self._set_rows(rows if where is None else torch.where(where, rows, self._nobody[: len(rows)]))
         self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
@@ -272,3 +273,19 @@ class WarpEnv(Env):
 
     def _set_rows(self, rows: Tensor) -> None:
         self._row.tensor[: len(rows)] = rows
+
+
+class _Share:
+    """A share of a range, in memory that a kernel reads; the whole of it is written only where it was another."""
+
+    def __init__(self, whole: Tensor, out: Tensor) -> None:
+        self._whole, self._out = whole, out
+        self._is_whole = False
+
+    def set(self, share: Tensor | None) -> None:
+        """Write ``share`` of the range, of the shape of the range, in (0, 1]; ``None`` for the whole."""
+        if share is not None:
+            torch.mul(self._whole, share.detach(), out=self._out)
+        elif not self._is_whole:
+            self._out.copy_(self._whole)
+        self._is_whole = share is None

@@ -40,6 +40,7 @@ class Curriculum(GoalSelector):
     """See ``Config``."""
 
     first_goals_scaled = True
+    dense = True
     saved = ("_range", "share", "_since", "_counted_at", "_sum", "_count")
 
     def __init__(self, config: Config, spaces: Spaces) -> None:

@@ -50,6 +50,7 @@ class Grid(GoalSelector):
         ValueError: If a group's grid would have more than 2^20 cells.
     """
 
+    dense = True
     saved = ("_weights", "_seen", "_half", "_learnt_at", "fitted")
 
     def __init__(self, config: Config, spaces: Spaces) -> None:
@@ -80,7 +81,6 @@ class Grid(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are weights."""
-        torch.maximum(self._seen, candidates.abs().amax(dim=(0, 1)), out=self._seen)
         if not self.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         cell = self._cells(candidates)
@@ -89,6 +89,15 @@ class Grid(GoalSelector):
             weight *= self._weights[i][cell[..., group].unbind(-1)]
         pick = picks.in_proportion(weight, draws[:, 0])
         return Proposal(picks.take(candidates, pick), picks.take(weight, pick))
+
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """See ``GoalSelector.issued``."""
+        seen = candidates.abs().amax(1)
+        seen = seen if where is None else seen.masked_fill_(~where.unsqueeze(1), 0.0)
+        torch.maximum(self._seen, seen.amax(0), out=self._seen)
 
     def _cells(self, goal: Tensor) -> Tensor:
         """Cell of every component, int64, same shape."""

@@ -53,10 +53,13 @@ class Novelty(FearSelector):
         self.rnd = rnd.Config(candidates=config.candidates).build(spaces, seed)
         """Who knows what is novel."""
 
-    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
-        """See ``GoalSelector.propose``."""
-        self.rnd.watch(rows, candidates)
-        return super().propose(rows, state, goal, candidates, draws)
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """See ``GoalSelector.issued``."""
+        super().issued(rows, state, goal, candidates, chosen, where)
+        self.rnd.issued(rows, state, goal, candidates, chosen, where)
 
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
         """See ``FearSelector.ranking``."""

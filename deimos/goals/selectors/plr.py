@@ -58,6 +58,7 @@ class PLR(GoalSelector):
     """See ``Config``."""
 
     needs_rollout = True
+    dense = True
     saved = ("_level", "_score", "_made", "_seen", "_upto", "_carry", "_learnt_at", "replaying")
 
     def __init__(self, config: Config, spaces: Spaces) -> None:

@@ -54,13 +54,17 @@ class QFear(director.Director):
         shape = spaces.num_envs, sum(self._sizes)
         self._worst = torch.full(shape, torch.nan, dtype=torch.float32, device=spaces.device)
 
-    def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
-        """See ``GoalSelector.propose``."""
-        assign(self._worst, rows, torch.nan)
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """See ``GoalSelector.issued``."""
+        super().issued(rows, state, goal, candidates, chosen, where)
+        lesson: Tensor | float = torch.nan
         if self.fear.fitted:
             worst = picks.take(candidates, self.score(state, goal, candidates).argmax(1))
-            self._worst[rows] = torch.cat([self._seen(state), goal, worst], dim=1).float()
-        return super().propose(rows, state, goal, candidates, draws)
+            lesson = torch.cat([self._seen(state), goal, worst], dim=1).float()
+        assign(self._worst, rows, lesson, where)
 
     def rows(self, window: Resolved, interactions: Interactions) -> Tensor:
         """See ``FearSelector.rows``."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from deimos.checks import SimulationError, check_at_least, check_choice, check_positive
 from deimos.goals import picks
-from deimos.goals.interactions import Interactions
+from deimos.goals.interactions import Interactions, assign
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
 from deimos.nn.adam import Adam
 from deimos.nn.losses import mean_squared_error
@@ -67,6 +67,7 @@ class Config(SelectorConfig):
 class RND(GoalSelector):
     """See ``Config``. Until inputs have been seen, and so can be whitened, it is uniform."""
 
+    dense = True
     saved = (
         "predictor", "target", "optimizer", "generator", "_uniform", "_moments", "_mean", "_scale", "_learnt_at",
         "fitted",
@@ -108,16 +109,18 @@ class RND(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are surprises."""
-        self.watch(rows, candidates)
         if not self.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         score = self.surprise(state, goal, candidates)
         pick = picks.by_rule(score, draws[:, 0], self.config.rule, 0.0)
         return Proposal(picks.take(candidates, pick), picks.take(score, pick))
 
-    def watch(self, rows: Tensor, candidates: Tensor) -> None:
-        """Note what uniform goals look like; for the arguments see ``propose``."""
-        self._uniform[rows] = candidates[:, 0].float()
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """See ``GoalSelector.issued``: it notes what uniform goals look like, whatever was chosen."""
+        assign(self._uniform, rows, candidates[:, 0].float(), where)
 
     def surprise(self, state: Tensor, goal: Tensor, candidates: Tensor) -> Tensor:
         """Mean squared error of the predictor, shape (B, N); the arguments are those of ``Fear.score``."""

@@ -27,6 +27,8 @@ class Config(SelectorConfig):
 class Uniform(GoalSelector):
     """See ``Config``."""
 
+    dense = True
+
     def __init__(self, config: Config) -> None:
         self.num_candidates = config.candidates
 

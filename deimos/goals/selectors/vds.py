@@ -89,6 +89,7 @@ class VDS(GoalSelector):
     """See ``Config``."""
 
     needs_rollout = True
+    dense = True
     saved = ("_parameters", "optimizer", "generator")
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:

@@ -81,8 +81,17 @@ class Weighted(FearSelector):
             top = draws[:, 0] >= self.config.mix
             if chosen.probe is not None:
                 top &= ~chosen.probe
-        self._sums += torch.stack([torch.ones_like(weight), weight, weight.square()]).double().sum(1)
         return replace(chosen, weight=weight, note=1 + top.long())
+
+    def issued(
+        self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,
+        where: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """See ``GoalSelector.issued``."""
+        super().issued(rows, state, goal, candidates, chosen, where)
+        assert chosen.weight is not None
+        powers = torch.stack([torch.ones_like(chosen.weight), chosen.weight, chosen.weight.square()]).double()
+        self._sums += (powers if where is None else powers * where).sum(1)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``; adds the effective sample size, as a share, and the shift of the states."""
