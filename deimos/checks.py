@@ -19,6 +19,9 @@ class RunError(Exception):
 class SimulationError(RuntimeError):
     """The simulation or the learner has left the realm of finite numbers; the run must stop."""
 
+    rank: int = 0
+    """Which of the processes that share a run it happened in."""
+
 
 def one_line(error: BaseException) -> str:
     """What an error says, in one line."""

@@ -24,7 +24,7 @@ from deimos.goals.selector import (
     uniform_proposal,
     with_parts,
 )
-from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.ranks import sum_over_ranks
 
 LEAST = 32  # crashes and survivals that tell a temperature
 
@@ -153,13 +153,14 @@ class FearSelector(GoalSelector):
         fair = known & window.probe if self.config.probe else known  # chosen goals are a biased sample
         fresh = fair & recent
         self._auroc = auroc(window.score[fair], window.crashed[fair])
+        chosen, issued = sum_over_ranks(torch.tensor([self._chosen, self._issued])).tolist()
         row = {
             "fear/auroc": self._auroc,
             "fear/crash_rate": window.crashed[recent].float().mean().item(),
             "fear/resolved": float(recent.sum()),
             "fear/score": window.score[recent].nanmean().item(),
             "fear/temperature": self.calibration.temperature,
-            "fear/chosen": self._chosen / self._issued if self._issued else math.nan,
+            "fear/chosen": chosen / issued if issued else math.nan,
         }
         self._issued = self._chosen = 0
         quality = evaluate(self.calibration.of_log_odds(window.score[fresh]), window.crashed[fresh])
@@ -175,9 +176,8 @@ class FearSelector(GoalSelector):
             self._age += 1
         else:
             self._say_why(window)
-        counts = torch.stack([window.crashed.sum(), torch.ones_like(window.env).sum()]).double()
-        total, resolved = mean_over_ranks(counts).tolist()
-        self.calibration.set_share((total + 0.5) / (resolved + 1.0))  # no crash lately is no certainty
+        share = (int(window.crashed.sum()) + 0.5) / (len(window) + 1.0)  # no crash lately is no certainty
+        self.calibration.set_share(share)
         return row | {"fear/loss": loss, "fear/age": float(self._age) if self.fear.fitted else math.nan}
 
     def _fit(self, window: Resolved, interactions: Interactions) -> float:
