@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union
 
-import torch
 import tyro
 
 from deimos import plugins
@@ -105,11 +104,12 @@ def _fit(trainer: Trainer, folder: RunFolder) -> None:
     with console.stop_on_interrupt() as stopped:
         with progress as report:
             finished = training.train(trainer, folder, report, lambda: bool(stopped()))
-        number = int(ranks.max_over_ranks(torch.tensor(stopped())))
-    if not finished or number:
-        if first:
-            print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
-        raise SystemExit(128 + (number or signal.SIGINT))
+        (number,) = ranks.largest(stopped())
+        if not finished or number:
+            if first:
+                where = f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}"
+                print(where, file=sys.stderr)
+            raise SystemExit(128 + (number or signal.SIGINT))
 
 
 def _finish(trainer: Trainer, folder: RunFolder) -> None:

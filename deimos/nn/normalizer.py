@@ -40,9 +40,10 @@ class Normalizer(nn.Module):
             obs: Observations, shape (n, size).
             weight: 1 for those that count and 0 for the others, shape (n,).
         """
-        total = sum_over_ranks(weight.sum())
+        total, mean = weight.sum(), weight @ obs
+        sum_over_ranks(total, mean)
         at_least_one = total.clamp(min=1.0)
-        mean = sum_over_ranks(weight @ obs) / at_least_one
+        mean /= at_least_one
         variance = sum_over_ranks(weight @ (obs - mean).square_()) / at_least_one
         self.count += total
         share = (total / self.count.clamp(min=1.0)).float()

@@ -43,6 +43,7 @@ class Place:
 
 _ALONE = Place()
 _place = _ALONE
+_apart = False  # within ``together``
 
 
 def place() -> Place:
@@ -54,7 +55,7 @@ def place() -> Place:
 def joined() -> Iterator[None]:
     """Join the processes that torchrun has started, as its environment describes them, for as long as this lasts.
 
-    Tensors on a CPU travel by gloo, those on a GPU by NCCL. Leave it by an error only if the process ends then.
+    Tensors on a CPU travel by gloo, those on a GPU by NCCL.
 
     Raises:
         RunError: If the others cannot be reached.
@@ -76,7 +77,7 @@ def joined() -> Iterator[None]:
         yield
     finally:
         _place = _ALONE
-    dist.destroy_process_group()  # after an error the others may be gone, and it would wait for them
+        dist.destroy_process_group()  # ends threads that would abort a process which is ending
 
 
 def _launched() -> Place:
@@ -85,17 +86,6 @@ def _launched() -> Place:
     if not all(name in os.environ for name in (*names, "MASTER_ADDR", "MASTER_PORT")):
         return _ALONE
     return Place(*(int(os.environ[name]) for name in names))
-
-
-@contextmanager
-def apart() -> Iterator[None]:
-    """Leave the others aside for as long as this lasts: what is saved within is this rank's share alone."""
-    global _place
-    before, _place = _place, _ALONE
-    try:
-        yield
-    finally:
-        _place = before
 
 
 def share(name: str, count: int) -> int:
@@ -111,7 +101,7 @@ def share(name: str, count: int) -> int:
 
 def sum_over_ranks(value: Tensor, *more: Tensor) -> Tensor:
     """Add up ``value`` over all ranks, in place, and return it; in the same message ``more`` of the same dtype."""
-    if _place.size > 1 and more:
+    if more and _meets():
         sums = _reduced(torch.cat([part.flatten() for part in (value, *more)]), "SUM")
         for part, sum_ in zip((value, *more), sums.split([part.numel() for part in (value, *more)]), strict=True):
             part.copy_(sum_.view_as(part))
@@ -124,13 +114,18 @@ def max_over_ranks(value: Tensor) -> Tensor:
     return _reduced(value, "MAX")
 
 
+def largest(*numbers: int) -> tuple[int, ...]:
+    """The largest of all ranks, number by number; of flags, whether any of them is set."""
+    return numbers if not _meets() else tuple(max_over_ranks(torch.tensor([*map(int, numbers)])).tolist())
+
+
 def mean_over_ranks(value: Tensor) -> Tensor:
     """Average ``value`` over all ranks, in place, and return it; a mean over worlds becomes that over all of them."""
-    return value if _place.size == 1 else sum_over_ranks(value).div_(_place.size)
+    return sum_over_ranks(value).div_(_place.size) if _meets() else value
 
 
 def _reduced(value: Tensor, operation: str) -> Tensor:
-    if _place.size > 1:
+    if _meets():
         import torch.distributed as dist
 
         _meet(dist.all_reduce, value, getattr(dist.ReduceOp, operation))
@@ -139,7 +134,7 @@ def _reduced(value: Tensor, operation: str) -> Tensor:
 
 def gather_rows(value: Tensor, dim: int = 0) -> Tensor:
     """What has one row per world, of all ranks: joined along ``dim``, in the order of the worlds' global numbers."""
-    if _place.size == 1:
+    if not _meets():
         return value
     import torch.distributed as dist
 
@@ -179,7 +174,7 @@ def from_first(make: Callable[[], T]) -> T:
     """What ``make`` gives on the first rank, on every rank; an error of it is raised on all."""
     with together():
         found = [make() if _place.first else None]
-    if _place.size > 1:
+    if _meets():
         import torch.distributed as dist
 
         _meet(dist.broadcast_object_list, found)
@@ -188,22 +183,25 @@ def from_first(make: Callable[[], T]) -> T:
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Raise on every rank what one of them raises within, named after it; within, no rank may call on the others.
+    """Raise on every rank what one of them raises within, named after it; where several fail, after the first.
 
-    Where several fail, the first of them is heard.
+    Within, each rank is by itself and nothing is sent: sums are its own, and so are the worlds in a state.
 
     Raises:
         RunError, SimulationError: If another rank has failed.
     """
-    if _place.size == 1:
+    global _apart
+    if not _meets():
         yield
         return
-    fault = None
+    fault, _apart = None, True
     try:
         yield
     except Exception as error:
         fault = error
-    if not int(max_over_ranks(torch.tensor(int(fault is not None)))):
+    finally:
+        _apart = False
+    if not any(largest(fault is not None)):
         return
     import torch.distributed as dist
 
@@ -216,9 +214,12 @@ def together() -> Iterator[None]:
         raise fault
     if not numbers:
         raise RunError(f"Rank {rank}: {text}") from fault
-    failure = SimulationError(f"Rank {rank}: {text}")
-    failure.rank = rank
-    raise failure from fault
+    raise SimulationError(f"Rank {rank}: {text}", rank) from fault
+
+
+def _meets() -> bool:
+    """Whether there are others to call on."""
+    return _place.size > 1 and not _apart
 
 
 def _meet(collective: Callable, *arguments: Any) -> None:

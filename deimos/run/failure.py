@@ -9,7 +9,7 @@ from torch import Tensor
 from deimos.checks import RunError, SimulationError
 from deimos.files import save_tensors
 from deimos.learn.rollout import Rollout
-from deimos.nn import ranks
+from deimos.nn.ranks import place, together
 from deimos.nn.stateful import LARGEST, unsound
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import Trainer
@@ -50,8 +50,7 @@ def dump(trainer: Trainer, folder: RunFolder, error: SimulationError, versions: 
         "last_rows": folder.read_csv("progress.csv")[-10:],
     }  # fmt: skip
     folder.write_json(REPORT, report)
-    with ranks.apart():
-        state = {"schema": SCHEMA, "error": str(error), "rollout": rollout, **trainer.state_dict()}
+    state = {"schema": SCHEMA, "error": str(error), "rollout": rollout, **trainer.state_dict()}
     save_tensors(folder.path / STATE, state)
 
 
@@ -84,8 +83,8 @@ def dumped(trainer: Trainer, folder: RunFolder, versions: Callable[[], dict[str,
         yield
     except SimulationError as error:
         try:
-            with ranks.together():
-                if error.rank == ranks.place().rank:
+            with together():
+                if error.rank == place().rank:
                     dump(trainer, folder, error, versions())
         except RunError:  # the disk is full too: the first error is the one to tell
             raise error from None

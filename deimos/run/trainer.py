@@ -190,7 +190,7 @@ class Trainer:
             self.loop.selector.check()
             clock.lap("selector")
         except SimulationError as error:
-            raise SimulationError(f"Iteration {self.iteration}: {error}") from error
+            raise SimulationError(f"Iteration {self.iteration}: {error}", error.rank) from error
         return self._summary() | learner | selector | self.env.report()
 
     def _summary(self) -> dict[str, float]:

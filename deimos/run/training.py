@@ -384,11 +384,11 @@ def _iterate(trainer: Trainer, folder: RunFolder, writer: _Writer | None, stoppe
         with ranks.together():
             if writer is not None:
                 writer.add(row, {"iteration": trainer.iteration, "fps": fps, **spent})
-            stop, late = stopped(), time.monotonic() - saved > CHECKPOINT_SECONDS
-        stop, late = ranks.max_over_ranks(torch.tensor([stop, late], dtype=torch.uint8)).tolist()
+            wanted = stopped(), time.monotonic() - saved > CHECKPOINT_SECONDS
+        stop, checkpoint = ranks.largest(*wanted)
         if stop:
             break
-        if late:
+        if checkpoint:
             keep()
             saved = time.monotonic()
     keep()
