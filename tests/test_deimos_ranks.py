@@ -47,7 +47,8 @@ CONFIG = TrainConfig(
 
 def learn(method):
     """A few iterations: the first rollout, the first gradient and its minibatches, all rows, and the last state."""
-    config = replace(CONFIG, method=method, ppo=replace(CONFIG.ppo, normalize_observations=method == "uniform"))
+    ppo = replace(CONFIG.ppo, normalize_observations=method == "uniform")
+    config = replace(CONFIG, method=method, ppo=ppo, critic_warmup=int(method == "cl"))
     trainer = Trainer(config, torch.device("cpu"))
     ppo, found = trainer.ppo, {"rows": []}
     minibatches, step = ppo._minibatches, ppo.optimizer.step
@@ -137,10 +138,13 @@ def both(tmp_path_factory):
     """What two ranks have come to, and the folder of their runs."""
     out = tmp_path_factory.mktemp("ranks")
     training.start(CONFIG, out / "alone")
-    done = subprocess.run(
-        torchrun(Path(__file__).resolve(), out), env=environment(), capture_output=True, text=True, timeout=PATIENCE,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    command = torchrun(Path(__file__).resolve(), out)
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        errors = process.communicate(timeout=PATIENCE)[1]
+    finally:
+        end(process)
+    assert process.returncode == 0, errors
     return [torch.load(out / f"{rank}.pt", weights_only=False) for rank in range(RANKS)], out
 
 

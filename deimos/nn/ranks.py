@@ -233,5 +233,5 @@ def _meet(collective: Callable, *arguments: Any) -> None:
     except RuntimeError as error:
         raise RunError(
             f"Rank {_place.rank} has lost another one, which has ended, or has not answered for "
-            f"{PATIENCE.total_seconds() / 60:g} minutes; what that one said tells why."
+            f"{PATIENCE.total_seconds() / 60:g} minutes; what it said tells why ({one_line(error).partition('. ')[0]})."
         ) from error

@@ -158,7 +158,7 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
     Raises:
         RunError: If its worlds do not fit in memory, or what the configuration names is not there or does not fit.
     """
-    memory.require_worlds(config.num_envs, config.ppo.num_steps, device)
+    memory.require_worlds(config.num_envs // ranks.place().size, config.ppo.num_steps, device)
     if config.evaluation:
         check_memory(config.env, config.eval, device)
     try:
@@ -168,7 +168,7 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
         if memory.is_shortage(error):
             reason = f"{config.num_envs} worlds could not be allocated ({reason}); use fewer (num_envs)."
         raise RunError(reason) from error
-    memory.require_candidates(config.num_envs, trainer.loop.selector.num_candidates, trainer.env.goal_dim, device)
+    memory.require_candidates(trainer.env.num_envs, trainer.loop.selector.num_candidates, trainer.env.goal_dim, device)
     return trainer
 
 
