@@ -257,9 +257,9 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
 def _check_ranks(folder: RunFolder, count: int) -> None:
     """Refuse a run that ``count`` ranks have trained, if there are more or fewer now."""
     if count != ranks.place().size:
-        begin = f"torchrun --nproc_per_node={count} train.py" if count > 1 else "python train.py"
+        begin = "python train.py" if count == 1 else f"torchrun --nproc_per_node={count} train.py"
         raise RunError(
-            f"{folder.path} was trained by {count} rank{'s' * (count > 1)} and can only be resumed by as many, got "
+            f"The number of ranks that resume {folder.path} must be {count}, as in its training, got "
             f"{ranks.place().size}: {begin} --resume {folder.path}, or start a run with its networks by --init-from."
         )
 
