@@ -101,7 +101,7 @@ def share(name: str, count: int) -> int:
 
 def sum_over_ranks(value: Tensor, *more: Tensor) -> Tensor:
     """Add up ``value`` over all ranks, in place, and return it; in the same message ``more`` of the same dtype."""
-    if more and _meets():
+    if more and _communicates():
         sums = _reduced(torch.cat([part.flatten() for part in (value, *more)]), "SUM")
         for part, sum_ in zip((value, *more), sums.split([part.numel() for part in (value, *more)]), strict=True):
             part.copy_(sum_.view_as(part))
@@ -116,31 +116,31 @@ def max_over_ranks(value: Tensor) -> Tensor:
 
 def largest(*numbers: int) -> tuple[int, ...]:
     """The largest of all ranks, number by number; of flags, whether any of them is set."""
-    return numbers if not _meets() else tuple(max_over_ranks(torch.tensor([*map(int, numbers)])).tolist())
+    return numbers if not _communicates() else tuple(max_over_ranks(torch.tensor([*map(int, numbers)])).tolist())
 
 
 def mean_over_ranks(value: Tensor) -> Tensor:
     """Average ``value`` over all ranks, in place, and return it; a mean over worlds becomes that over all of them."""
-    return sum_over_ranks(value).div_(_place.size) if _meets() else value
+    return sum_over_ranks(value).div_(_place.size) if _communicates() else value
 
 
 def _reduced(value: Tensor, operation: str) -> Tensor:
-    if _meets():
+    if _communicates():
         import torch.distributed as dist
 
-        _meet(dist.all_reduce, value, getattr(dist.ReduceOp, operation))
+        _communicate(dist.all_reduce, value, getattr(dist.ReduceOp, operation))
     return value
 
 
 def gather_rows(value: Tensor, dim: int = 0) -> Tensor:
     """What has one row per world, of all ranks: joined along ``dim``, in the order of the worlds' global numbers."""
-    if not _meets():
+    if not _communicates():
         return value
     import torch.distributed as dist
 
     value = value.contiguous()
     parts = [torch.empty_like(value) for _ in range(_place.size)]
-    _meet(dist.all_gather, parts, value)
+    _communicate(dist.all_gather, parts, value)
     return torch.cat(parts, dim)
 
 
@@ -174,10 +174,10 @@ def from_first(make: Callable[[], T]) -> T:
     """What ``make`` gives on the first rank, on every rank; an error of it is raised on all."""
     with together():
         found = [make() if _place.first else None]
-    if _meets():
+    if _communicates():
         import torch.distributed as dist
 
-        _meet(dist.broadcast_object_list, found)
+        _communicate(dist.broadcast_object_list, found)
     return found[0]  # type: ignore[return-value]
 
 
@@ -191,7 +191,7 @@ def together() -> Iterator[None]:
         RunError, SimulationError: If another rank has failed.
     """
     global _apart
-    if not _meets():
+    if not _communicates():
         yield
         return
     fault, _apart = None, True
@@ -208,7 +208,7 @@ def together() -> Iterator[None]:
     said: list[Any] = [None] * _place.size
     known = isinstance(fault, RunError | SimulationError)
     text = str(fault) if known else repr(fault)
-    _meet(dist.all_gather_object, said, fault and (text, isinstance(fault, SimulationError)))
+    _communicate(dist.all_gather_object, said, fault and (text, isinstance(fault, SimulationError)))
     rank, (text, numbers) = next((rank, heard) for rank, heard in enumerate(said) if heard)
     if fault is not None and not known:
         raise fault
@@ -217,12 +217,12 @@ def together() -> Iterator[None]:
     raise SimulationError(f"Rank {rank}: {text}", rank) from fault
 
 
-def _meets() -> bool:
+def _communicates() -> bool:
     """Whether there are others to call on."""
     return _place.size > 1 and not _apart
 
 
-def _meet(collective: Callable, *arguments: Any) -> None:
+def _communicate(collective: Callable, *arguments: Any) -> None:
     """Call on the others.
 
     Raises:
