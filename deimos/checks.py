@@ -19,6 +19,11 @@ class RunError(Exception):
 class SimulationError(RuntimeError):
     """The simulation or the learner has left the realm of finite numbers; the run must stop."""
 
+    def __init__(self, message: str, rank: int = 0) -> None:
+        super().__init__(message)
+        self.rank = rank
+        """Which of the processes that share a run it happened in."""
+
 
 def one_line(error: BaseException) -> str:
     """What an error says, in one line."""

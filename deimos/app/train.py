@@ -16,6 +16,7 @@ from deimos.app.evaluate import show_evaluation, title
 from deimos.checks import RunError
 from deimos.goals import selectors
 from deimos.learn.policy import load_policy
+from deimos.nn import ranks
 from deimos.run import presets, training
 from deimos.run.branch import branch_config
 from deimos.run.evaluation import weights_hash
@@ -74,27 +75,46 @@ def main(arguments: list[str], program: str) -> None:
 
 def _train(options: Any) -> None:
     config = TrainConfig(**{field.name: getattr(options, field.name) for field in fields(TrainConfig)})
-    console.quiet_warp()
-    with one_stream(training.resolve_device(config.device)):
-        _run(*training.start(config, options.out, options.init_from, options.branch_from))
+    _run(config.device, lambda: training.start(config, options.out, options.init_from, options.branch_from))
 
 
 def _resume(options: ResumeOptions) -> None:
+    device = options.device or training.read_config(RunFolder.open(options.resume)).device
+    _run(device, lambda: training.resume(options.resume, options.env_steps, options.device))
+
+
+def _run(device: str, begin: Callable[[], tuple[Trainer, RunFolder]]) -> None:
+    """Begin a run and train, alone or with the other processes of torchrun; the first one then evaluates and draws."""
     console.quiet_warp()
-    config = training.read_config(RunFolder.open(options.resume))
-    with one_stream(training.resolve_device(options.device or config.device)):
-        _run(*training.resume(options.resume, options.env_steps, options.device))
+    with contextlib.ExitStack() as stack:
+        with ranks.joined():
+            with ranks.together():
+                stack.enter_context(one_stream(training.resolve_device(device)))
+            trainer, folder = begin()
+            _fit(trainer, folder)
+            first = ranks.place().first
+        if first:
+            _finish(trainer, folder)
 
 
-def _run(trainer: Trainer, folder: RunFolder) -> None:
-    """Train, evaluate, draw and say where everything is."""
-    config = trainer.config
+def _fit(trainer: Trainer, folder: RunFolder) -> None:
+    """Train; a signal to one of the processes stops all of them after the same iteration."""
+    first = ranks.place().first
+    progress = _training_progress(trainer) if first else contextlib.nullcontext(lambda row, fps: None)
     with console.stop_on_interrupt() as stopped:
-        with _training_progress(trainer) as report:
+        with progress as report:
             finished = training.train(trainer, folder, report, lambda: bool(stopped()))
-        if not finished or stopped():
-            print(f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}", file=sys.stderr)
-            raise SystemExit(128 + (stopped() or signal.SIGINT))
+        (number,) = ranks.largest(stopped())
+        if not finished or number:
+            if first:
+                where = f"Stopped after iteration {trainer.iteration}; resume with --resume {folder.path}"
+                print(where, file=sys.stderr)
+            raise SystemExit(128 + (number or signal.SIGINT))
+
+
+def _finish(trainer: Trainer, folder: RunFolder) -> None:
+    """Evaluate, draw and say where everything is."""
+    config = trainer.config
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
         parts = [f"{name} {seconds / total:.0%}" for name, seconds in trainer.seconds.items()]

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from deimos.goals.interactions import Interactions, assign
 from deimos.goals.selector import GoalSelector, Spaces, Transitions
+from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.stateful import Stateful
 
 
@@ -43,6 +44,7 @@ class GoalCore(Stateful):
 
     saved = ("selector", "interactions", "weight", "percentile", "_delivered", "_steps")
     unknown = ("percentile", "_delivered")
+    by_world = ("weight", "percentile", "_delivered")
 
     def __init__(
         self, selector: GoalSelector, spaces: Spaces, window: int | None = None, capacity: int | None = None
@@ -138,7 +140,7 @@ class GoalCore(Stateful):
             What it has to say, and ``goal_percentile``: the mean of ``percentile`` over all worlds and steps since the
             last call, which is the dose of fear that was delivered.
         """
-        mean = self._delivered.mean().item() / self._steps if self._steps else math.nan
+        mean = mean_over_ranks(self._delivered.mean()).item() / self._steps if self._steps else math.nan
         self._delivered.zero_()
         self._steps = 0
-        return {"goal_percentile": mean} | self.selector.learn(self.interactions, rollout)
+        return {"goal_percentile": mean} | self.selector.learn(self.interactions.of_all_ranks(), rollout)

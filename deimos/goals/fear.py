@@ -11,7 +11,6 @@ from deimos.nn.adam import Adam
 from deimos.nn.losses import cross_entropy
 from deimos.nn.mlps import MLPs
 from deimos.nn.networks import Activation, mlp
-from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
@@ -96,7 +95,7 @@ class Fear(Stateful):
         if min(crashes, len(crashed) - crashes) < self.config.min_per_class:
             return float("nan")
         inputs, weight, target = inputs.float(), weight.float(), crashed.float() if target is None else target
-        mass = mean_over_ranks(torch.stack([(weight * ~crashed).sum(), (weight * crashed).sum()]))
+        mass = torch.stack([(weight * ~crashed).sum(), (weight * crashed).sum()])
         weight = weight * (0.5 / mass)[crashed.long()]
         size = -(-len(inputs) // self.config.minibatches)
         loss = torch.zeros((), dtype=torch.float32, device=target.device)
@@ -113,7 +112,6 @@ class Fear(Stateful):
     def _learn(self, inputs: Tensor, target: Tensor, weight: Tensor) -> Tensor:
         """One step of Adam on a minibatch; returns the loss before it."""
         loss = self._nets.gradient(inputs, cross_entropy(target, weight))
-        mean_over_ranks(self._nets.grad)
         self.optimizer.step()
         return loss[0, 0]
 

@@ -24,7 +24,7 @@ from deimos.goals.selector import (
     uniform_proposal,
     with_parts,
 )
-from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.ranks import largest
 
 LEAST = 32  # crashes and survivals that tell a temperature
 
@@ -151,7 +151,8 @@ class FearSelector(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
-        issued, self._issued = int(torch.as_tensor(self._issued).sum()), 0
+        (issued,) = largest(int(torch.as_tensor(self._issued).any()))
+        self._issued = 0
         chosen = float(self.afraid) if issued else math.nan  # it has not changed since the last time
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at
@@ -183,9 +184,8 @@ class FearSelector(GoalSelector):
             self._age += 1
         else:
             self._say_why(window)
-        counts = torch.stack([window.crashed.sum(), torch.ones_like(window.env).sum()]).double()
-        total, resolved = mean_over_ranks(counts).tolist()
-        self.calibration.set_share((total + 0.5) / (resolved + 1.0))  # no crash lately is no certainty
+        share = (int(window.crashed.sum()) + 0.5) / (len(window) + 1.0)  # no crash lately is no certainty
+        self.calibration.set_share(share)
         return row | {"fear/loss": loss, "fear/age": float(self._age) if self.fear.fitted else math.nan}
 
     def _fit(self, window: Resolved, interactions: Interactions) -> float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from deimos.nn.ranks import gather_rows
 from deimos.nn.stateful import Stateful
 
 
@@ -102,6 +103,7 @@ class Interactions(Stateful):
 
     saved = ("now", "active", "_pending", "issued_at", "_horizon", "_ring", "_marks", "_cursor")
     unknown = ("_pending", "_ring")  # scores
+    by_world = ("active", "_pending", "issued_at", "_horizon", "_ring", "_marks", "_cursor")
 
     def __init__(
         self, num_envs: int, state_dim: int, goal_dim: int, capacity: int, window: int, device: torch.device,
@@ -235,6 +237,12 @@ class Interactions(Stateful):
     def followed(self, done: Resolved) -> Tensor:
         """True where an interaction was survived and led to the latest decision of its world, bool, shape (n,)."""
         return ~done.crashed & (self.issued_at[done.env] == done.resolved)
+
+    def of_all_ranks(self) -> "Interactions":
+        """The interactions in the worlds of all ranks, which are known by their global numbers: what to learn from."""
+        view = copy.copy(self)
+        vars(view).update({name: gather_rows(getattr(self, name)) for name in self.by_world})
+        return view
 
     def without_scores(self) -> "Interactions":
         """The same interactions for a selector that did not choose these goals: it sees no scores."""

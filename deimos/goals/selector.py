@@ -18,7 +18,7 @@ class Spaces:
     """What a selector needs to know about the worlds that it serves."""
 
     num_envs: int
-    """Number of worlds."""
+    """Number of worlds; where several ranks share a run, of those of each."""
     state_dim: int
     """Components of a state (the observation without its goal)."""
     goal_dim: int
@@ -169,10 +169,13 @@ class GoalSelector(Stateful, abc.ABC):
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Learn from what happened, once per rollout.
 
+        Where several ranks share a run, each learns the same from the same interactions, those in the worlds of all.
+        What a selector keeps of its own worlds, or counts in them, it gathers by ``deimos.nn.ranks``.
+
         Args:
-            interactions: The pending and the recently resolved ones.
-            rollout: The transitions since the last call; ``None`` in a loop that keeps none, where
-                selectors that learn from transitions raise ``ValueError``.
+            interactions: The pending and the recently resolved ones; worlds by their global numbers.
+            rollout: The transitions of this rank's worlds since the last call; ``None`` in a loop that keeps none,
+                where selectors that learn from transitions raise ``ValueError``.
 
         Returns:
             Numbers for the log, the same keys every time.

@@ -21,7 +21,7 @@ from deimos.nn.losses import Loss, Surrogate, ValueLoss, log_prob
 from deimos.nn.mlps import MLPs, gradients
 from deimos.nn.networks import Activation, Actor, mlp
 from deimos.nn.random import Purpose, normals
-from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.ranks import gather_rows, own_transitions, place, sum_over_ranks
 from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
@@ -116,7 +116,7 @@ class PPO(Stateful):
 
     Args:
         config: How they learn.
-        num_envs: Number of worlds.
+        num_envs: Number of worlds; where several ranks share a run, of those of each.
         obs_dim: Components of an observation.
         action_dim: Components of an action.
         device: Where they live.
@@ -135,12 +135,13 @@ class PPO(Stateful):
         actor_sees: Seen = ALL, critic_sees: Seen = ALL,
     ) -> None:  # fmt: skip
         rows = config.num_steps * num_envs
-        if config.minibatches > rows:
+        self._rows = rows * place().size  # transitions of all ranks
+        if config.minibatches > self._rows:
             raise ValueError(
-                f"minibatches must be at most the {rows} transitions of a rollout, got {config.minibatches}."
+                f"minibatches must be at most the {self._rows} transitions of a rollout, got {config.minibatches}."
             )
         self.config = config
-        self._size = rows // config.minibatches
+        self._size = self._rows // config.minibatches
         weights = generator(seed, "policy weights")
         self.actor = Actor(
             obs_dim, config.hidden, action_dim, config.activation, config.init_std, weights, actor_sees,
@@ -221,8 +222,8 @@ class PPO(Stateful):
 
         Args:
             rollout: What the current policy did.
-            order: The order that the transitions are split into minibatches in, int64,
-                shape (num_steps * num_envs,); ``None`` draws one.
+            order: The order that the transitions of all ranks are split into minibatches in, int64,
+                shape (num_steps * all worlds,); ``None`` draws one.
             critic: The value function to use as the baseline, from observations of shape (..., obs_dim) to values
                 in units of scaled rewards; ``None`` for PPO's own. Somebody else trains it, and PPO's own learns
                 nothing then.
@@ -235,12 +236,11 @@ class PPO(Stateful):
         """
         batch, explained = self.batch(rollout, critic)
         if order is None:
-            rows = batch.table.shape[1]
-            order = torch.randperm(rows, generator=self.generator, device=batch.table.device)
+            order = torch.randperm(self._rows, generator=self.generator, device=batch.table.device)
         std = self.actor.std.clone()
         value_loss = surrogate_loss = kl = math.nan
         learns = learn_policy or critic is None
-        if learns and bool(mean_over_ranks(rollout.weight.sum()) >= self._size):
+        if learns and bool(sum_over_ranks(rollout.weight.sum()) >= self._size):
             minibatches = self._minibatches(batch, order)
             totals = torch.zeros(3, dtype=torch.float32, device=order.device)
             self._grad.zero_()
@@ -278,10 +278,10 @@ class PPO(Stateful):
         advantage = rollout.advantage
         returns = advantage + value
         weight = rollout.weight
-        total = mean_over_ranks(weight.sum())
-        mean = mean_over_ranks((weight * advantage).sum()) / total
-        variance = mean_over_ranks((weight * (advantage - mean).square()).sum()) / (total - 1)
-        explained = 1 - variance / (returns.var() + 1e-8)
+        total = sum_over_ranks(weight.sum())
+        mean = sum_over_ranks((weight * advantage).sum()) / total
+        variance = sum_over_ranks((weight * (advantage - mean).square()).sum()) / (total - 1)
+        explained = 1 - variance / (gather_rows(returns, dim=1).var() + 1e-8)
         advantage = (advantage - mean) / (variance.sqrt() + 1e-8)
         table, std = self._batch.table, self.actor.std.unsqueeze(1)
         start, size = rollout.obs.shape[2], rollout.action.shape[2]
@@ -295,13 +295,16 @@ class PPO(Stateful):
         return self._batch, explained
 
     def _minibatches(self, batch: Batch, order: Tensor) -> list[Batch]:
-        """Parts of a batch in another order, each with weights that add up to 1."""
-        count = self.config.minibatches
-        table = self._shuffled.table[:, : self._size * count]
-        torch.index_select(batch.table, 1, order[: table.shape[1]], out=table)
-        weight = table[-3].view(count, self._size)
-        weight /= weight.sum(1, keepdim=True).clamp(min=1.0)
-        return [Batch(part, batch.obs_dim) for part in table.split(self._size, dim=1)]
+        """Parts of a batch in another order, each with weights that add up to 1 over all ranks."""
+        count, num_envs = self.config.minibatches, self._sizes[0]
+        rows, own = own_transitions(order[: self._size * count].view(count, self._size), num_envs)
+        table = self._shuffled.table.resize_(len(batch.table), rows.numel())  # ranks have unequal shares each time
+        torch.index_select(batch.table, 1, rows.flatten(), out=table)
+        weight = table[-3].view_as(rows)
+        if own is not None:
+            weight *= own
+        weight /= sum_over_ranks(weight.sum(1, keepdim=True)).clamp(min=1.0)
+        return [Batch(part, batch.obs_dim) for part in table.split(rows.shape[1], dim=1)]
 
     def _learn(self, minibatch: Batch, old_std: Tensor, *, learn_value: bool = True) -> Tensor:
         """One step of Adam; returns value loss, surrogate loss and KL divergence, shape (3,)."""
@@ -312,15 +315,15 @@ class PPO(Stateful):
         if learn_value:
             work.append(self._value_work(minibatch))
         surrogate, *value = gradients(*work)
+        sum_over_ranks(self._grad, surrogate, *value)
         std.grad -= config.entropy_coef / std
         self._critic.grad *= config.value_coef
         ratio, moved = old_std / std, surrogate[0, 1:]
         kl = (0.5 * (ratio.square() + moved / std.square() - 1.0) - ratio.log()).sum()
-        mean_over_ranks(self._grad)
         for nets in (self._actor, self._critic):
             nets.clip_gradient(config.max_grad_norm)
         if config.desired_kl:
-            self._adapt_learning_rate(mean_over_ranks(kl))
+            self._adapt_learning_rate(kl)
         self.optimizer.step()
         std.data.clamp_(min=1e-6)
         value_loss = value[0][0, 0] if value else torch.zeros_like(kl)
@@ -334,8 +337,8 @@ class PPO(Stateful):
     def _learn_value(self, minibatch: Batch) -> Tensor:
         """``_learn`` for the critic alone; of a policy that stays there is neither a loss nor a divergence."""
         (loss,) = gradients(self._value_work(minibatch))
+        sum_over_ranks(self._critic.grad, loss)
         self._critic.grad *= self.config.value_coef
-        mean_over_ranks(self._critic.grad)
         self._critic.clip_gradient(self.config.max_grad_norm)
         self.optimizer.step(self._critic_part)
         return torch.stack([loss[0, 0], *loss.new_full((2,), math.nan)])

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.ranks import sum_over_ranks
 
 EPSILON = 1e-2  # what a component that hardly varies is divided by at least; rsl_rl's
 
@@ -40,10 +40,11 @@ class Normalizer(nn.Module):
             obs: Observations, shape (n, size).
             weight: 1 for those that count and 0 for the others, shape (n,).
         """
-        total = mean_over_ranks(weight.sum())
+        total, mean = weight.sum(), weight @ obs
+        sum_over_ranks(total, mean)
         at_least_one = total.clamp(min=1.0)
-        mean = mean_over_ranks(weight @ obs) / at_least_one
-        variance = mean_over_ranks(weight @ (obs - mean).square_()) / at_least_one
+        mean /= at_least_one
+        variance = sum_over_ranks(weight @ (obs - mean).square_()) / at_least_one
         self.count += total
         share = (total / self.count.clamp(min=1.0)).float()
         delta = mean - self.mean

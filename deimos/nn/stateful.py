@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from deimos.nn.networks import weights_of
+from deimos.nn.ranks import gather_rows, own_rows
 from deimos.nn.seeds import restore
 
 
@@ -23,10 +24,15 @@ class Stateful:
     unknown: ClassVar[tuple[str, ...]] = ()
     """Names of those among them where NaN says that something is not known, or not there. All other numbers must be
     sound, see ``is_sound``, or the run stops."""
+    by_world: ClassVar[tuple[str, ...]] = ()
+    """Names of those among them that have one row per world: where several ranks share the worlds, each holds its own,
+    and a state those of all. Everything else must be the same on all of them."""
 
     def state_dict(self) -> dict:
-        """Everything that a bit-exact resume needs."""
-        return {name.lstrip("_"): _state(getattr(self, name)) for name in self.saved}
+        """Everything that a bit-exact resume needs; where several ranks share a run, all must call it."""
+        found = {name: getattr(self, name) for name in self.saved}
+        found |= {name: gather_rows(found[name]) for name in self.by_world}
+        return {name.lstrip("_"): _state(value) for name, value in found.items()}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from ``state_dict()``.
@@ -36,7 +42,9 @@ class Stateful:
             RuntimeError, ValueError: If it belongs to something of another size.
         """
         for name in self.saved:
-            setattr(self, name, _restored(getattr(self, name), state[name.lstrip("_")]))
+            saved = state[name.lstrip("_")]
+            saved = own_rows(saved) if name in self.by_world else saved
+            setattr(self, name, _restored(getattr(self, name), saved))
 
     def must_be_sound(self) -> Mapping[str, Any]:
         """By name, what ``state_dict`` is made of, with 0 for the NaN of what is unknown."""

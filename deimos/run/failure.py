@@ -9,6 +9,7 @@ from torch import Tensor
 from deimos.checks import RunError, SimulationError
 from deimos.files import save_tensors
 from deimos.learn.rollout import Rollout
+from deimos.nn.ranks import place, together
 from deimos.nn.stateful import LARGEST, unsound
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import Trainer
@@ -32,15 +33,17 @@ def dump(trainer: Trainer, folder: RunFolder, error: SimulationError, versions: 
 
     The report lists every tensor with a number that is not finite, or that is huge: its shape, how many there are, and
     in which worlds (or rows, where a tensor has no worlds); and the first steps of the rollout on which a world broke,
-    with what it observed and did before. The state holds the whole rollout.
+    with what it observed and did before. The state holds the whole rollout. Where several ranks share a run, both are
+    about the worlds of the one that failed, counted from its first.
     """
+    worlds = trainer.env.num_envs
     rollout = {name: value for name, value in vars(trainer.rollout).items() if isinstance(value, Tensor)}
     found = [*unsound("", _parts(trainer)), *unsound("rollout", rollout)]
     report = {
-        "schema": SCHEMA, "error": str(error), "iteration": trainer.iteration, "versions": versions,
+        "schema": SCHEMA, "error": str(error), "rank": error.rank, "iteration": trainer.iteration, "versions": versions,
         "not_finite": [
             {"name": name, "shape": list(bad.shape), "count": int(bad.sum()),
-             "worlds" if trainer.config.num_envs in bad.shape else "rows": _places(bad, trainer.config.num_envs)}
+             "worlds" if worlds in bad.shape else "rows": _places(bad, worlds)}
             for name, bad in found
         ],
         "invalid": _invalid(trainer.rollout),
@@ -80,7 +83,9 @@ def dumped(trainer: Trainer, folder: RunFolder, versions: Callable[[], dict[str,
         yield
     except SimulationError as error:
         try:
-            dump(trainer, folder, error, versions())
+            with together():
+                if error.rank == place().rank:
+                    dump(trainer, folder, error, versions())
         except RunError:  # the disk is full too: the first error is the one to tell
             raise error from None
         raise SimulationError(f"{error} What it was about is in {folder.path / REPORT}.") from error

@@ -11,6 +11,7 @@ from deimos.checks import RunError, SimulationError, check_at_least, check_choic
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
+from deimos.nn import ranks
 from deimos.nn.host import own_settings
 from deimos.nn.layout import seen_by
 from deimos.nn.threads import tf32_products, torch_on_one
@@ -45,7 +46,7 @@ class TrainConfig:
     seed: int = 0
     """Seed of the weights, the worlds, the goals and the exploration, in [0, 2^32)."""
     num_envs: int = 2000
-    """Parallel worlds, at least 1."""
+    """Parallel worlds, at least 1; of all processes together where torchrun starts several."""
     env_steps: int = 2000
     """Steps of every world, at least 1; rounded up to whole rollouts."""
     device: str = "auto"
@@ -106,12 +107,14 @@ class Trainer:
     @torch_on_one()  # sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.config = config
-        self.env = config.env.build(config.num_envs, device, config.seed)
+        num_envs = ranks.share("num_envs", config.num_envs)
+        self._first_world = ranks.place().rank * num_envs
+        self.env = config.env.build(num_envs, device, config.seed, self._first_world)
         total_steps = config.iterations * config.ppo.num_steps
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
         actor_sees, critic_sees = (seen_by(who, self.env.layout, device) for who in ("actor", "critic"))
         self.ppo = PPO(
-            config.ppo, config.num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed,
+            config.ppo, num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed,
             actor_sees=actor_sees, critic_sees=critic_sees,
         )  # fmt: skip
         self.rollout = self.ppo.new_rollout()
@@ -132,7 +135,7 @@ class Trainer:
         """Let the policy act for one rollout."""
         env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
         clock = _Clock(self)
-        ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps)
+        ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps, self._first_world)
         steps = zip(rollout.obs[:-1], rollout.noise, rollout.action, rollout.mean, strict=True)
         for t, (obs, noise, action, mean) in enumerate(steps):
             obs.copy_(env.obs)
@@ -169,12 +172,13 @@ class Trainer:
     def _iterate(self) -> dict[str, float]:
         """See ``iterate``."""
         try:
-            self.collect()
-            self.iteration += 1
-            self.env.check()
-            if self.env.may_go_on_invalid:
-                self.rollout.exclude_invalid()
-            _check_obs(self.rollout.obs[-1])
+            with ranks.together():
+                self.collect()
+                self.iteration += 1
+                self.env.check()
+                if self.env.may_go_on_invalid:
+                    self.rollout.exclude_invalid()
+                _check_obs(self.rollout.obs[-1])
             self.rollout.reward -= self._penalty * self.rollout.terminated
             clock = _Clock(self)
             learner = self.ppo.update(
@@ -187,23 +191,24 @@ class Trainer:
             self.loop.selector.check()
             clock.lap("selector")
         except SimulationError as error:
-            raise SimulationError(f"Iteration {self.iteration}: {error}") from error
+            raise SimulationError(f"Iteration {self.iteration}: {error}", error.rank) from error
+        return self._summary() | learner | selector | self.env.report()
+
+    def _summary(self) -> dict[str, float]:
+        """What every run logs of a rollout, in the worlds of all ranks."""
         rollout = self.rollout
-        transitions = rollout.reward.numel()
-        crashes = int(rollout.terminated.sum())
+        transitions = self.config.num_envs * rollout.num_steps
+        crashes = int(ranks.sum_over_ranks(rollout.terminated.sum()))
         penalty = self.env.crash_penalty + self._penalty
-        reward = rollout.reward.mean(dtype=torch.float64).item() + penalty * crashes / transitions
+        reward = ranks.mean_over_ranks(rollout.reward.mean(dtype=torch.float64)).item()
         return {
             "iteration": self.iteration,
             "env_steps": self.iteration * rollout.num_steps,
             "transitions": self.iteration * transitions,
-            "reward": reward,
+            "reward": reward + penalty * crashes / transitions,
             "crashes": crashes,
             "crashes_per_1000": 1000 * crashes / transitions,
-            "selected_fraction": self.loop.interactions.active.float().mean().item(),
-            **learner,
-            **selector,
-            **self.env.report(),
+            "selected_fraction": ranks.mean_over_ranks(self.loop.interactions.active.float().mean()).item(),
         }
 
     def state_dict(self) -> dict:

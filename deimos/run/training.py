@@ -4,8 +4,9 @@ import platform
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +17,7 @@ from deimos import __version__
 from deimos.checks import RunError, check_device, one_line
 from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
+from deimos.nn import ranks
 from deimos.run import memory
 from deimos.run.branch import check_branch
 from deimos.run.config import from_dict, kind, to_dict, with_plain_numbers
@@ -23,7 +25,7 @@ from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
 from deimos.run.failure import check_finite, dumped
 from deimos.run.folder import RunFolder
-from deimos.run.logs import open_logs
+from deimos.run.logs import Logs, open_logs
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.shared import find_cuda
 
@@ -33,7 +35,7 @@ CHECKPOINT_SECONDS = 30.0
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of a name: auto, cpu, cuda (the first one) or cuda:N.
+    """The device of a name: auto, cpu, cuda or cuda:N. Of several GPUs cuda is the first, or each rank's own.
 
     Raises:
         RunError: If it names none, if there is no such device, or if torch sees a CUDA device and Warp does not.
@@ -45,7 +47,9 @@ def resolve_device(name: str) -> torch.device:
     count = 0 if name == "cpu" else find_cuda()
     if name == "cpu" or (name == "auto" and not count):
         return torch.device("cpu")
-    index = int(name.partition(":")[2] or 0)
+    if ":" in name and ranks.place().size > 1:
+        raise RunError(f"device must be auto, cpu or cuda where several ranks have a GPU each, got '{name}'.")
+    index = int(name.partition(":")[2] or ranks.place().local_rank)
     if not count:
         raise RunError("There is no CUDA device here; use --device cpu.")
     if index >= count:
@@ -95,28 +99,43 @@ def start(
     device = resolve_device(config.device)
     config = with_plain_numbers(config)
     config = replace(
-        config, env=config.env.resolved(device), threads=config.threads or cores(),
-        device=str(device),
+        config, env=config.env.resolved(device), threads=config.threads or max(1, cores() // ranks.place().local_size),
+        device=_stored_name(device),
     )  # fmt: skip
     torch.set_num_threads(config.threads)
-    trainer = build(config, device)
-    if init_from is not None:
-        _load_weights(trainer, RunFolder.open(init_from))
-    if branch_from is not None:
-        _take_over(trainer, RunFolder.open(branch_from))
-    folder = RunFolder.create(path) if path else _new_folder(config)
+    with ranks.together():
+        trainer = build(config, device)
+        if init_from is not None:
+            _load_weights(trainer, RunFolder.open(init_from))
+        if branch_from is not None:
+            _take_over(trainer, RunFolder.open(branch_from))
+    folder = RunFolder(ranks.from_first(lambda: (RunFolder.create(path) if path else _new_folder(config)).path))
+    first = ranks.place().first
     try:
-        folder.write_json("config.json", {
-            "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
-            "init_from": str(init_from) if init_from else None,
-            "branch_from": str(branch_from) if branch_from else None,
-            "files": {name: folder.keep(name, partial(config.env.read_file, name)) for name in config.env.files},
-        })  # fmt: skip
+        with ranks.together():
+            if first:
+                folder.write_json("config.json", _description(config, folder, init_from, branch_from))
         save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
     except BaseException:  # a plug-in's, or an interrupt: whatever it is
-        shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
+        if first:
+            shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
         raise
     return trainer, folder
+
+
+def _stored_name(device: torch.device) -> str:
+    """What a run's configuration calls its device: where several ranks have one each, without a number."""
+    return str(device) if ranks.place().size == 1 else device.type
+
+
+def _description(config: TrainConfig, folder: RunFolder, init_from: Path | None, branch_from: Path | None) -> dict:
+    """What ``config.json`` holds; keeps the files that the worlds are built from."""
+    return {
+        "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
+        "init_from": str(init_from) if init_from else None,
+        "branch_from": str(branch_from) if branch_from else None,
+        "files": {name: folder.keep(name, partial(config.env.read_file, name)) for name in config.env.files},
+    }  # fmt: skip
 
 
 def _new_folder(config: TrainConfig) -> RunFolder:
@@ -139,7 +158,7 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
     Raises:
         RunError: If its worlds do not fit in memory, or what the configuration names is not there or does not fit.
     """
-    memory.require_worlds(config.num_envs, config.ppo.num_steps, device)
+    memory.require_worlds(config.num_envs // ranks.place().size, config.ppo.num_steps, device)
     if config.evaluation:
         check_memory(config.env, config.eval, device)
     try:
@@ -149,7 +168,7 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
         if memory.is_shortage(error):
             reason = f"{config.num_envs} worlds could not be allocated ({reason}); use fewer (num_envs)."
         raise RunError(reason) from error
-    memory.require_candidates(config.num_envs, trainer.loop.selector.num_candidates, trainer.env.goal_dim, device)
+    memory.require_candidates(trainer.env.num_envs, trainer.loop.selector.num_candidates, trainer.env.goal_dim, device)
     return trainer
 
 
@@ -198,7 +217,11 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
     Raises:
         RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
     """
-    state = _load_current(folder)
+    return _rebuild(_load_current(folder), config)
+
+
+def _rebuild(state: dict, config: TrainConfig) -> Trainer:
+    """The run of a checkpoint."""
     torch.set_num_threads(config.threads)
     trainer = build(config, resolve_device(config.device))
     trainer.load_state_dict(state)
@@ -209,22 +232,46 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
     """Resume a run from its last checkpoint, with a larger budget ``env_steps`` or on another device if they are given.
 
     Raises:
-        RunError: If it is not a run folder, its checkpoint is broken, or the budget is smaller.
+        RunError: If it is not a run folder, its checkpoint is broken, the budget is smaller, or another number of ranks
+            has trained it: sums would be rounded otherwise.
     """
     folder = RunFolder.open(path)
-    with folder.hold():
+    with _held(folder), ranks.together():
         config = read_config(folder)
         if env_steps is not None:
             if env_steps < config.env_steps:
                 raise RunError(f"--env-steps must exceed the {config.env_steps} already set, got {env_steps}.")
             config = replace(config, env_steps=env_steps)
         if device is not None:
-            config = replace(config, device=str(resolve_device(device)))
-        trainer = load(folder, config)
-        stored = folder.read_json("config.json")  # whose files keep the names that they were given by
-        stored["config"] |= {"env_steps": config.env_steps, "device": config.device}
-        folder.write_json("config.json", stored)
+            config = replace(config, device=_stored_name(resolve_device(device)))
+        state = _load_current(folder)
+        _check_ranks(folder, state.get("ranks", 1))
+        trainer = _rebuild(state, config)
+        if ranks.place().first:
+            stored = folder.read_json("config.json")  # whose files keep the names that they were given by
+            stored["config"] |= {"env_steps": config.env_steps, "device": config.device}
+            folder.write_json("config.json", stored)
     return trainer, folder
+
+
+def _check_ranks(folder: RunFolder, count: int) -> None:
+    """Refuse a run that ``count`` ranks have trained, if there are more or fewer now."""
+    if count != ranks.place().size:
+        begin = "python train.py" if count == 1 else f"torchrun --nproc_per_node={count} train.py"
+        raise RunError(
+            f"The number of ranks that resume {folder.path} must be {count}, as in its training, got "
+            f"{ranks.place().size}: {begin} --resume {folder.path}, or start a run with its networks by --init-from."
+        )
+
+
+@contextmanager
+def _held(folder: RunFolder) -> Iterator[None]:
+    """``RunFolder.hold`` on behalf of all ranks."""
+    with ExitStack() as stack:
+        with ranks.together():
+            if ranks.place().first:
+                stack.enter_context(folder.hold())
+        yield
 
 
 def read_config(folder: RunFolder) -> TrainConfig:
@@ -252,17 +299,21 @@ def _today(evaluation: dict) -> dict:
 
 
 def save(trainer: Trainer, folder: RunFolder) -> None:
-    """Write the checkpoint and the policy.
+    """Write the checkpoint and the policy; where several ranks share a run, all call it, and the first one writes.
 
     Raises:
         SimulationError: If a number is not finite that must be; the previous ones are intact.
         RunError: If they cannot be written; the previous ones are intact.
     """
-    check_finite(trainer)
-    save_tensors(folder.path / "checkpoint.pt", {"schema": CHECKPOINT_SCHEMA, **trainer.state_dict()})
+    with ranks.together():
+        check_finite(trainer)
+    state = {"schema": CHECKPOINT_SCHEMA, "ranks": ranks.place().size, **trainer.state_dict()}
     ppo, env = trainer.config.ppo, trainer.env
     policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
-    save_policy(folder.path / "policy.pt", policy)
+    with ranks.together():
+        if ranks.place().first:
+            save_tensors(folder.path / "checkpoint.pt", state)
+            save_policy(folder.path / "policy.pt", policy)
 
 
 def train(
@@ -273,41 +324,72 @@ def train(
 
     Rows of later iterations that the folder has are written again. Meanwhile no other process can train the run. After
     every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true ends the
-    run early, with a checkpoint.
+    run early, with a checkpoint. Where several ranks share a run, the first one writes and reports, and any may end it.
 
     Raises:
         SimulationError: If a number is not finite; the last checkpoint is intact, and ``failure.json`` has the details.
         RunError: If a file cannot be written, in which case the last checkpoint is intact; or another process trains
             the run.
     """
-    with folder.hold(), dumped(trainer, folder, provenance):
-        for name in ("progress.csv", "timing.csv"):
-            folder.cut_csv(name, trainer.iteration)
-        return _iterate(trainer, folder, report, stopped)
+    with _held(folder), dumped(trainer, folder, provenance), ExitStack() as stack:
+        with ranks.together():
+            writer = stack.enter_context(_writer(trainer, folder, report)) if ranks.place().first else None
+        return _iterate(trainer, folder, writer, stopped)
 
 
-def _iterate(
-    trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None], stopped: Callable[[], bool]
-) -> bool:
-    """See ``train``."""
-    transitions = trainer.rollout.reward.numel()
-    saved = time.monotonic()
+@dataclass(frozen=True)
+class _Writer:
+    """What writes and shows the numbers of a run."""
+
+    folder: RunFolder
+    logs: Logs
+    report: Callable[[dict[str, float], float], None]
+
+    def add(self, row: dict[str, float], timing: dict[str, float]) -> None:
+        """Write and show an iteration."""
+        self.folder.append_csv("progress.csv", row)
+        self.folder.append_csv("timing.csv", timing)
+        self.logs.write(int(row["iteration"]), row | {"fps": timing["fps"]})
+        self.report(row, timing["fps"])
+
+
+@contextmanager
+def _writer(
+    trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None]
+) -> Iterator[_Writer]:  # fmt: skip
+    """Open a run's tables and logs; rows that it is about to write again are dropped."""
+    for name in ("progress.csv", "timing.csv"):
+        folder.cut_csv(name, trainer.iteration)
     with open_logs(trainer.config.log, folder, to_dict(trainer.config), trainer.iteration) as logs:
-        while trainer.iteration < trainer.config.iterations:
-            before = dict(trainer.seconds)
-            begin = time.perf_counter()
-            row = trainer.iterate()
-            fps = transitions / (time.perf_counter() - begin)
-            folder.append_csv("progress.csv", row)
-            spent = {name: seconds - before[name] for name, seconds in trainer.seconds.items()}
-            folder.append_csv("timing.csv", {"iteration": trainer.iteration, "fps": fps, **spent})
-            logs.write(trainer.iteration, row | {"fps": fps})
-            report(row, fps)
-            if stopped():
-                break
-            if time.monotonic() - saved > CHECKPOINT_SECONDS:
-                logs.flush()  # first: what a resumed run does not say again must be there
-                save(trainer, folder)
-                saved = time.monotonic()
-    save(trainer, folder)
+        yield _Writer(folder, logs, report)
+
+
+def _iterate(trainer: Trainer, folder: RunFolder, writer: _Writer | None, stopped: Callable[[], bool]) -> bool:
+    """See ``train``; of several ranks, the first one has a writer."""
+
+    def keep() -> None:
+        with ranks.together():
+            if writer is not None:
+                writer.logs.flush()  # first: what a resumed run does not say again must be there
+        save(trainer, folder)
+
+    transitions = trainer.config.num_envs * trainer.config.ppo.num_steps
+    saved = time.monotonic()
+    while trainer.iteration < trainer.config.iterations:
+        before = dict(trainer.seconds)
+        begin = time.perf_counter()
+        row = trainer.iterate()
+        fps = transitions / (time.perf_counter() - begin)
+        spent = {name: seconds - before[name] for name, seconds in trainer.seconds.items()}
+        with ranks.together():
+            if writer is not None:
+                writer.add(row, {"iteration": trainer.iteration, "fps": fps, **spent})
+            wanted = stopped(), time.monotonic() - saved > CHECKPOINT_SECONDS
+        stop, checkpoint = ranks.largest(*wanted)
+        if stop:
+            break
+        if checkpoint:
+            keep()
+            saved = time.monotonic()
+    keep()
     return trainer.iteration >= trainer.config.iterations

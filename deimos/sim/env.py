@@ -20,6 +20,7 @@ from torch import Tensor
 from deimos.checks import check_at_least, check_range
 from deimos.files import read_bytes
 from deimos.nn.layout import ObsField, goal_slice
+from deimos.nn.ranks import gather_rows, own_rows
 
 if TYPE_CHECKING:
     import mujoco
@@ -331,7 +332,10 @@ class Env(abc.ABC):
         return []
 
     def report(self) -> dict[str, float]:
-        """What a log wants to know of the steps since the last call, the same keys every time; reads the device."""
+        """What a log wants to know of the steps since the last call, the same keys every time; reads the device.
+
+        Where several ranks share a run, all call it, and the log has what the first one gives: see ``deimos.nn.ranks``.
+        """
         return {}
 
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
@@ -419,15 +423,14 @@ class Env(abc.ABC):
         """
         for name, tensor in self.tensors.items():
             if name in state and name not in DRAW_COUNTS:
-                if state[name].shape != tensor.shape:
-                    raise ValueError(
-                        f"{name} must have the shape {tuple(tensor.shape)}, got {tuple(state[name].shape)}."
-                    )
-                tensor.copy_(state[name])
+                own = own_rows(state[name])
+                if own.shape != tensor.shape:
+                    raise ValueError(f"{name} must have the shape {tuple(tensor.shape)}, got {tuple(own.shape)}.")
+                tensor.copy_(own)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Copies of all tensors that a bit-exact resume needs."""
-        return {name: tensor.clone() for name, tensor in self.tensors.items()}
+        """Copies of all tensors that a bit-exact resume needs, with the worlds of all ranks; see ``Stateful``."""
+        return {name: gather_rows(tensor).clone() for name, tensor in self.tensors.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Continue from ``state_dict()``.
@@ -435,6 +438,7 @@ class Env(abc.ABC):
         Raises:
             ValueError: If ``state`` is that of another environment or another number of worlds.
         """
+        state = {name: own_rows(tensor) for name, tensor in state.items()}
         expected = {name: tuple(tensor.shape) for name, tensor in self.tensors.items()}
         found = {name: tuple(tensor.shape) for name, tensor in state.items()}
         if expected != found:

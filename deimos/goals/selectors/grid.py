@@ -9,6 +9,7 @@ from deimos.checks import check_at_least, check_positive
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions, uniform_proposal
+from deimos.nn.ranks import max_over_ranks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +109,7 @@ class Grid(GoalSelector):
         """Raise the weights around the cells of goals that were tracked well."""
         done = interactions.resolved(self._learnt_at)
         self._learnt_at = interactions.now
-        if bool((self._seen > 0).all()):
+        if bool((max_over_ranks(self._seen) > 0).all()):
             self._half.copy_(self._seen)
             self.fitted = True
         row = {}

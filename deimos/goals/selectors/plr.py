@@ -17,6 +17,7 @@ from deimos.checks import check_at_least, check_positive, check_range
 from deimos.goals import picks
 from deimos.goals.interactions import Interactions, Resolved
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces, Transitions
+from deimos.nn.ranks import gather_rows, own_rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +61,7 @@ class PLR(GoalSelector):
     needs_rollout = True
     dense = True
     saved = ("_level", "_score", "_made", "_seen", "_upto", "_carry", "_learnt_at", "replaying")
+    by_world = ("_carry",)
 
     def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config
@@ -116,17 +118,18 @@ class PLR(GoalSelector):
     def _positive_value_loss(self, interactions: Interactions, done: Resolved, rollout: Transitions) -> Tensor:
         """Mean of max(advantage, 0) over every resolved interaction, shape (n,); interactions span rollouts."""
         begin = interactions.now - rollout.num_steps
-        upto = torch.nn.functional.pad(rollout.advantage.clamp(min=0).cumsum(0), (0, 0, 1, 0))
+        advantage, carry = gather_rows(rollout.advantage, dim=1), gather_rows(self._carry)
+        upto = torch.nn.functional.pad(advantage.clamp(min=0).cumsum(0), (0, 0, 1, 0))
 
         def gained(env: Tensor, first: Tensor, last: Tensor) -> Tensor:
-            before = self._carry[env] * (first < begin)
+            before = carry[env] * (first < begin)
             return before + upto[last - begin, env] - upto[(first - begin).clamp(min=0), env]
 
         loss = gained(done.env, done.issued, done.resolved) / (done.resolved - done.issued)
-        every = torch.arange(len(self._carry), device=loss.device)
+        every = torch.arange(len(carry), device=loss.device)
         issued = interactions.issued_at
         pending = gained(every, issued, torch.full_like(issued, interactions.now))
-        self._carry = torch.where(interactions.active, pending, 0.0)
+        self._carry = own_rows(torch.where(interactions.active, pending, 0.0))
         return loss
 
     def _refresh(self, done: Resolved, loss: Tensor) -> None:

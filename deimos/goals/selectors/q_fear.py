@@ -15,6 +15,7 @@ from deimos.goals import picks
 from deimos.goals.interactions import Interactions, Resolved, assign
 from deimos.goals.selector import Proposal, Spaces
 from deimos.goals.selectors import director
+from deimos.nn.ranks import gather_rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +47,7 @@ class QFear(director.Director):
     inputs_per_row: ClassVar[int] = 2  # an interaction, and the worst that could follow it: NaN where nobody knows
     saved = (*director.Director.saved, "_worst")
     unknown = (*director.Director.unknown, "_worst")
+    by_world = ("_worst",)
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         super().__init__(config, spaces, seed)
@@ -68,8 +70,8 @@ class QFear(director.Director):
 
     def rows(self, window: Resolved, interactions: Interactions) -> Tensor:
         """See ``FearSelector.rows``."""
-        known = interactions.followed(window).unsqueeze(1)
-        worst = self._worst[window.env].where(known, torch.full_like(known, torch.nan, dtype=torch.float32))
+        worst, known = gather_rows(self._worst)[window.env], interactions.followed(window).unsqueeze(1)
+        worst = worst.where(known, torch.full_like(known, torch.nan, dtype=torch.float32))
         return torch.cat([super().rows(window, interactions), worst], dim=1)
 
     def fit(self, rows: Tensor, crashed: Tensor, weight: Tensor) -> float:

@@ -15,7 +15,7 @@ from deimos.nn.adam import Adam
 from deimos.nn.losses import mean_squared_error
 from deimos.nn.mlps import MLPs
 from deimos.nn.networks import Activation, mlp
-from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.ranks import gather_rows
 from deimos.nn.seeds import generator
 from deimos.nn.threads import torch_on_one
 
@@ -72,7 +72,7 @@ class RND(GoalSelector):
         "predictor", "target", "optimizer", "generator", "_uniform", "_moments", "_mean", "_scale", "_learnt_at",
         "fitted",
     )  # fmt: skip
-    unknown = ("_uniform",)
+    unknown = by_world = ("_uniform",)
 
     @torch_on_one()  # orthogonal weights come from a decomposition whose sums depend on torch's threads
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
@@ -140,7 +140,7 @@ class RND(GoalSelector):
         """Whiten by, and learn from, what was issued since the last time; no outcome is needed."""
         env, state, goal, next_goal = interactions.issued(self._learnt_at)
         self._learnt_at = interactions.now
-        uniform = self._uniform[env]
+        uniform = gather_rows(self._uniform)[env]
         known = uniform.isfinite().all(1)  # in a world whose goals somebody else chose so far, it has seen none
         state, goal, next_goal, uniform = state[known], goal[known], next_goal[known], uniform[known]
         if len(uniform) == 0:
@@ -174,7 +174,6 @@ class RND(GoalSelector):
             order = torch.randperm(len(inputs), generator=self.generator, device=inputs.device)
             for rows in order.split(size):
                 loss = self._predictor.gradient(inputs[rows], mean_squared_error(target[rows]))
-                mean_over_ranks(self._predictor.grad)
                 self.optimizer.step()
                 total += loss[0, 0] * len(rows)
         return (total / len(inputs)).item()

@@ -13,6 +13,7 @@ from deimos.goals import picks
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces, Transitions
 from deimos.goals.selectors import director
+from deimos.nn import ranks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +39,9 @@ class Swapped(director.Director):
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         super().__init__(config, spaces, seed)
-        sizes = spaces.state_dim, spaces.goal_dim
+        worlds, sizes = spaces.num_envs * ranks.place().size, (spaces.state_dim, spaces.goal_dim)
         self._state, self._goal = (
-            torch.zeros(spaces.num_envs, size, dtype=torch.float32, device=spaces.device) for size in sizes
+            torch.zeros(worlds, size, dtype=torch.float32, device=spaces.device) for size in sizes
         )
         self._count = 0  # decisions seen so far
 

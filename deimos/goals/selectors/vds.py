@@ -19,7 +19,7 @@ from deimos.nn.adam import Adam
 from deimos.nn.losses import ValueLoss
 from deimos.nn.mlps import MLPs
 from deimos.nn.networks import Activation, mlp
-from deimos.nn.ranks import mean_over_ranks
+from deimos.nn.ranks import mean_over_ranks, sum_over_ranks
 from deimos.nn.returns import advantages
 from deimos.nn.seeds import generator
 
@@ -136,9 +136,9 @@ class VDS(GoalSelector):
         worlds = self._worlds(rollout.obs.shape[1], rollout.obs.device)
         old, returns = self._targets(rollout, worlds)
         loss = self._fit(rollout, worlds, old, returns)
-        spread = deviation(old).mean().item() if self.config.data == "all" else float("nan")
+        spread = mean_over_ranks(deviation(old).mean()).item() if self.config.data == "all" else float("nan")
         self._known = None
-        return {"vds/loss": loss, "vds/deviation": spread, "vds/value": old.mean().item()}
+        return {"vds/loss": loss, "vds/deviation": spread, "vds/value": mean_over_ranks(old.mean()).item()}
 
     def _worlds(self, num_envs: int, device: torch.device) -> Tensor:
         """The worlds that every critic learns from, int64, shape (K, worlds of each)."""
@@ -177,7 +177,8 @@ class VDS(GoalSelector):
     def _fit(self, rollout: Transitions, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
         """Adam on the clipped value loss; returns its mean over critics and minibatches.
 
-        As PPO, it learns nothing, and gives NaN, where fewer transitions count than a minibatch has.
+        A minibatch has the same places in the rollouts of all ranks. As PPO, it learns nothing, and gives NaN, where
+        fewer transitions count than a minibatch has.
         """
         rows = rollout.num_steps * worlds.shape[1]
         minibatches = min(self.config.minibatches, rows)
@@ -186,23 +187,23 @@ class VDS(GoalSelector):
         steps = torch.arange(rollout.num_steps, device=order.device) * rollout.obs.shape[1]
         place = (steps.unsqueeze(1) + worlds.unsqueeze(1)).flatten(1).gather(1, order)  # in the flat rollout
         weight = rollout.weight.take(place)
-        if bool(mean_over_ranks(weight.sum(1).min()) < size):
+        if bool(mean_over_ranks(weight.sum(1)).min() < size):
             return float("nan")
         order, place, weight = (tensor[:, : minibatches * size] for tensor in (order, place, weight))
         obs = self._spaces.state_then_goal(rollout.obs[:-1]).flatten(0, 1).t()
         x = obs.index_select(1, place.reshape(-1)).view(len(obs), *place.shape).permute(1, 2, 0)
         weight = weight.unflatten(1, (minibatches, size))
-        weight = (weight / weight.sum(2, keepdim=True).clamp(min=1.0)).flatten(1)
+        weight = (weight / sum_over_ranks(weight.sum(2, keepdim=True)).clamp(min=1.0)).flatten(1)
         data = [weight, *(values.flatten(1).gather(1, order) for values in (old, returns))]
         loss, losses = ValueLoss(torch.stack(data, dim=1), self.config.clip), torch.zeros_like(old[:, 0, 0])
         for _ in range(self.config.epochs):
             for start in range(0, minibatches * size, size):
                 part = slice(start, start + size)
                 losses += self.nets.gradient(x[:, part], loss[part]).squeeze(1)
-                mean_over_ranks(self.nets.grad)
+                sum_over_ranks(self.nets.grad)
                 self.nets.clip_gradient(self.config.max_grad_norm)
                 self.optimizer.step()
-        return losses.mean().item() / (self.config.epochs * minibatches)
+        return sum_over_ranks(losses).mean().item() / (self.config.epochs * minibatches)
 
     def check(self) -> None:
         """See ``GoalSelector.check``."""

@@ -19,6 +19,7 @@ from deimos.goals.fear import auroc
 from deimos.goals.fear_selector import FearSelector, FearSelectorConfig
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Proposal, Spaces, Transitions
+from deimos.nn.ranks import sum_over_ranks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +96,7 @@ class Weighted(FearSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``; adds the effective sample size, as a share, and the shift of the states."""
-        count, total, squares = self._sums.tolist()
+        count, total, squares = sum_over_ranks(self._sums).tolist()
         self._sums.zero_()
         return super().learn(interactions, rollout) | {
             "weighted/effective_share": total**2 / (count * squares) if count else math.nan,

@@ -36,6 +36,7 @@ from deimos.kernels.legged.state import (
 from deimos.kernels.legged.step import apply_actions, evaluate_step
 from deimos.kernels.random import Purpose, draw_uniforms
 from deimos.nn.host import own_settings
+from deimos.nn.ranks import max_over_ranks, mean_over_ranks, sum_over_ranks
 from deimos.sim.env import ObsField
 from deimos.sim.legged import engines
 from deimos.sim.legged.config import LocomotionConfig
@@ -252,15 +253,17 @@ class Locomotion(WarpEnv):
         The terms add up to the mean reward; the errors are means over the worlds at this moment.
         """
         steps, self._steps_reported = max(self._steps_reported, 1), 0
-        means = (self._sums / (steps * self.num_envs)).tolist()
+        means = mean_over_ranks(self._sums / (steps * self.num_envs)).tolist()
         self._sums.zero_()
         invalid, self.invalid_steps = self.invalid_steps, 0
+        use = self.physics.report()
+        most = max_over_ranks(torch.tensor([*use.values()], dtype=torch.float64)).tolist()
         return {
             **{f"reward/{name}": value for name, value in zip(self.columns, means, strict=True)},
-            "level": self.tensors["level"].float().mean().item(),
-            "invalid_steps": invalid,
-            **self.physics.report(),
-            **{_error_name(name): error.mean().item() for name, error in self.errors.items()},
+            "level": mean_over_ranks(self.tensors["level"].float().mean()).item(),
+            "invalid_steps": int(sum_over_ranks(torch.tensor(invalid))),
+            **dict(zip(use, most, strict=True)),
+            **{_error_name(name): mean_over_ranks(error.mean()).item() for name, error in self.errors.items()},
         }
 
     def tiles(self) -> list[tuple[str, int]]:
