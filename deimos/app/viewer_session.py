@@ -14,6 +14,7 @@ from deimos.goals.shield import Mode
 from deimos.nn.layout import goal_components
 from deimos.run.attack import Attack, argmax_director, attacker, uniform_goals
 from deimos.run.evaluation import make_target
+from deimos.run.film import seconds_per_step
 from deimos.run.loop import GoalLoop
 from deimos.run.saved import SavedRun
 from deimos.sim.env import Env
@@ -149,7 +150,7 @@ class Session:
     @property
     def seconds_per_step(self) -> float:
         """Duration of a step as it is shown [s]: 1/50 where the world has no seconds."""
-        return self.env.dt if self.env.has_seconds else 0.02
+        return seconds_per_step(self.env)
 
     def choose(self, name: str) -> None:
         """Have somebody else choose the goals, from the next one on; by hand it begins with the active one.

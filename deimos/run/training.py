@@ -18,6 +18,7 @@ from deimos.files import load_tensors, save_tensors
 from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.run import memory
 from deimos.run.branch import check_branch
+from deimos.run.clips import Camera, cut_clips
 from deimos.run.config import from_dict, kind, to_dict, with_plain_numbers
 from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
@@ -260,9 +261,12 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     """
     check_finite(trainer)
     save_tensors(folder.path / "checkpoint.pt", {"schema": CHECKPOINT_SCHEMA, **trainer.state_dict()})
+    _save_policy(trainer, folder.path / "policy.pt")
+
+
+def _save_policy(trainer: Trainer, path: Path) -> None:
     ppo, env = trainer.config.ppo, trainer.env
-    policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
-    save_policy(folder.path / "policy.pt", policy)
+    save_policy(path, Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt))
 
 
 def train(
@@ -271,9 +275,9 @@ def train(
 ) -> bool:  # fmt: skip
     """Run all iterations that are left, and return whether the budget was used up.
 
-    Rows of later iterations that the folder has are written again. Meanwhile no other process can train the run. After
-    every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true ends the
-    run early, with a checkpoint.
+    Rows and clips of later iterations that the folder has are made again. Meanwhile no other process can train the run.
+    After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true
+    ends the run early, with a checkpoint.
 
     Raises:
         SimulationError: If a number is not finite; the last checkpoint is intact, and ``failure.json`` has the details.
@@ -283,6 +287,7 @@ def train(
     with folder.hold(), dumped(trainer, folder, provenance):
         for name in ("progress.csv", "timing.csv"):
             folder.cut_csv(name, trainer.iteration)
+        cut_clips(folder, trainer.iteration)
         return _iterate(trainer, folder, report, stopped)
 
 
@@ -291,7 +296,7 @@ def _iterate(
 ) -> bool:
     """See ``train``."""
     transitions = trainer.rollout.reward.numel()
-    saved = time.monotonic()
+    saved, camera = time.monotonic(), Camera(folder, trainer.config.video_every)
     with open_logs(trainer.config.log, folder, to_dict(trainer.config), trainer.iteration) as logs:
         while trainer.iteration < trainer.config.iterations:
             before = dict(trainer.seconds)
@@ -301,7 +306,8 @@ def _iterate(
             folder.append_csv("progress.csv", row)
             spent = {name: seconds - before[name] for name, seconds in trainer.seconds.items()}
             folder.append_csv("timing.csv", {"iteration": trainer.iteration, "fps": fps, **spent})
-            logs.write(trainer.iteration, row | {"fps": fps})
+            clip = camera.after(trainer.iteration, partial(_save_policy, trainer))
+            logs.write(trainer.iteration, row | {"fps": fps}, clip)
             report(row, fps)
             if stopped():
                 break
