@@ -17,6 +17,7 @@ from deimos.run.evaluation import make_target
 from deimos.run.film import seconds_per_step
 from deimos.run.loop import GoalLoop
 from deimos.run.saved import SavedRun
+from deimos.run.shield import stored_guard
 from deimos.sim.env import Env
 
 UNIFORM, BY_HAND = "uniform", "by hand"
@@ -123,7 +124,9 @@ class Session:
         choices |= {name: attack.selector(self.env) for name, attack in self._attacks.items()}
         self.goals = Steered(choices)
         self.goals.current, self.goals.own = current if current in (*choices, BY_HAND) else UNIFORM, own
-        self._guard = self._run.guard(self.env, self._shield) if self._shield else None
+        self._guard = None
+        if self._shield:
+            self._guard = stored_guard(self._run.folder, self._policy, self.env, trained, self._shield)
         self._loop = GoalLoop(self.env, self.goals, guard=self._guard)
 
     def _stamps(self) -> list[tuple[int, int]]:
