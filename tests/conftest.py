@@ -52,6 +52,20 @@ def pytest_pyfunc_call(pyfuncitem):
     return True
 
 
+@pytest.fixture(scope="session")
+def hills(tmp_path_factory):
+    """The path of a small saved terrain: 3 levels and 2 columns of stairs."""
+    from deimos.terrain.shapes import stairs
+
+    from deimos import terrain
+
+    shapes = tuple(terrain.Share(shape=stairs.Shape(tile=4.0, platform=2.0, direction=way)) for way in ("up", "down"))
+    grid = terrain.Grid(shapes=shapes, levels=3, columns=2, tile=4.0, border=2.0, hardest=0.5)
+    path = tmp_path_factory.mktemp("terrain") / "hills.npz"
+    terrain.build(grid).save(path)
+    return str(path)
+
+
 STUDY = """
 seeds = {seeds}
 methods = {methods}
