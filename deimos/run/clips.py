@@ -1,6 +1,7 @@
 """Clips of the policy while it learns: ``videos/ITERATION.gif`` in a run's folder, from where the logs take them."""
 
 import logging
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -47,6 +48,7 @@ def render(run: Path, policy: Path, clip: Path) -> None:
         [sys.executable, "-m", "deimos.run.film", str(run), str(policy), str(clip)],
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=True,
         timeout=PATIENCE_SECONDS, start_new_session=True,  # Ctrl-C stops the training, after this clip
+        env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},  # the world of a clip is on the CPU; the GPU is the training's
     )  # fmt: skip
 
 
