@@ -1,7 +1,7 @@
 """Weights & Biases itself, offline: `python .ci/check_logs.py` (extra wandb).
 
 A run is killed some iterations after its last checkpoint and resumed; the files that `wandb sync` would send hold every
-iteration once, with the numbers of progress.csv.
+iteration once, with the numbers of progress.csv, and the clips of the policy.
 """
 
 import json
@@ -20,6 +20,7 @@ from deimos.run import training
 from deimos.run.folder import RunFolder
 
 SAVED, KILLED, END = 3, 6, 9  # iterations of the last checkpoint, of the kill and in all
+FILMED = [3, 6, 9]  # iterations with a video
 RUN = f"""
 import os, signal, sys
 from pathlib import Path
@@ -33,7 +34,9 @@ def report(row, fps):
     if row["iteration"] == {KILLED}:
         os.kill(os.getpid(), signal.SIGKILL)
 
-config = TrainConfig(num_envs=16, env_steps={24 * END}, device="cpu", threads=1, evaluation=False, log=("wandb",))
+config = TrainConfig(
+    num_envs=16, env_steps={24 * END}, device="cpu", threads=1, evaluation=False, log=("wandb",), video_every=3
+)
 training.train(*training.start(config, Path(sys.argv[1])), report)
 """
 BLOCK, HEADER = 32768, 7  # of LevelDB's log format, in which wandb keeps its records
@@ -70,12 +73,19 @@ def main() -> None:
         history = [record.history for record in records(files[0]) if record.HasField("history")]
         steps = [each.step.num for each in history]
         assert steps == [*range(1, END + 1)], steps
-        rewards = [
-            json.loads(item.value_json) for each in history for item in each.item
-            if "reward" in (item.key, *item.nested_key)
-        ]  # fmt: skip
-        assert rewards == [float(row["reward"]) for row in RunFolder(path).read_csv("progress.csv")], rewards
-    print(f"Weights & Biases has the iterations 1 to {END} once each, after a kill and a resume.")
+        said = {("reward",): [], ("policy", "path"): []}
+        for each in history:
+            for item in each.item:
+                if (name := tuple(item.nested_key) or (item.key,)) in said:
+                    said[name].append((each.step.num, json.loads(item.value_json)))
+        rewards, videos = said.values()
+        rows = RunFolder(path).read_csv("progress.csv")
+        assert rewards == [(int(row["iteration"]), float(row["reward"])) for row in rows], rewards
+        assert [step for step, _ in videos] == FILMED, videos
+        for step, name in videos:
+            clip = files[0].parent / "files" / name
+            assert clip.read_bytes() == (path / "videos" / f"{step:06d}.gif").read_bytes(), clip
+    print(f"Weights & Biases has the iterations 1 to {END} and their clips once each, after a kill and a resume.")
 
 
 if __name__ == "__main__":

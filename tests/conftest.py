@@ -1,6 +1,7 @@
-"""Fixtures of all tests: the devices that they run on, and the reference of every random draw."""
+"""Fixtures of all tests: devices that they run on, the reference of every random draw, the text of a short study."""
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -49,6 +50,45 @@ def pytest_pyfunc_call(pyfuncitem):
     if done.returncode != 0:
         pytest.fail(f"{done.stdout}{done.stderr}\nexit code {done.returncode}", pytrace=False)
     return True
+
+
+@pytest.fixture(scope="session")
+def hills(tmp_path_factory):
+    """The path of a small saved terrain: 3 levels and 2 columns of stairs."""
+    from deimos.terrain.shapes import stairs
+
+    from deimos import terrain
+
+    shapes = tuple(terrain.Share(shape=stairs.Shape(tile=4.0, platform=2.0, direction=way)) for way in ("up", "down"))
+    grid = terrain.Grid(shapes=shapes, levels=3, columns=2, tile=4.0, border=2.0, hardest=0.5)
+    path = tmp_path_factory.mktemp("terrain") / "hills.npz"
+    terrain.build(grid).save(path)
+    return str(path)
+
+
+STUDY = """
+seeds = {seeds}
+methods = {methods}
+[train]
+num_envs = 16
+env_steps = {env_steps}
+device = "cpu"
+ppo = {{ hidden = [8], epochs = 1 }}
+eval = {{ worlds = 16, steps = 40, adversary_steps = 40 }}
+[[environment]]
+name = "directional"
+env = {{ kind = "particle", variant = "directional", goal_period = 10, max_speed = 200.0, max_force = 200.0 }}
+"""
+
+
+@pytest.fixture(scope="session")
+def short_study():
+    """Writes the TOML of a study whose cells take seconds and crash, ``head`` first."""
+
+    def text(env_steps, *, seeds=1, methods=("uniform", "p25"), head=""):
+        return head + STUDY.format(env_steps=env_steps, seeds=seeds, methods=json.dumps(methods))
+
+    return text
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 HOME = Path(__file__).resolve().parent.parent
-NIGHTLY = HOME / ".ci" / "nightly"
+BASE_TESTS = HOME / ".ci" / "base_tests"
 
 BLOCK = """
 import sys
@@ -100,9 +100,9 @@ def test_command_line_names_its_extra(arguments):
     assert "pip install 'deimos-rl[sim]'" in done.stderr
 
 
-def test_what_nightly_runs_needs_the_base_install():
-    """The tests that .ci/nightly runs import torch, NumPy, pytest and what Deimos builds on these alone."""
-    files = re.findall(r"\btest_\w+\.py\b", re.search(r"tests=\((.*?)\n\)", NIGHTLY.read_text(), re.DOTALL)[1])
+def test_base_tests_need_the_base_install():
+    """The tests that .ci/base_tests runs import torch, NumPy, pytest and what Deimos builds on these alone."""
+    files = re.findall(r"\btest_\w+\.py\b", re.search(r"tests=\((.*?)\n\)", BASE_TESTS.read_text(), re.DOTALL)[1])
     assert {"test_base_install.py", "test_deimos_goal_director.py", "test_deimos_fear.py"} <= set(files)
     for file in set(files):
         for node in ast.walk(ast.parse((HOME / "tests" / file).read_text())):

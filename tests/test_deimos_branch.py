@@ -138,7 +138,9 @@ def test_what_must_not_differ_is_named(origin, tmp_path):
 def test_method_penalty_and_period_may_differ(origin, tmp_path):
     """A branch with another method, a crash penalty and another T runs, and its goals last as long as they should."""
     env = replace(CONFIG.env, crash_penalty=2.0, goal_period=24)
-    config = branched(origin, env=env, selector=vds.Config(critics=2, role="auxiliary", hidden=(8,)))
+    config = branched(
+        origin, env=env, log=(), video_every=9, selector=vds.Config(critics=2, role="auxiliary", hidden=(8,))
+    )
     trainer, _ = training.start(config, tmp_path / "run", branch_from=origin)
     trainer.iterate()
     assert trainer.env.crash_penalty == 2.0

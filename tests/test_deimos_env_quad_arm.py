@@ -1,4 +1,4 @@
-"""Quad+arm: the task of the arm on the Go1; what it shares with Quad is shown in test_deimos_env_quad.py."""
+"""Quad+arm: the task of the arm on the Go1; what it shares with Quad is shown in test_deimos_env_quad_state.py."""
 
 import dataclasses
 import itertools

@@ -315,7 +315,7 @@ def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsy
         (other / name).write_bytes((particles / name).read_bytes())
     (other / "policy.pt").write_bytes((WALK / "policy.pt").read_bytes())
     assert cli.main(["export", str(other), str(tmp_path / "out")]) == 2
-    assert "observes other things than its environment" in capsys.readouterr().err
+    assert "is one of another environment: it observes" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     (other / "policy.pt").write_bytes((particles / "policy.pt").read_bytes())
     (other / "shield.json").write_text('{"deploy": {"weights": "0123456789abcdef"}}')

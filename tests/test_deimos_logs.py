@@ -1,5 +1,7 @@
 """What a run shows while it trains: every iteration once, also after a kill."""
 
+import hashlib
+import inspect
 import json
 import signal
 import subprocess
@@ -13,25 +15,35 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from deimos.checks import RunError
 from deimos.learn.ppo import PPOConfig
-from deimos.run import training
+from deimos.run import clips, training
 from deimos.run.config import to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 
 STEPS, SAVED, KILLED, END = 8, 3, 5, 9  # of a rollout; iterations of the last checkpoint, of the kill and in all
+FILMED = [2, 4, 6, 8]  # iterations with a video
 CONFIG = TrainConfig(
-    num_envs=8, env_steps=STEPS * END, device="cpu", threads=1, evaluation=False,
+    num_envs=8, env_steps=STEPS * END, device="cpu", threads=1, evaluation=False, video_every=2,
     ppo=PPOConfig(num_steps=STEPS, hidden=(4,), epochs=1),
 )  # fmt: skip
 
+
+def render(run, policy, clip):
+    """Make a clip, in place of the process that would render it: the hash of the policy that it shows."""
+    clip.write_bytes(b"GIF89a" + hashlib.sha256(policy.read_bytes()).digest())
+
+
 KILLED_RUN = f"""
-import json, os, signal, sys, time
+import hashlib, json, os, signal, sys, time
 from pathlib import Path
+from deimos.run import clips
 from tensorboard.summary.writer.record_writer import RecordWriter
 from deimos.run import training
 from deimos.run.config import from_dict
 from deimos.run.trainer import TrainConfig
 
+{inspect.getsource(render)}
+clips.render = render
 killed, delay = int(sys.argv[3]), 0.0
 save, write = training.save, RecordWriter.write
 training.CHECKPOINT_SECONDS = -1.0
@@ -63,9 +75,11 @@ training.train(*training.start(config, Path(sys.argv[1])), report)
 
 
 @pytest.mark.parametrize("killed", [SAVED, KILLED])
-def test_tensorboard_has_every_iteration_once(killed, tmp_path):
+def test_tensorboard_has_every_iteration_once(killed, tmp_path, monkeypatch):
     """A run that was killed at once after a checkpoint, or later, and resumed has neither gap nor double step."""
-    path = tmp_path / "run"
+    monkeypatch.setattr(clips, "render", render)
+    path, whole = tmp_path / "run", tmp_path / "whole"
+    training.train(*training.start(replace(CONFIG, log=()), whole))
     arguments = [sys.executable, "-c", KILLED_RUN, str(path), json.dumps(to_dict(CONFIG)), str(killed)]
     assert subprocess.run(arguments, stderr=subprocess.DEVNULL).returncode == -signal.SIGKILL
     assert [int(row["iteration"]) for row in RunFolder(path).read_csv("progress.csv")] == [*range(1, killed + 1)]
@@ -77,12 +91,17 @@ def test_tensorboard_has_every_iteration_once(killed, tmp_path):
     for name in ("reward", "crashes", "fps"):
         assert [event.step for event in board.Scalars(name)] == [*range(1, END + 1)]
     assert [event.value for event in board.Scalars("reward")] == pytest.approx([float(row["reward"]) for row in rows])
+    shown = {event.step: event.encoded_image_string for event in board.Images("policy")}
+    assert [event.step for event in board.Images("policy")] == FILMED
+    assert shown == {number: clip.read_bytes() for number, clip in clips.clips(RunFolder(whole)).items()}
 
 
 class FakeWandb:
     """Weights & Biases as far as runs use it; offline a file for each process, online one history by identity."""
 
     Error = type("Error", (Exception,), {})
+
+    Video = staticmethod(lambda path: Path(path).read_bytes().hex())
 
     def __init__(self, offline):
         self.offline, self.history, self.files, self.began = offline, [], 0, []
@@ -124,6 +143,7 @@ def test_wandb_has_every_iteration_once(offline, tmp_path, monkeypatch):
     """A cut and resumed run has neither gap nor double step, offline nor online, whatever had been sent by then."""
     wandb = FakeWandb(offline)
     monkeypatch.setitem(sys.modules, "wandb", wandb)
+    monkeypatch.setattr(clips, "render", render)
     monkeypatch.setattr(training, "CHECKPOINT_SECONDS", -1.0)
     path = tmp_path / "run"
 
@@ -144,6 +164,9 @@ def test_wandb_has_every_iteration_once(offline, tmp_path, monkeypatch):
     rows = RunFolder(path).read_csv("progress.csv")
     assert [row["reward"] for row in wandb.history] == [float(row["reward"]) for row in rows]
     assert all(row["fps"] > 0 for row in wandb.history)
+    shown = {row["step"]: bytes.fromhex(row["policy"]) for row in wandb.history if "policy" in row}
+    assert shown == {number: clip.read_bytes() for number, clip in clips.clips(RunFolder(path)).items()}
+    assert list(shown) == FILMED
     identity = RunFolder(path).read_json("wandb.json")["id"]
     assert wandb.began == [(identity, CONFIG.seed)] * 2
     assert not [*path.glob("events.out.tfevents.*")]
@@ -180,7 +203,7 @@ def test_logs_are_known_by_their_names(tmp_path):
     """No log is a choice, one that is not there is refused, and a run without logs leaves no file of them."""
     with pytest.raises(ValueError, match="log must be one of tensorboard, wandb, got 'paper'"):
         TrainConfig(log=("tensorboard", "paper"))
-    trainer, folder = training.start(replace(CONFIG, log=()), tmp_path / "run")
+    trainer, folder = training.start(replace(CONFIG, log=(), video_every=0), tmp_path / "run")
     training.train(trainer, folder)
     assert training.read_config(folder).log == ()
     assert not [*folder.path.glob("events.out.tfevents.*")]

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from deimos.app import cli
-from deimos.app.drawing import BLUE, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing, with_caption
 from deimos.app.playback import PlayOptions
-from deimos.app.video import ENDINGS, pictures, video
 from deimos.checks import RunError
+from deimos.run.video import ENDINGS, pictures, video
+from deimos.sim.drawing import BLUE, ORANGE, OUTSIDE, PAPER, REACH, RED, Drawing, with_caption
 from deimos.sim.envs.particle import Config
 
 HOME = Path(__file__).parent.parent

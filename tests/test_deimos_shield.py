@@ -2,6 +2,7 @@
 
 import json
 import logging
+import pickle
 
 import numpy as np
 import pytest
@@ -157,6 +158,23 @@ def test_the_p_value_of_a_drift_is_scipys():
     found = stats.ks_2samp(recent, reference, method="asymp")
     assert shield.drift() == pytest.approx(2 * np.exp(-2 * found.statistic**2 * 200 * 1000 / 1200))
     assert shield.drift() == pytest.approx(found.pvalue, rel=0.1)  # SciPy minds how many there are
+
+
+def test_a_guard_counts_and_keeps_nothing():
+    """The share of refused goals is exact, NaN before the first, and memory does not grow with what is asked for."""
+    env, rows = FAST.build(4, CPU, seed=0), torch.arange(4)
+    guard = Guard(Shield(0.5, "stop", (0.0,) * 3, (1.0,) * 3), random_rule, candidates=1)
+    assert np.isnan(guard.refused)
+    sizes, refused = [], 0
+    for _ in range(20):
+        drawn = random_rule(env, rows, env.goal.unsqueeze(1))[:, 0]
+        refused += int((drawn >= 0.5).sum())
+        guard(env, rows, env.goal.clone())
+        sizes.append(len(pickle.dumps(guard)))
+        env.step(torch.zeros(4, 3))
+    assert 0 < refused < 80
+    assert guard.refused == refused / 80
+    assert sizes[-1] <= sizes[0] + 8  # an integer's digits
 
 
 def test_the_guard_has_the_last_word_and_the_asker_learns_of_the_asked():

@@ -19,19 +19,6 @@ from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.folder import StudyFolder
 
-STUDY = """
-seeds = 1
-methods = ["uniform", "p25"]
-[train]
-num_envs = 16
-env_steps = 960
-device = "cpu"
-ppo = { hidden = [8], epochs = 1 }
-eval = { worlds = 16, steps = 40, adversary_steps = 40 }
-[[environment]]
-name = "directional"
-env = { kind = "particle", variant = "directional", goal_period = 10, max_speed = 200.0, max_force = 200.0 }
-"""
 WORST = ("worst", "worst_attacker", "worst_interactions")  # they depend on who attacked
 LONG = {"attackers": ("argmax-long",), "allow_uncommitted": True}
 
@@ -62,10 +49,10 @@ plugins.register(selectors, "even", __name__)
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory):
+def file(tmp_path_factory, short_study):
     """The study in a TOML file."""
     path = tmp_path_factory.mktemp("toml") / "study.toml"
-    path.write_text(STUDY)
+    path.write_text(short_study(960))
     return path
 
 
@@ -268,12 +255,12 @@ def test_cells_of_another_commit_are_refused(whole, file, tmp_path):
     assert len(study.cells()) == 1
 
 
-def test_study_imports_its_plugins(tmp_path, monkeypatch, new_plugins):
+def test_study_imports_its_plugins(tmp_path, monkeypatch, new_plugins, short_study):
     """A selector of a module that the study names trains in its workers; with another source it is another cell."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my_selector.py").write_text(PLUGIN)
     file = tmp_path / "study.toml"
-    file.write_text('plugins = ["my_selector"]\n' + STUDY.replace('"uniform", "p25"', '"even"'))
+    file.write_text(short_study(960, methods=["even"], head='plugins = ["my_selector"]'))
     study = StudyFolder(tmp_path / "study")
     cli.RunOptions(folder=study.path, file=file, allow_uncommitted=True).run()
     assert {row["method"] for row in study.results().rows} == {"even"}
@@ -285,7 +272,7 @@ def test_study_imports_its_plugins(tmp_path, monkeypatch, new_plugins):
     (study.cell_path(cell) / "result.json").unlink()
     with pytest.raises(RunError, match="the file of 'my_selector' is not the one that it was made with"):
         worker.run(study, cell)
-    file.write_text('plugins = ["no_such_module"]\n' + STUDY)
+    file.write_text(short_study(960, head='plugins = ["no_such_module"]'))
     with pytest.raises(RunError, match="plugins: the module no_such_module cannot be imported"):
         plan.expand(plan.read(file))
 

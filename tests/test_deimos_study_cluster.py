@@ -19,26 +19,13 @@ from deimos.study import cli, on_ray, plan
 from deimos.study.folder import StudyFolder
 
 EXAMPLES = Path(__file__).parent.parent / "examples" / "cluster"
-STUDY = """
-seeds = 2
-methods = ["uniform"]
-audit_worlds = 0
-[train]
-num_envs = 16
-env_steps = 480
-device = "cpu"
-ppo = { hidden = [8], epochs = 1 }
-eval = { worlds = 16, steps = 40, adversary_steps = 40 }
-[[environment]]
-name = "directional"
-env = { kind = "particle", variant = "directional", goal_period = 10, max_speed = 200.0, max_force = 200.0 }
-"""
 
 
 @pytest.fixture
-def study(tmp_path):
+def study(tmp_path, short_study):
     """A study of two cells, none of which was begun."""
-    (tmp_path / "study.toml").write_text(STUDY)
+    text = short_study(480, seeds=2, methods=["uniform"], head="audit_worlds = 0")
+    (tmp_path / "study.toml").write_text(text)
     made = StudyFolder(tmp_path / "study")
     made.add(plan.expand(plan.read(tmp_path / "study.toml")))
     return made

@@ -24,19 +24,6 @@ from deimos.study.folder import StudyFolder
 from deimos.study.results import result
 from deimos.study.runner import Runner
 
-STUDY = """
-seeds = 1
-methods = ["uniform", "p25"]
-[train]
-num_envs = 16
-env_steps = 1920
-device = "cpu"
-ppo = { hidden = [8], epochs = 1 }
-eval = { worlds = 16, steps = 40, adversary_steps = 40 }
-[[environment]]
-name = "directional"
-env = { kind = "particle", variant = "directional", goal_period = 10, max_speed = 200.0, max_force = 200.0 }
-"""
 ITERATIONS = 80
 
 RUN = """
@@ -48,10 +35,10 @@ cli.RunOptions(folder=Path(sys.argv[1]), workers=2).run()
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory):
+def file(tmp_path_factory, short_study):
     """The study in a TOML file."""
     path = tmp_path_factory.mktemp("toml") / "study.toml"
-    path.write_text(STUDY)
+    path.write_text(short_study(1920))
     return path
 
 

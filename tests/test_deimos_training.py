@@ -1,7 +1,6 @@
-"""A run as a whole: killed, resumed, stopped, poisoned and out of disk; and what its files hold."""
+"""A run as a whole: killed, resumed, stopped, poisoned, out of disk, and begun with another's networks."""
 
 import errno
-import json
 import os
 import random
 import re
@@ -12,32 +11,23 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 import deimos
-from deimos import plugins
 from deimos.app import cli
 from deimos.checks import RunError, SimulationError
 from deimos.files import load_tensors
 from deimos.goals.fear import FearConfig
-from deimos.goals.methods import METHODS, method
-from deimos.goals.selector import SelectorConfig
-from deimos.goals.selectors import director, rnd, uniform
+from deimos.goals.selectors import director
 from deimos.learn.ppo import PPOConfig
-from deimos.learn.rollout import Rollout
-from deimos.nn.random import Purpose, normals
-from deimos.run import presets, training
-from deimos.run.config import from_dict, kind, to_dict
-from deimos.run.evaluation import EvalConfig
+from deimos.run import training
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
-from deimos.sim import envs
-from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
 
 HOME = Path(deimos.__file__).resolve().parent.parent
+
 
 # Fast particles that start anywhere and get a goal every 16 steps: some crash, some survive, and the fear network
 # learns from the first iterations on. Its window, 2 T, is longer than a rollout, so it too outlives a checkpoint.
@@ -52,12 +42,17 @@ CONFIG = TrainConfig(
     device="cpu",
     threads=1,
 )
+
+
 FLAGS = (
     "--num-envs 64 --env-steps 480 --seed 3 --threads 1 --device cpu --no-evaluation --ppo.hidden 16 16 "
     "--env.goal-period 16 --env.max-speed 40 --env.spawn-range 900 "
     "selector:director --selector.candidates 20 --selector.fear.min-per-class 4"
 ).split()
+
+
 EARLY = 5  # iterations after which everything that can be lost has been in use
+
 
 # The command line itself, with another time between checkpoints and a bound on the size of the files of iterations.
 DRIVER = """
@@ -233,61 +228,6 @@ def test_same_seed_same_run(undisturbed, tmp_path):
     assert_same_run(tmp_path / "same", undisturbed)
     run(replace(CONFIG, seed=4), tmp_path / "other", iterations=1)
     assert rows(tmp_path / "other")[0] != rows(undisturbed)[0]
-
-
-@pytest.mark.parametrize(
-    "selector",
-    [
-        method("p75"),
-        method("vds"),
-        rnd.Config(target=64, predictor=128, features=128),  # so large that torch shares out the weights' decomposition
-    ],
-    ids=kind,
-)
-def test_threads_change_no_number(selector, tmp_path, monkeypatch):
-    """On one thread and on several, all of which have work, ``progress.csv`` has the same bytes."""
-    monkeypatch.setattr("deimos.nn.cpu.MIN_OPERATIONS", 1.0)
-    config = replace(CONFIG, num_envs=1500, env_steps=48, selector=selector)
-    before, written = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 5):
-            run(replace(config, threads=threads), tmp_path / str(threads))
-            written.append((tmp_path / str(threads) / "progress.csv").read_bytes())
-    finally:
-        torch.set_num_threads(before)
-    assert written[0].count(b"\n") == 3
-    assert written[1] == written[2] == written[0]
-
-
-@pytest.mark.parametrize("name", ["p75", "rnd", "vds"])
-def test_the_hosts_default_dtype_changes_no_number(name):
-    """Where torch's default is float64, a trainer is built and learns in float32, with the same numbers."""
-    config, found = replace(CONFIG, selector=None, method=name), []
-    for dtype in (torch.float32, torch.float64):
-        torch.set_default_dtype(dtype)
-        try:
-            trainer = training.Trainer(config, torch.device("cpu"))
-            found.append([str(trainer.iterate()) for _ in range(4)])
-        finally:
-            torch.set_default_dtype(torch.float32)
-    assert found[0] == found[1]
-
-
-def test_seed_reaches_everything():
-    """The seed decides the weights of every network, their noise and order of learning, and the worlds and goals."""
-    one, other = (training.Trainer(replace(CONFIG, seed=seed), torch.device("cpu")) for seed in (3, 4))
-    for part in (
-        lambda trainer: trainer.ppo.actor.mean[0].weight,
-        lambda trainer: trainer.ppo.critic[0].weight,
-        lambda trainer: trainer.ppo.generator.get_state(),
-        lambda trainer: trainer.loop.selector.fear.network[0].weight,
-        lambda trainer: trainer.loop.selector.fear.generator.get_state(),
-        lambda trainer: trainer.env.tensors["position"],
-        lambda trainer: trainer.env.tensors["goal"],
-        lambda trainer: trainer.env.sample_goals(torch.arange(2), 3),
-        lambda trainer: trainer.env.draw(torch.arange(2)),
-    ):
-        assert not torch.equal(part(one), part(other))
 
 
 def poison_actor(trainer):
@@ -523,228 +463,3 @@ def test_init_from_refuses_another_size(undisturbed, tmp_path):
     with pytest.raises(RunError, match=r"do not fit this run: .*size mismatch"):
         training.start(config, tmp_path / "run", undisturbed)
     assert not (tmp_path / "run").exists()
-
-
-CONFIGS = {
-    **{f"method {name}": TrainConfig(method=name) for name in METHODS},
-    **{f"selector of {name}": TrainConfig(selector=method(name)) for name in METHODS},
-    "default": TrainConfig(),
-    "all else": TrainConfig(
-        env=particle.Config(
-            variant="relative", goal_period=7, max_speed=3.3, max_force=float("inf"), goal_range=0.1,
-            reward="reciprocal", reward_length=1e-3, spawn_range=999.0, time_limit=55, stagger_goals=True,
-            obs_scale="raw", crash_penalty=2.5,
-        ),
-        selector=director.Config(
-            percentile=33.3, rule="argmin", candidates=17, probe=0.05, control="shuffled", memory=3, gate=True,
-            fear=FearConfig(
-                hidden=(5,), activation="tanh", learning_rate=0.1, epochs=3, minibatches=2, min_per_class=2, workspace=3
-            ),
-        ),
-        ppo=PPOConfig(
-            num_steps=5, epochs=2, minibatches=3, learning_rate=1 / 3, desired_kl=0.0, discount=1.0, gae_lambda=0.0,
-            clip=0.1, clip_value=False, value_coef=0.5, entropy_coef=0.0, max_grad_norm=7.0, reward_scale=2.0,
-            hidden=(3, 2, 1), activation="elu", init_std=0.7, normalize_observations=True,
-        ),
-        eval=EvalConfig(
-            worlds=3, steps=99, seed=0, adversary_steps=4, attackers=("oracle",), oracle_worlds=2, pool=Path("pool.pt"),
-            fear=FearConfig(
-                hidden=(9, 9, 9), activation="elu", learning_rate=1.0, epochs=1, minibatches=1, min_per_class=9,
-                workspace=1,
-            ),
-        ),
-        evaluation=False, seed=2**32 - 1, num_envs=11, env_steps=13, critic_warmup=3, device="cpu",
-        threads=2, tf32=True, log=("wandb", "tensorboard"),
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", CONFIGS)
-def test_config_round_trips(tmp_path, name):
-    """A configuration comes back the same from config.json, infinity included."""
-    config = CONFIGS[name]
-    folder = RunFolder.create(tmp_path / "run")
-    folder.write_json("config.json", {"schema": training.SCHEMA, "config": to_dict(config)})
-    assert json.loads((folder.path / "config.json").read_text())["schema"] == training.SCHEMA
-    found = training.read_config(folder)
-    assert found == config
-    assert found.goals == config.goals
-    assert hash(found) == hash(config)  # lists have become tuples again
-
-
-def test_config_differs_from_the_default_in_every_field():
-    """The configuration that shall round-trip leaves no field at its default."""
-
-    def same(config, default, name):
-        if hasattr(config, "__dataclass_fields__") and type(config) is type(default):
-            for field in config.__dataclass_fields__:
-                yield from same(getattr(config, field), getattr(default, field), f"{name}.{field}")
-        elif config == default:
-            yield name
-
-    found = list(same(CONFIGS["all else"], replace(TrainConfig(), selector=director.Config()), ""))
-    assert found == [".method"]  # which excludes a selector
-
-
-@pytest.mark.parametrize(
-    ("cls", "data", "message"),
-    [
-        (TrainConfig, {"sed": 1}, "deimos.run.trainer.TrainConfig has no sed; it has: critic_warmup, device, env"),
-        (TrainConfig, {"env": {"kind": "moon"}}, "deimos.sim.envs has no 'moon'; it has: .*particle"),
-        (EnvConfig, {"variant": "relative"}, "deimos.sim.envs must name its 'kind'"),
-        (SelectorConfig, {"kind": "director", "percentile": 101}, r"percentile must be in \[0, 100\], got 101"),
-    ],
-)
-def test_config_refuses_what_it_does_not_know(cls, data, message):
-    """An unknown field, plugin or value in a stored configuration is named, not skipped."""
-    with pytest.raises(ValueError, match=message):
-        from_dict(cls, data)
-
-
-@pytest.mark.parametrize("obs_scale", ["unit", "raw"])
-@pytest.mark.parametrize("variant", ["absolute", "directional", "relative"])
-def test_policy_acts_as_the_actor_in_physical_units(tmp_path, variant, obs_scale):
-    """The saved policy does for physical observations what the actor does for the environment's, bounded alike."""
-    config = replace(
-        CONFIG, env=replace(CONFIG.env, variant=variant, obs_scale=obs_scale, max_force=0.3), selector=uniform.Config()
-    )
-    trainer = training.Trainer(config, torch.device("cpu"))
-    trainer.collect()
-    with torch.no_grad():  # so that about half of the actions are cut
-        size = trainer.ppo.actor(trainer.env.obs).abs().median()
-        for parameter in trainer.ppo.actor.mean[-1].parameters():
-            parameter *= 0.3 / size
-    training.save(trainer, RunFolder.create(tmp_path / "run"))
-    policy = deimos.load_policy(tmp_path / "run")
-
-    env, state = trainer.env, trainer.env.tensors
-    goal = state["goal"] - state["position"] if variant == "relative" else state["goal"]
-    physical = torch.cat([state["velocity"], state["position"], state["force"], goal], dim=1)
-    mean = trainer.ppo.actor(env.obs).detach()
-    expected = mean.clamp(-0.3, 0.3)
-    assert (mean != expected).any()  # some are cut
-    assert (mean == expected).any()  # and some are not
-    # Scaling back and forth costs a rounding or two of numbers up to 2250, seen through two layers.
-    torch.testing.assert_close(policy(physical), expected, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(policy.scaled(env.obs), expected, rtol=0, atol=1e-6)
-    assert policy.goal_slice == env.goal_slice
-    assert policy.layout == env.layout
-    assert [field.unit for field in policy.layout] == [
-        "u/step",
-        "u",
-        "u/step^2",
-        "u/step" if variant == "directional" else "u",
-    ]
-    assert policy.dt == env.dt
-    assert policy.action_bound == 0.3
-
-
-def test_policy_without_a_bound_is_not_cut(tmp_path):
-    """A policy trained without a bound on the force loads, and its actions are the actor's own."""
-    config = replace(CONFIG, env=replace(CONFIG.env, max_force=float("inf")))
-    trainer = training.Trainer(config, torch.device("cpu"))
-    trainer.ppo.actor.mean[-1].bias.data += 1e6
-    training.save(trainer, RunFolder.create(tmp_path / "run"))
-    policy = deimos.load_policy(tmp_path / "run" / "policy.pt")
-    assert (policy(torch.zeros(2, 12)) > 1e5).all()
-
-
-def test_missing_or_foreign_policy_is_refused(tmp_path):
-    """A folder without a policy, and a file that is none, raise RunError."""
-    with pytest.raises(RunError, match="There is no policy at"):
-        deimos.load_policy(tmp_path)
-    torch.save({"schema": 1, "layout": [], "actor": {}}, tmp_path / "policy.pt")
-    with pytest.raises(RunError, match="is not a policy of this version"):
-        deimos.load_policy(tmp_path)
-
-
-def test_what_led_to_an_invalid_state_is_left_out():
-    """Every transition of a world since its last reset gets weight 0 when the world breaks, and no other one."""
-    rollout = Rollout(5, 3, 12, 3, torch.device("cpu"))
-    rollout.terminated[1, 0] = True  # world 0 is reset after step 1 and breaks at step 3
-    rollout.invalid[3, 0] = rollout.truncated[3, 0] = True
-    rollout.invalid[0, 1] = rollout.truncated[0, 1] = True  # world 1 breaks at once
-    rollout.exclude_invalid()
-    expected = torch.tensor([[1, 1, 0, 0, 1], [0, 1, 1, 1, 1], [1, 1, 1, 1, 1]], dtype=torch.float32)
-    assert torch.equal(rollout.weight.t(), expected)
-
-
-def test_too_many_worlds_are_refused_before_memory_is_taken():
-    """The message says how much would be needed; nothing is allocated first, or the system would kill the process."""
-    with pytest.raises(
-        RunError, match=r"2000000000 worlds, each at least \d+ KiB, need more than [\d,]+ GiB of memory, .*use fewer"
-    ):
-        training.build(TrainConfig(num_envs=2_000_000_000), torch.device("cpu"))
-
-
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (RuntimeError("the engine has lost\nits map"), "^the engine has lost its map$"),
-        (SimulationError("qpos is not finite"), "^qpos is not finite$"),
-        (RuntimeError(), "^RuntimeError$"),
-        (ValueError("goal_period must be even"), "^goal_period must be even$"),
-        (MemoryError(), r"^64 worlds could not be allocated \(MemoryError\); use fewer"),
-        (RuntimeError("Failed to allocate 9 bytes on device 'cpu'"), r"^64 worlds could not be allocated \(Failed to"),
-        (RuntimeError("CUDA out of memory"), "^64 worlds could not be allocated"),
-        (ValueError("Maximum allowed dimension exceeded"), "^64 worlds could not be allocated"),
-    ],
-)
-def test_what_stops_a_run_from_being_built_is_named(monkeypatch, error, message):
-    """Only what is for want of memory is said to be; every other reason is given as it is, in one line."""
-
-    def fail(*arguments):
-        raise error
-
-    monkeypatch.setattr(particle.Config, "build", fail)
-    with pytest.raises(RunError, match=message):
-        training.build(CONFIG, torch.device("cpu"))
-
-
-def test_a_preset_is_a_training_configuration():
-    """Every environment has a preset of its own name, and every preset builds a configuration for its environment."""
-    for name in plugins.names(envs):
-        assert presets.environment(name) == name
-    for name in presets.names():
-        assert kind(presets.preset(name).env) == presets.environment(name)
-    with pytest.raises(ValueError, match=r"no preset 'nonsense'; there are: .*particle"):
-        presets.preset("nonsense")
-
-
-def test_exploration_is_addressed_by_world_and_step():
-    """The first rollout draws the noise of steps 0 to T - 1, the second goes on after it."""
-    trainer = training.Trainer(CONFIG, torch.device("cpu"))
-    steps, worlds = CONFIG.ppo.num_steps, torch.arange(CONFIG.num_envs)
-    for first in (0, steps):
-        trainer.iterate()
-        numbers = torch.arange(first, first + steps).unsqueeze(1)
-        expected = normals(CONFIG.seed, Purpose.EXPLORATION, worlds, numbers, 3)
-        assert torch.equal(trainer.rollout.noise, expected)
-
-
-def test_a_rollout_keeps_no_graph():
-    """What an environment or a caller hands over with gradients is recorded without."""
-    rollout = Rollout(2, 3, 4, 1, torch.device("cpu"))
-    wanting = torch.ones(3, requires_grad=True)
-    no, yes = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)
-    rollout.record(
-        0, obs=wanting.unsqueeze(1).expand(3, 4), reward=2 * wanting, terminated=no, truncated=yes, invalid=no,
-        weight=wanting, cut_off=torch.arange(3),
-    )  # fmt: skip
-    kept = [value for value in vars(rollout).values() if isinstance(value, torch.Tensor)]
-    assert not any(value.requires_grad for value in [*kept, *rollout.cut_off()])
-
-
-def test_a_run_leaves_all_global_streams_alone():
-    """Building, training and saving under selectors with networks moves neither torch's nor NumPy's global stream."""
-    before = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
-    for name in ("p75", "rnd", "vds"):
-        config = TrainConfig(
-            env=particle.Config(goal_period=4), method=name, ppo=PPOConfig(hidden=(8,)), num_envs=16, evaluation=False
-        )
-        trainer = training.Trainer(config, torch.device("cpu"))
-        for _ in range(2):
-            trainer.iterate()
-        trainer.load_state_dict(trainer.state_dict())
-    assert torch.equal(torch.get_rng_state(), before[0])
-    assert str(np.random.get_state()) == str(before[1])  # noqa: NPY002

@@ -20,6 +20,8 @@ from deimos.app.viewer_session import BY_HAND, SIDE, UNIFORM, FearMap, Session, 
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy, save_policy
 from deimos.nn.layout import ObsField, goal_components
+from deimos.run import saved
+from deimos.run.fear import load_fear
 from deimos.run.saved import SavedRun
 from deimos.sim.envs.particle import Config
 
@@ -86,12 +88,16 @@ def test_a_goal_by_hand_stays(scared):
     assert session.goal != pytest.approx([20.0, -30.0, 10.0])
 
 
-def test_the_shield_looks_at_every_goal(scared, tmp_path):
-    """What the run's shield refuses, by whomever it was asked for, the policy does not get, and it is counted."""
+def test_the_shield_looks_at_every_goal(scared, tmp_path, monkeypatch):
+    """What the run's shield refuses, by whomever it was asked for, the policy does not get; each file is read once."""
     path = Path(shutil.copytree(scared, tmp_path / "run"))
     small = "--alpha 0.3 --worlds 3000 --attackers scripted --eval.worlds 16 --eval.steps 100 --alphas 0.3 --device cpu"
     assert cli.main(["shield", str(path), *small.split()]) == 0
+    read = []
+    monkeypatch.setattr(saved, "load_policy", lambda path: read.append("policy") or load_policy(path))
+    monkeypatch.setattr(saved, "load_fear", lambda *run: read.append("fear") or load_fear(*run))
     session = Session(SavedRun.open(path), 3, seed=5, shield="stop")
+    assert sorted(read) == ["fear", "policy"]
     corners = [[x, y, z] for x in (-200.0, 200.0) for y in (-200.0, 200.0) for z in (-200.0, 200.0)]
     for goal, refused in ((min(corners, key=session.risk), 0.0), (max(corners, key=session.risk), 0.5)):
         session.ask(goal)

@@ -11,13 +11,13 @@ import tyro
 from deimos import plugins
 from deimos.app import console
 from deimos.app.console import number, table
-from deimos.app.drawing import with_caption
-from deimos.app.playback import choose_renderer, rendering
 from deimos.checks import RunError
 from deimos.files import write_whole
+from deimos.sim.drawing import with_caption
 from deimos.sim.legged import mjcf, robot_draft, robot_file, robots
 from deimos.sim.legged.robot_check import LEGS, PARTS, SECONDS, Report, check_robot
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, Robot
+from deimos.sim.rendering import choose_renderer, renderer
 
 if TYPE_CHECKING:
     import mujoco
@@ -149,20 +149,17 @@ def _draw(path: Path, robot: Robot, report: Report) -> None:
         raise RunError(f"picture must end in .png, got {path}.")
     model, data = report.physics.model, report.physics.to_mujoco(0)
     _colour(model, robot)
-    model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
     camera = mujoco.MjvCamera()
     camera.azimuth, camera.elevation, camera.distance = 130.0, -18.0, SEEN * robot.standing_height
     camera.lookat[:] = *data.qpos[:2], robot.standing_height / 2
     views = []
-    with rendering():
-        renderer = mujoco.Renderer(model, SIZE, SIZE)
-    with renderer:
+    with renderer(model, SIZE, SIZE) as drawn:
         for group, text in ((VISUAL_GROUP, "looks"), (COLLISION_GROUP, "collides: base red, feet green, limbs blue")):
             shown = mujoco.MjvOption()
             shown.geomgroup[:] = [1, 1, 0, 0, 0, 0]  # the ground's
             shown.geomgroup[group] = 1
-            renderer.update_scene(data, camera, shown)
-            views.append(with_caption(renderer.render(), text))
+            drawn.update_scene(data, camera, shown)
+            views.append(with_caption(drawn.render(), text))
     write_whole(path, lambda file: Image.fromarray(np.hstack(views)).save(file, "PNG"))
 
 

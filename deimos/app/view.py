@@ -13,10 +13,8 @@ import numpy as np
 import tyro
 
 from deimos.app import console
-from deimos.app.drawing import with_caption
 from deimos.app.findings import percent
-from deimos.app.playback import LARGEST, choose_renderer, rendering
-from deimos.app.video import video
+from deimos.app.playback import LARGEST
 from deimos.app.viewer_panel import Moment, Panel
 from deimos.app.viewer_scene import Scene, build_scene, palette, shades
 from deimos.app.viewer_session import UNIFORM, Session, prepare
@@ -25,6 +23,9 @@ from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.goals.shield import Mode
 from deimos.run.attack import names as attacker_names
 from deimos.run.saved import SavedRun
+from deimos.run.video import video
+from deimos.sim.drawing import with_caption
+from deimos.sim.rendering import choose_renderer, load_renderer, renderer
 
 PATIENCE = 1.0  # [s] between two looks at whether the run has written a checkpoint
 SIDE_OF_MAP = 0.3  # of a picture's height, in its corner
@@ -93,8 +94,7 @@ def main(arguments: list[str], program: str) -> None:
     console.quiet_warp()
     if options.record:
         choose_renderer()
-        with rendering():
-            import mujoco  # noqa: F401 (it decides now how it will render)
+        load_renderer()
     run = SavedRun.open(options.run, options.goal_period, options.terrain)
     check_port(options.port)  # attackers learn for minutes
     with console.progress("attackers learn") as report:
@@ -185,25 +185,23 @@ def _stride(session: Session, fps: float) -> int:
 def _recorder(session: Session, scene: Scene, options: ViewOptions) -> Iterator[Callable[[Moment], object]]:
     """Gives what writes a moment into the video: the scene, its caption, and the map of fear in a corner."""
     assert options.record is not None
-    with rendering():
-        import mujoco
+    import mujoco
 
-        scene.model.vis.global_.offwidth, scene.model.vis.global_.offheight = options.width, options.height
-        renderer = mujoco.Renderer(scene.model, options.height, options.width)
     camera, colours = mujoco.MjvCamera(), np.round(255 * palette()).astype(np.uint8)
     camera.distance, camera.azimuth, camera.elevation = scene.distance, 130.0, scene.elevation
     fps = 1.0 / (_stride(session, options.fps) * session.seconds_per_step)
-    with renderer, video(options.record, (options.width, options.height), fps) as send:
+    size = (options.width, options.height)
+    with renderer(scene.model, *size) as drawn, video(options.record, size, fps) as send:
 
         def write(moment: Moment) -> None:
             camera.lookat[:] = scene.data.xpos[scene.body]
-            renderer.update_scene(scene.data, camera)
-            room = renderer.scene.geoms[renderer.scene.ngeom : renderer.scene.maxgeom]
+            drawn.update_scene(scene.data, camera)
+            room = drawn.scene.geoms[drawn.scene.ngeom : drawn.scene.maxgeom]
             for slot, geom in zip(room, moment.shapes, strict=False):
                 mujoco.mjv_initGeom(slot, geom.type, np.zeros(3), np.zeros(3), np.eye(3).ravel(), geom.rgba)
                 slot.size, slot.pos, slot.mat = geom.size, geom.pos, geom.mat
-                renderer.scene.ngeom += 1
-            picture = renderer.render().copy()
+                drawn.scene.ngeom += 1
+            picture = drawn.render().copy()
             if moment.fear is not None:
                 inset = colours[shades(moment.fear)[::-1]]
                 times = max(1, round(SIDE_OF_MAP * options.height / len(inset)))

@@ -14,8 +14,10 @@ from deimos.goals.shield import Mode
 from deimos.nn.layout import goal_components
 from deimos.run.attack import Attack, argmax_director, attacker, uniform_goals
 from deimos.run.evaluation import make_target
+from deimos.run.film import seconds_per_step
 from deimos.run.loop import GoalLoop
 from deimos.run.saved import SavedRun
+from deimos.run.shield import stored_guard
 from deimos.sim.env import Env
 
 UNIFORM, BY_HAND = "uniform", "by hand"
@@ -122,7 +124,9 @@ class Session:
         choices |= {name: attack.selector(self.env) for name, attack in self._attacks.items()}
         self.goals = Steered(choices)
         self.goals.current, self.goals.own = current if current in (*choices, BY_HAND) else UNIFORM, own
-        self._guard = self._run.guard(self.env, self._shield) if self._shield else None
+        self._guard = None
+        if self._shield:
+            self._guard = stored_guard(self._run.folder, self._policy, self.env, trained, self._shield)
         self._loop = GoalLoop(self.env, self.goals, guard=self._guard)
 
     def _stamps(self) -> list[tuple[int, int]]:
@@ -149,7 +153,7 @@ class Session:
     @property
     def seconds_per_step(self) -> float:
         """Duration of a step as it is shown [s]: 1/50 where the world has no seconds."""
-        return self.env.dt if self.env.has_seconds else 0.02
+        return seconds_per_step(self.env)
 
     def choose(self, name: str) -> None:
         """Have somebody else choose the goals, from the next one on; by hand it begins with the active one.

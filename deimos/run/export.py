@@ -19,17 +19,17 @@ from torch import Tensor
 from deimos.checks import RunError
 from deimos.files import write_whole
 from deimos.goals.fear_selector import FearSelector
-from deimos.learn.policy import Policy, load_policy
+from deimos.learn.policy import Policy
 from deimos.nn.layout import ObsField, goal_components
 from deimos.nn.threads import torch_on_one
 from deimos.run import export_controller, export_onnx, export_robot, export_unitree
 from deimos.run.config import kind
 from deimos.run.evaluation import weights_hash
-from deimos.run.fear import load_fear
 from deimos.run.folder import RunFolder
+from deimos.run.saved import SavedRun
 from deimos.run.shield import read_shield
 from deimos.run.trainer import TrainConfig
-from deimos.run.training import provenance, read_config
+from deimos.run.training import provenance
 from deimos.sim.env import Env
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.task import Locomotion
@@ -54,25 +54,17 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
     Raises:
         RunError: If ``out`` exists, the run is broken, or something cannot be written.
     """
-    config = read_config(folder)
-    policy = load_policy(folder.path)
-    try:
-        steps = STEPS
-        if isinstance(config.env, LocomotionConfig):
-            steps = round(SECONDS / config.env.physics.control_period)
-        env_config = config.env.for_evaluation().resolved(torch.device("cpu"))
-        env = env_config.with_goal_period(steps).build(ROBOTS, torch.device("cpu"), config.eval.seed)
-    except ValueError as error:
-        raise RunError(str(error)) from error
-    if policy.layout != env.layout:
-        raise RunError(f"The policy of {folder.path} observes other things than its environment: {policy.layout}.")
-    afraid = load_fear(folder, config, env)
+    run, steps = SavedRun.open(folder.path), STEPS
+    if isinstance(run.config.env, LocomotionConfig):
+        steps = round(SECONDS / run.config.env.physics.control_period)
+    env = SavedRun.open(folder.path, goal_period=steps).build(ROBOTS, run.config.eval.seed, 0)
+    policy, afraid = run.policy(env), run.fear(env)
     try:
         out.mkdir(parents=True)
     except FileExistsError as error:
         raise RunError(f"{out} exists and is not overwritten; choose another folder.") from error
     try:
-        _write(folder, config, policy, env, afraid, out)
+        _write(folder, run.config, policy, env, afraid, out)
         if check:
             facts = _play(env, policy, afraid, steps)
             write_whole(out / "check.npz", lambda file: np.savez(file, **facts))  # type: ignore[arg-type]

@@ -1,28 +1,33 @@
 """Where the numbers of a run are shown while it trains: ``--log tensorboard wandb``.
 
 ``progress.csv`` and ``timing.csv`` are what a run is known by; these are views of them. A run that was killed has said
-things that the resumed one says again: each log says below how it comes to have every iteration once.
+things that the resumed one says again: each log says below how it comes to have every iteration once. A clip of the
+policy (``deimos.run.clips``) stands among the numbers of its iteration.
 """
 
 import re
 import shutil
+import struct
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any, Protocol
 
 from deimos.checks import RunError, one_line
+from deimos.run.clips import clips
 from deimos.run.folder import RunFolder
 
+VIDEO = "policy"  # what clips are called in the logs
 WANDB = "wandb.json"  # in a run's folder: the name of the run among those of Weights & Biases
 
 
 class Log(Protocol):
     """Where numbers are shown."""
 
-    def write(self, iteration: int, row: dict[str, float]) -> None:
-        """Show what an iteration has given."""
+    def write(self, iteration: int, row: dict[str, float], clip: Path | None) -> None:
+        """Show what an iteration has given: its numbers, and a GIF where one was made."""
 
     def flush(self) -> None:
         """Make what was written survive a kill: called before every checkpoint."""
@@ -49,10 +54,17 @@ class TensorBoard:
         self._board = SummaryWriter(str(folder.path), purge_step=iteration + 1)
         self.flush, self.close = self._board.flush, self._board.close
 
-    def write(self, iteration: int, row: dict[str, float]) -> None:
+    def write(self, iteration: int, row: dict[str, float], clip: Path | None) -> None:
         """See ``Log.write``."""
         for name, value in row.items():
             self._board.add_scalar(name, value, iteration)
+        if clip is not None:  # as ``SummaryWriter.add_video`` does, which encodes by moviepy
+            from tensorboard.compat.proto.summary_pb2 import Summary
+
+            data = clip.read_bytes()
+            width, height = struct.unpack("<HH", data[6:10])  # GIF's header
+            image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=data)
+            self._board.file_writer.add_summary(Summary(value=[Summary.Value(tag=VIDEO, image=image)]), iteration)
 
 
 class WeightsAndBiases:
@@ -66,6 +78,7 @@ class WeightsAndBiases:
     def __init__(self, folder: RunFolder, facts: dict[str, Any], iteration: int) -> None:
         import wandb
 
+        self._video = wandb.Video
         if not (folder.path / WANDB).exists():
             folder.write_json(WANDB, {"id": uuid.uuid4().hex[:16]})
         stored = folder.read_json(WANDB)
@@ -84,15 +97,16 @@ class WeightsAndBiases:
                 f"Weights & Biases cannot be reached ({one_line(error)}); log in by `wandb login`, or set "
                 f"WANDB_MODE=offline and send the run by `wandb sync` later."
             ) from error
-        fps = {row["iteration"]: row["fps"] for row in folder.read_csv("timing.csv")}
+        fps, made = {row["iteration"]: row["fps"] for row in folder.read_csv("timing.csv")}, clips(folder)
         for row in folder.read_csv("progress.csv"):
             known = {name: float(cell) for name, cell in (row | {"fps": fps.get(row["iteration"], "")}).items() if cell}
             if self._run.step <= int(row["iteration"]) <= iteration:
-                self.write(int(row["iteration"]), known)
+                self.write(int(row["iteration"]), known, made.get(int(row["iteration"])))
 
-    def write(self, iteration: int, row: dict[str, float]) -> None:
+    def write(self, iteration: int, row: dict[str, float], clip: Path | None) -> None:
         """See ``Log.write``."""
-        self._run.log(row, step=iteration, commit=True)
+        video = {VIDEO: self._video(str(clip))} if clip else {}
+        self._run.log(row | video, step=iteration, commit=True)
 
     def flush(self) -> None:
         """See ``Log.flush``; there is nothing to do."""
@@ -114,10 +128,10 @@ class Logs:
     def __init__(self, logs: list[Log]) -> None:
         self._logs = logs
 
-    def write(self, iteration: int, row: dict[str, float]) -> None:
+    def write(self, iteration: int, row: dict[str, float], clip: Path | None) -> None:
         """See ``Log.write``."""
         for log in self._logs:
-            log.write(iteration, row)
+            log.write(iteration, row, clip)
 
     def flush(self) -> None:
         """See ``Log.flush``."""

@@ -7,11 +7,9 @@ import torch
 
 from deimos.checks import RunError
 from deimos.goals.fear_selector import FearSelector
-from deimos.goals.shield import Mode
 from deimos.learn.policy import Policy, load_policy
 from deimos.run.fear import load_fear
 from deimos.run.folder import RunFolder
-from deimos.run.shield import Guard, stored_guard
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import load_checkpoint, read_config
 from deimos.sim.env import Env
@@ -37,15 +35,18 @@ class SavedRun:
             terrain: What robots stand on; ``None`` for the ground of the training.
 
         Raises:
-            RunError: If it is no run, or has no robots to put on a terrain.
+            RunError: If it is no run, has no robots to put on a terrain, or has no such T.
         """
         folder = RunFolder.open(path)
         config = read_config(folder)
-        env = config.env.for_evaluation().with_goal_period(goal_period or config.env.goal_period)
-        if terrain is not None:
-            if not isinstance(env, LocomotionConfig):
-                raise RunError(f"terrain is for legged robots; {path} is a run of another environment.")
-            env = replace(env, terrain=terrain)
+        try:
+            env = config.env.for_evaluation().with_goal_period(goal_period or config.env.goal_period)
+            if terrain is not None:
+                if not isinstance(env, LocomotionConfig):
+                    raise RunError(f"terrain is for legged robots; {path} is a run of another environment.")
+                env = replace(env, terrain=terrain)
+        except ValueError as error:
+            raise RunError(str(error)) from error
         return cls(folder, replace(config, env=env))
 
     @property
@@ -88,14 +89,6 @@ class SavedRun:
             return self.config.env.build(num_envs, torch.device("cpu"), seed, world)
         except ValueError as error:
             raise RunError(str(error)) from error
-
-    def guard(self, env: Env, mode: Mode) -> Guard:
-        """The shield that was made for the run, in the loop of its worlds.
-
-        Raises:
-            RunError: If the run has none that fits.
-        """
-        return stored_guard(self.folder, self.policy(env), env, self.fear(env), mode)
 
     def fear(self, env: Env) -> FearSelector | None:
         """The selector with the fear network that the run has learnt by now, if it has one."""

@@ -156,9 +156,7 @@ class Guard:
 
     def __init__(self, shield: Shield, rule: Rule, candidates: int) -> None:
         self._shield, self._rule, self._candidates = shield, rule, candidates
-        self._refused: list[Tensor] = []
-        self.scores: list[Tensor] = []
-        """Scores of the goals that were asked for, one tensor for every step with any."""
+        self._asked, self._refused = 0, torch.zeros((), dtype=torch.int64)
 
     def __call__(self, env: Env, rows: Tensor, goal: Tensor) -> Tensor:
         """The goals that the listed worlds get."""
@@ -166,14 +164,14 @@ class Guard:
         made = self._shield.choose(
             lambda goals: self._rule(env, rows, goals), env.goal[rows], goal.detach(), candidates
         )
-        self._refused.append(made.refused)
-        self.scores.append(made.score)
+        self._asked += len(rows)
+        self._refused = self._refused.to(env.device) + made.refused.sum()  # read when somebody asks: that synchronises
         return made.goal
 
     @property
     def refused(self) -> float:
         """Share of the goals that were refused; NaN before the first."""
-        return torch.cat(self._refused).float().mean().item() if self._refused else float("nan")
+        return self._refused.item() / self._asked if self._asked else float("nan")
 
 
 class Trial:
@@ -268,10 +266,15 @@ class Trial:
 
     def _scores(self, rule: Rule) -> Tensor:
         """What a rule makes of uniform goals that nobody refuses, shape (n,)."""
-        env, guard = self._target.build(self._eval.worlds, self._eval.seed), self._guard(rule, float("inf"))()
+        env, scores = self._target.build(self._eval.worlds, self._eval.seed), []
+
+        def note(env: Env, rows: Tensor, goal: Tensor) -> Tensor:
+            scores.append(rule(env, rows, goal.unsqueeze(1)).squeeze(1))
+            return goal
+
         report = partial(self._progress, "baseline")
-        play(env, self._target.policy, uniform_goals(env), self._eval.steps, report, guard=guard)
-        return torch.cat(guard.scores)
+        play(env, self._target.policy, uniform_goals(env), self._eval.steps, report, guard=note)
+        return torch.cat(scores)
 
     def measure(self, shield: str, guard: Callable[[], Guard] | None, attackers: Sequence[str]) -> list[dict[str, Any]]:
         """Try a shield under Naive and under attackers, which learn with it in their worlds.

@@ -59,13 +59,17 @@ class TrainConfig:
     """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
     log: tuple[str, ...] = ("tensorboard",)
     """Where its numbers are shown while it trains: tensorboard, wandb (Weights & Biases), both or nowhere."""
+    video_every: int = 0
+    """Iterations from one video of the policy to the next, at least 0; 0 makes none. Each goes to ``videos`` in the
+    run's folder and into its logs, and takes some seconds, in which the training waits."""
     critic_warmup: int = 0
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 
     def __post_init__(self) -> None:
         check_at_least("num_envs", self.num_envs, 1)
         check_at_least("env_steps", self.env_steps, 1)
-        check_at_least("critic_warmup", self.critic_warmup, 0)
+        for name in ("critic_warmup", "video_every"):
+            check_at_least(name, getattr(self, name), 0)
         check_range("threads", self.threads, 0, MOST_THREADS)
         check_device("device", self.device)
         for name in self.log:

@@ -20,6 +20,7 @@ from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.nn import ranks
 from deimos.run import memory
 from deimos.run.branch import check_branch
+from deimos.run.clips import Camera, cut_clips
 from deimos.run.config import from_dict, kind, to_dict, with_plain_numbers
 from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
@@ -308,12 +309,15 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     with ranks.together():
         check_finite(trainer)
     state = {"schema": CHECKPOINT_SCHEMA, "ranks": ranks.place().size, **trainer.state_dict()}
-    ppo, env = trainer.config.ppo, trainer.env
-    policy = Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt)
     with ranks.together():
         if ranks.place().first:
             save_tensors(folder.path / "checkpoint.pt", state)
-            save_policy(folder.path / "policy.pt", policy)
+            _save_policy(trainer, folder.path / "policy.pt")
+
+
+def _save_policy(trainer: Trainer, path: Path) -> None:
+    ppo, env = trainer.config.ppo, trainer.env
+    save_policy(path, Policy(trainer.ppo.actor, ppo.hidden, ppo.activation, env.layout, env.action_bound, env.dt))
 
 
 def train(
@@ -322,9 +326,10 @@ def train(
 ) -> bool:  # fmt: skip
     """Run all iterations that are left, and return whether the budget was used up.
 
-    Rows of later iterations that the folder has are written again. Meanwhile no other process can train the run. After
-    every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true ends the
-    run early, with a checkpoint. Where several ranks share a run, the first one writes and reports, and any may end it.
+    Rows and clips of later iterations that the folder has are made again. Meanwhile no other process can train the run.
+    After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true
+    ends the run early, with a checkpoint. Where several ranks share a run, the first one writes and reports, and any
+    may end it.
 
     Raises:
         SimulationError: If a number is not finite; the last checkpoint is intact, and ``failure.json`` has the details.
@@ -343,13 +348,15 @@ class _Writer:
 
     folder: RunFolder
     logs: Logs
+    camera: Camera
     report: Callable[[dict[str, float], float], None]
 
-    def add(self, row: dict[str, float], timing: dict[str, float]) -> None:
-        """Write and show an iteration."""
+    def add(self, trainer: Trainer, row: dict[str, float], timing: dict[str, float]) -> None:
+        """Write and show the iteration that ``trainer`` has just ended."""
         self.folder.append_csv("progress.csv", row)
         self.folder.append_csv("timing.csv", timing)
-        self.logs.write(int(row["iteration"]), row | {"fps": timing["fps"]})
+        clip = self.camera.after(trainer.iteration, partial(_save_policy, trainer))
+        self.logs.write(trainer.iteration, row | {"fps": timing["fps"]}, clip)
         self.report(row, timing["fps"])
 
 
@@ -357,11 +364,12 @@ class _Writer:
 def _writer(
     trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None]
 ) -> Iterator[_Writer]:  # fmt: skip
-    """Open a run's tables and logs; rows that it is about to write again are dropped."""
+    """Open a run's tables and logs; rows and clips that it is about to make again are dropped."""
     for name in ("progress.csv", "timing.csv"):
         folder.cut_csv(name, trainer.iteration)
+    cut_clips(folder, trainer.iteration)
     with open_logs(trainer.config.log, folder, to_dict(trainer.config), trainer.iteration) as logs:
-        yield _Writer(folder, logs, report)
+        yield _Writer(folder, logs, Camera(folder, trainer.config.video_every), report)
 
 
 def _iterate(trainer: Trainer, folder: RunFolder, writer: _Writer | None, stopped: Callable[[], bool]) -> bool:
@@ -383,7 +391,7 @@ def _iterate(trainer: Trainer, folder: RunFolder, writer: _Writer | None, stoppe
         spent = {name: seconds - before[name] for name, seconds in trainer.seconds.items()}
         with ranks.together():
             if writer is not None:
-                writer.add(row, {"iteration": trainer.iteration, "fps": fps, **spent})
+                writer.add(trainer, row, {"iteration": trainer.iteration, "fps": fps, **spent})
             wanted = stopped(), time.monotonic() - saved > CHECKPOINT_SECONDS
         stop, checkpoint = ranks.largest(*wanted)
         if stop:
