@@ -185,6 +185,12 @@ def test_an_attacker_can_choose_and_lends_its_fear(scared, tmp_path):
     assert chosen >= np.mean([session.risk((goal / session._scale).tolist()) for goal in uniform])
 
 
+def test_goals_may_last_longer_than_an_evaluation(scared):
+    """T may be whatever one wants to watch: that the run was evaluated for fewer steps is no matter."""
+    steps = SavedRun.open(scared).config.eval.steps
+    assert session_of(scared, goal_period=steps).env.goal_period == steps
+
+
 def test_reset_and_world(scared):
     """Reset counts anew; another world is the one that a session of that number begins with, goals and all."""
     session = session_of(scared)

@@ -70,6 +70,7 @@ ELSEWHERE = {
     r"deimos export docs/.* --check|python deploy/go1/|python examples/deploy/": "tests/test_deimos_export.py",
     r"pip install 'deimos-rl\[|ray start |.* --engine ray": ".ci/check_ray.py; Ray is in no environment of the tests",
     r"sbatch ": "tests/test_deimos_study_cluster.py, without Slurm",
+    r"first=\$\(scontrol |srun torchrun ": "nowhere: it needs Slurm; torchrun is in tests/test_deimos_ranks.py",
     r"deimos doctor --gpu |deimos train --device cuda": "tests/test_deimos_doctor.py, on a CPU",
     r"reproduction/freeze ": "tests/test_reproduction_studies.py, in a repository of its own",
 }
@@ -130,7 +131,7 @@ class Session:
         self.write(
             Block("toml", (folder / "examples" / "study.toml").read_text(encoding="utf-8")), "examples/study.toml"
         )
-        for name in ("quad_flat", "quad_rough_walk", "quad_arm_stand"):
+        for name in ("quad_flat", "quad_rough_walk", "quad_arm_reach"):
             shutil.copytree(DOCS / "results" / name, folder / "docs" / "results" / name)
         monkeypatch.chdir(folder)
         monkeypatch.syspath_prepend(str(folder))
@@ -171,6 +172,8 @@ class Session:
             self.deimos(arguments)
         elif (program, arguments[0]) == ("python", "train.py"):
             self.deimos(["train", *arguments[1:]])
+        elif program == "torchrun":  # tests/test_deimos_ranks.py runs several; here it is one process
+            self.deimos(["train", *arguments[arguments.index("train.py") + 1 :]])
         else:
             raise AssertionError(f"{line}: nothing runs this")
 

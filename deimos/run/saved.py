@@ -47,7 +47,7 @@ class SavedRun:
                 env = replace(env, terrain=terrain)
         except ValueError as error:
             raise RunError(str(error)) from error
-        return cls(folder, replace(config, env=env))
+        return cls(folder, replace(config, env=env, evaluation=False))  # whose steps were for the training's T
 
     @property
     def has_robots(self) -> bool:
