@@ -10,42 +10,12 @@ from deimos.kernels.legged.height_scan import scan_points
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import COLUMNS
 from deimos.kernels.random import Purpose
+from quad_worlds import actions, build, build_loop, mask_of, rows_of
 
-from deimos.goals.selectors import uniform
-from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.envs.quad import Config
 from deimos.sim.legged import robots
 
 POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)
-
-
-def build(device, num_envs=6, seed=0, env_offset=0, **config):
-    """An environment with short goals and episodes unless told otherwise."""
-    config = Config(**({"goal_period": 5, "episode_steps": 40, "engine": "warp"} | config))
-    return config.build(num_envs, device, seed, env_offset)
-
-
-def build_loop(env, candidates=3):
-    """A loop with uniform goals."""
-    return GoalLoop(env, uniform.Config(candidates=candidates).build(spaces(env), seed=0))
-
-
-def actions(num_envs, device, seed=0, scale=0.6):
-    """Constant actions, other for every world: some robots fall early, some late."""
-    a = np.random.default_rng(seed).normal(scale=scale, size=(num_envs, 12))
-    return torch.tensor(a, dtype=torch.float32, device=device)
-
-
-def rows_of(env, *rows):
-    """Rows as an environment takes them; all of them if none is given."""
-    return torch.tensor(rows or range(env.num_envs), dtype=torch.int64, device=env.device)
-
-
-def mask_of(env, *rows):
-    """A mask of the listed worlds."""
-    mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
-    mask[list(rows)] = True
-    return mask
 
 
 def test_observation_is_legged_gyms(torch_device):

@@ -13,43 +13,13 @@ from deimos.kernels.legged.step import evaluate_step
 from deimos.terrain import Grid, Share
 from deimos.terrain.shapes.flat import Shape as Flat
 from deimos.terrain.shapes.stairs import Shape as Stairs
+from quad_worlds import actions, build, build_loop, mask_of, rows_of
 
 import deimos
 from deimos import terrain
-from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
-from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.envs.quad import Config
-
-
-def build(device, num_envs=6, seed=0, **config):
-    """An environment with short goals and episodes unless told otherwise."""
-    config = Config(**({"goal_period": 5, "episode_steps": 40, "engine": "warp"} | config))
-    return config.build(num_envs, device, seed)
-
-
-def build_loop(env, candidates=3):
-    """A loop with uniform goals."""
-    return GoalLoop(env, uniform.Config(candidates=candidates).build(spaces(env), seed=0))
-
-
-def actions(num_envs, device, seed=0, scale=0.6):
-    """Constant actions, other for every world: some robots fall early, some late."""
-    a = np.random.default_rng(seed).normal(scale=scale, size=(num_envs, 12))
-    return torch.tensor(a, dtype=torch.float32, device=device)
-
-
-def rows_of(env, *rows):
-    """Rows as an environment takes them; all of them if none is given."""
-    return torch.tensor(rows or range(env.num_envs), dtype=torch.int64, device=env.device)
-
-
-def mask_of(env, *rows):
-    """A mask of the listed worlds."""
-    mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
-    mask[list(rows)] = True
-    return mask
 
 
 def test_levels_follow_the_tracking(torch_device, hills):

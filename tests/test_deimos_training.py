@@ -13,35 +13,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from short_training import CONFIG
 
 import deimos
 from deimos.app import cli
 from deimos.checks import RunError, SimulationError
 from deimos.files import load_tensors
-from deimos.goals.fear import FearConfig
-from deimos.goals.selectors import director
-from deimos.learn.ppo import PPOConfig
 from deimos.run import training
 from deimos.run.folder import RunFolder
-from deimos.run.trainer import TrainConfig
-from deimos.sim.envs import particle
 
 HOME = Path(deimos.__file__).resolve().parent.parent
-
-
-# Fast particles that start anywhere and get a goal every 16 steps: some crash, some survive, and the fear network
-# learns from the first iterations on. Its window, 2 T, is longer than a rollout, so it too outlives a checkpoint.
-CONFIG = TrainConfig(
-    env=particle.Config(goal_period=16, max_speed=40.0, spawn_range=900.0),
-    selector=director.Config(candidates=20, fear=FearConfig(min_per_class=4)),
-    ppo=PPOConfig(hidden=(16, 16)),
-    evaluation=False,
-    seed=3,
-    num_envs=64,
-    env_steps=480,
-    device="cpu",
-    threads=1,
-)
 
 
 FLAGS = (
