@@ -151,7 +151,8 @@ class FearSelector(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
-        (issued,) = largest(int(torch.as_tensor(self._issued).any()))
+        counted = self._issued
+        (issued,) = largest(int(counted.any()) if isinstance(counted, Tensor) else counted)
         self._issued = 0
         chosen = float(self.afraid) if issued else math.nan  # it has not changed since the last time
         window = interactions.resolved()

@@ -116,7 +116,9 @@ def max_over_ranks(value: Tensor) -> Tensor:
 
 def largest(*numbers: int) -> tuple[int, ...]:
     """The largest of all ranks, number by number; of flags, whether any of them is set."""
-    return numbers if not _communicates() else tuple(max_over_ranks(torch.tensor([*map(int, numbers)])).tolist())
+    if not _communicates():
+        return numbers
+    return tuple(max_over_ranks(torch.tensor([*map(int, numbers)], device="cpu")).tolist())
 
 
 def mean_over_ranks(value: Tensor) -> Tensor:
