@@ -199,7 +199,7 @@ def together() -> Iterator[None]:
     fault, _apart = None, True
     try:
         yield
-    except Exception as error:
+    except Exception as error:  # whatever it is: the others wait for a word, and it is raised again below
         fault = error
     finally:
         _apart = False
