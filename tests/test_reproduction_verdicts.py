@@ -22,7 +22,7 @@ SMALL = {
 
 def shares(test, scene):
     """How often a clause holds and how often it does not, in a scene."""
-    return verdicts.measure(test, scene, SEEDS, STUDIES, seed=1)
+    return verdicts.measure(test, scene, SEEDS, STUDIES, seed=[1])
 
 
 @pytest.mark.parametrize("name", SMALL)
