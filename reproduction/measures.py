@@ -99,6 +99,11 @@ class Evidence:
         """The rows of a method under some goals, by seed."""
         return self.rows.get((self.methods.get(method, method), goals, place.environment, place.period), {})
 
+    def goals(self, place: Place) -> list[str]:
+        """Who chose the goals of a place's evaluations: naive, then attackers by name."""
+        found = {goals for _, goals, name, period in self.rows if (name, period) == (place.environment, place.period)}
+        return sorted(found, key=lambda name: (name != "naive", name))
+
     def trainings(self, place: Place, method: str) -> dict[int, Row]:
         """The training curves of a method, by seed."""
         return self.curves.get((self.methods.get(method, method), place.environment), {})
@@ -139,6 +144,11 @@ def _column(goals: str, name: str) -> Callable[[Evidence, Place, str], Numbers]:
         return {seed: row.get(name, math.nan) for seed, row in found.items()}
 
     return numbers
+
+
+def under(goals: str) -> Measure:
+    """Crashes per interaction under one attacker."""
+    return Measure(f"crashes ({goals.capitalize()})", _column(goals, "crash_rate"), ratio=True, floor=FLOOR)
 
 
 def _attacked(evidence: Evidence, place: Place, method: str) -> Numbers:
@@ -234,7 +244,7 @@ def _speed(evidence: Evidence, place: Place, method: str) -> Numbers:
 
 
 FLOOR = 1e-5  # half a crash in an evaluation of some 40 000 interactions
-NAIVE = Measure("crashes (Naive)", _column("naive", "crash_rate"), ratio=True, floor=FLOOR)
+NAIVE = under("naive")
 ATTACKED = Measure("crashes (attacked)", _attacked, ratio=True, floor=FLOOR)
 SCORE = Measure("score (Naive)", _column("naive", "score"))
 ATTACKED_SCORE = Measure("score (attacked)", _column("argmax", "score"))
@@ -249,6 +259,9 @@ CHOSEN = Measure("share of goals that the Director chose", _curve("selected_frac
 DIVERSITY = Measure("diversity of goals", _curve("goal_map", diversity))
 DOSE = Measure("delivered dose: mean percentile of fear of the goals in training",
                _curve("goal_percentile", _known_mean))  # fmt: skip
+FITTED = Measure("share of rollouts after which fear was fitted", _curve("fear_fitted", _known_mean))
+EXACT_RANK = Measure("percentile of the chosen goals, tried in clones", _curve("exact_percentile", _known_mean))
+AUROC = Measure("AUROC of fear within contexts", _curve("auroc", _known_mean))
 MOTION = Measure("speed of the policy", _curve("speed", lambda x: float(x)))
 RISK = Measure("fear at the dangerous place above that at the safe one",
                _curve("risk", lambda auroc: _known_mean(auroc) - 0.5))  # fmt: skip
@@ -258,5 +271,5 @@ SAFE_GAIN = Measure("crashes that the attack adds to safe policies", _where(GAIN
 UNSAFE_RELIEF = Measure("crashes that the attack takes from unsafe policies",
                         _where(Measure("", _less(NAIVE, ATTACKED)), NAIVE, lambda rate: rate >= SAFE))  # fmt: skip
 STANDING = Measure("rank among all policies, by crashes per interaction", _standing)
-OF_TRAINING = (LATE, FALL, LATE_FALL, HALFWAY, CHOSEN, DIVERSITY, DOSE, MOTION, RISK, FPS)
+OF_TRAINING = (LATE, FALL, LATE_FALL, HALFWAY, CHOSEN, DIVERSITY, DOSE, FITTED, EXACT_RANK, AUROC, MOTION, RISK, FPS)
 """Those that hang on no T of an evaluation."""
