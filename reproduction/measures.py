@@ -72,6 +72,7 @@ class Evidence:
             self.curves[row["method"], row["environment"]][row["seed"]] = row
         self.speeds = speeds
         """Rounds of Table 4.1."""
+        self._blocked = {row["environment"] for row in [*rows, *curves] if row.get("block")}
 
     def only(self, seeds: Collection[int]) -> "Evidence":
         """The same without the policies of other seeds."""
@@ -94,6 +95,10 @@ class Evidence:
         if not periods and any(environment in each["seconds"] for each in self.speeds):
             periods = [0]
         return [Place(environment, period) for period in periods]
+
+    def paired(self, place: Place, methods: Iterable[str] = ()) -> bool:
+        """Whether policies of one seed began with the same one, so that ``methods`` are compared seed by seed."""
+        return place.environment in self._blocked and not any(name.endswith("@ particle") for name in methods)
 
     def evaluations(self, place: Place, goals: str, method: str) -> dict[int, Row]:
         """The rows of a method under some goals, by seed."""
