@@ -12,7 +12,7 @@ from deimos.study import figures as drawing
 from deimos.study import report
 from deimos.study.data import Data
 from deimos.study.document import Block
-from reproduction import claims, deviations, overview, shifted_goals
+from reproduction import claims, deviations, legged_contrasts, overview, shifted_goals
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import SETTLED_RATIO, SETTLED_SHARE
 from reproduction.claims import LEAST, Outcome, Result
@@ -55,7 +55,8 @@ def page(data: Data, pictures: report.Pictures, out: Path, speeds: Sequence[Mapp
     return [
         "# What the thesis claims, clause by clause", _summary(outcomes, data), *first,
         "# The study", *_lines(outcomes), *report.environments(data, pictures), *report.over_all(data),
-        *report.what_was_run(data), *deviations.blocks(), *report.speed(data), *report.distributions(data),
+        *legged_contrasts.blocks(evidence), *report.what_was_run(data), *deviations.blocks(), *report.speed(data),
+        *report.distributions(data),
         "## Every clause", *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
