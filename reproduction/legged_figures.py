@@ -58,11 +58,16 @@ def bases(data: Data, environment: str) -> list[int]:
     return sorted({row["seed"] for row in data.rows if row["environment"] == environment})
 
 
+def _methods(data: Data, environment: str) -> list[str]:
+    """Those of an environment in order, but first the one that all are compared with."""
+    return sorted(data.methods(environment), key=lambda name: name != REFERENCE)
+
+
 def pairs(data: Data, environment: str, period: int) -> "Figure":
     """Crashes per interaction and score of every policy, without and with an attacker, a line for each base."""
     easy, hard = Where(environment, "naive", period), Where(environment, "adversary", period)
     worst = outcomes.attacked(data, environment, period)
-    methods, numbers = data.methods(environment), bases(data, environment)
+    methods, numbers = _methods(data, environment), bases(data, environment)
     figure, axes = subplots(2, 2, (WIDTH, 4.6), sharex=True, sharey="row")
     for panel, where, metric, title in (
         (axes[0, 0], easy, "crash_rate", "uniform goals"), (axes[0, 1], worst.where, worst.metric, worst.by),
@@ -125,7 +130,7 @@ def differences(data: Data, environment: str, period: int) -> "Figure | None":
 
 def training(data: Data, environment: str) -> "Figure | None":
     """Crashes and reward during training, a panel for each method, a line for each base."""
-    methods = [name for name in data.methods(environment) if data.curves(environment, name)]
+    methods = [name for name in _methods(data, environment) if data.curves(environment, name)]
     if not methods:
         return None
     columns = min(_COLUMNS, len(methods))
@@ -144,8 +149,9 @@ def training(data: Data, environment: str) -> "Figure | None":
         top.set_title(name)
         top.set_yscale("symlog", linthresh=0.1)
         top.yaxis.set_major_formatter("{x:g}")
-        top.tick_params(labelbottom=False)
-        bottom.set_xlabel("steps of every world")
+        if index + columns >= len(methods):  # nothing below
+            bottom.tick_params(labelbottom=True)
+            bottom.set_xlabel("steps of every world")
     for which, label in enumerate(("crashes per 1000\ntransitions", "mean reward\nper transition")):
         _share_limits(axes[which::2], label)
     _legend(figure, bases(data, environment))
