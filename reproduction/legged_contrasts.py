@@ -36,10 +36,15 @@ LONGER_HOURS = {"quad": 2.7, "quad_arm": 1.3}
 TITLES = {
     ("quad", 100): "Quad at T2", ("quad", 500): "Quad at T10, trained at T2",
     ("quad_long", 100): "Quad at T2, trained at T10", ("quad_long", 500): "Quad at T10, trained at T10",
+    ("quad_on_warp", 100): "Quad at T2, evaluated on mujoco-warp",
     ("quad_warp", 100): "Quad at T2, trained and evaluated on mujoco-warp",
     ("quad_arm", 100): "Quad+arm at T2", ("quad_arm", 500): "Quad+arm at T10",
 }  # fmt: skip
 """Of the places where methods are compared, in order."""
+ENGINES = {
+    "quad": "native", "quad_on_warp": "native, judged on mujoco-warp", "quad_warp": "mujoco-warp",
+}  # fmt: skip
+"""Environments of Quad by the engine of training and evaluation."""
 TEXT = (
     "Paired differences, base by base, fine-tuned from common base policies, 12 M of the thesis's 295 M transitions. A "
     "log rate is log(crashes + 1/2) - log(interactions + 1); worst is the worst of the attackers. p is that of flipped "
@@ -171,18 +176,19 @@ def _table(title: str, found: Sequence[Contrast], *, judged: bool) -> list[Block
 
 
 def _engines(evidence: Evidence) -> list[Block]:
-    """p75 against uniform on both engines, of the bases that both have; nothing where one engine was not run."""
+    """p75 against uniform, base by base, in one engine and in the other; nothing where one of them was not used."""
     rows = []
     for measure in (SCORE, NAIVE):
-        found = [contrast(evidence, Place(name, SHORT), "p75", REFERENCE, measure) for name in ("quad", "quad_warp")]
-        if None in found:
-            continue
-        native, warp = (dict(zip(each.bases, each.differences, strict=True)) for each in found if each is not None)
-        for base in sorted(native.keys() & warp.keys()):
-            rows.append({
-                "base": str(base), "outcome": measure.name, "native": f"{native[base]:+.3g}",
-                "mujoco-warp": f"{warp[base]:+.3g}", "sign": "same" if native[base] * warp[base] > 0 else "other",
-            })  # fmt: skip
+        found = {
+            title: dict(zip(each.bases, each.differences, strict=True)) for name, title in ENGINES.items()
+            if (each := contrast(evidence, Place(name, SHORT), "p75", REFERENCE, measure)) is not None
+        }  # fmt: skip
+        if len(found) > 1:
+            rows += [
+                {"base": str(base), "outcome": measure.name}
+                | {title: f"{own[base]:+.3g}" if base in own else "-" for title, own in found.items()}
+                for base in sorted(set().union(*found.values()))
+            ]
     return ["### p75 - uniform on both engines, at T2", rows] if rows else []
 
 

@@ -5,10 +5,15 @@ from pathlib import Path
 
 import pytest
 
+from deimos.checks import RunError
 from deimos.run import presets, training
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
-from reproduction import legged_bases
+from deimos.study import cell as worker
+from deimos.study import plan
+from deimos.study.folder import StudyFolder
+from deimos.study.results import Results, merge
+from reproduction import legged_bases, legged_on_warp
 
 SETTINGS = {"quad": ("rough", 500), "quad_arm": ("flat", 100)}
 """Ground and T of every robot's bases."""
@@ -76,3 +81,28 @@ def test_no_seed_is_used_twice():
     """Every base has a seed of its own."""
     seeds = [seed for own in legged_bases.ROBOTS.values() for seed in own.seeds]
     assert len(set(seeds)) == len(seeds)
+
+
+def test_policies_are_judged_on_the_other_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A finished policy has a row on mujoco-warp, of an environment of its own that merges with the study's tables."""
+    monkeypatch.setattr(legged_on_warp, "EVALUATION", EvalConfig(worlds=4, steps=200, attackers=()))
+    table = {"name": "quad", "env": {"kind": "quad", "goal_period": 100, "engine": "native"}}
+    train = {"num_envs": 4, "env_steps": 24, "ppo": {"hidden": [8]}, "device": "cpu",
+             "eval": {"worlds": 4, "steps": 200, "attackers": []}}  # fmt: skip
+    described = {"methods": ["uniform", "p75"], "audit_worlds": 0, "train": train, "environment": [table]}
+    study = StudyFolder(tmp_path / "study")
+    study.add(plan.expand(described, seeds=[1, 2]))
+    (cell,) = [cell for cell in study.cells() if (cell.config.method, cell.config.seed) == ("p75", 2)]
+    assert worker.run(study, cell)
+    monkeypatch.setattr("sys.argv", ["legged_on_warp", str(study.path), str(tmp_path / "warp"), "--seeds", "2-2"])
+    legged_on_warp.main()
+    merge(tmp_path / "all", [study.path, tmp_path / "warp"])
+    native, warp = Results.read(tmp_path / "all").rows
+    assert (native["environment"], warp["environment"]) == ("quad", "quad_on_warp")
+    assert (warp["method"], warp["seed"], warp["goals"], warp["goal_period"]) == ("p75", 2, "naive", 100)
+    assert warp["hash"] != native["hash"]
+    assert {row["engine"] for row in RunFolder(study.cell_path(cell) / "run").read_rows("evaluation.json")} == {
+        "native", "warp",
+    }  # fmt: skip
+    with pytest.raises(RunError, match="no finished policies of these methods and seeds"):
+        legged_on_warp.judge(study, StudyFolder(tmp_path / "other"), ["uniform"], [])

@@ -140,7 +140,9 @@ def test_tables_say_what_is_judged_and_what_is_estimated(tmp_path, monkeypatch):
     assert {row["p (better)"] for row in primary[:3]} == {f"{1 / 32:.3g}"}
     assert [row["contrast"] for row in exploratory[::3]] == ["vds - uniform", "vds+p75 - vds"]
     assert all("p (better)" not in row for row in estimates)
-    assert [(row["base"], row["sign"]) for row in engines] == [("1", "same"), ("2", "same")] * 2
+    assert [row["base"] for row in engines] == ["1", "2", "3", "4", "5"] * 2
+    assert [row["mujoco-warp"] == "-" for row in engines[:5]] == [False, False, True, True, True]
+    assert engines[0]["native"] == primary[0]["of every base"].split(", ")[0]
     assert {"robot": "quad", "not run": "coop", "would take [core-hours]": "1.6"}.items() <= next(
         row for row in lacking if row["not run"] == "coop"
     ).items()
