@@ -49,9 +49,10 @@ def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figure
         own = [row for row in shifted if (row["environment"], row["goal_period"]) == (environment, period)]
         text = f"{environment}, T = {period}: {DOSE} {SHIFTED}"
         found[f"dose-{environment}-T{period}"] = (text, dose_response(data, environment, period, own))
-    if legged_figures.paired(data, environment):
-        found |= legged_figures.figures(data, environment)
-    return found
+    if not data.paired(environment):
+        return found
+    found |= legged_figures.figures(data, environment)
+    return {name: (f"{caption} {legged_figures.ORIGIN}", figure) for name, (caption, figure) in found.items()}
 
 
 def dose_response(data: Data, environment: str, period: int, shifted: Sequence[Row]) -> "Figure | None":

@@ -19,7 +19,8 @@ NUMBERS = {("quad", 100): "4.8", ("quad", 500): "4.9", ("quad_arm", 100): "4.10"
 """The thesis's figures of evaluations, by robot and T [steps]."""
 CURVES = {"quad": "A.1", "quad_arm": "A.2"}
 """Those of trainings."""
-ORIGIN = "fine-tuned from common base policies, 12 M of the thesis's 295 M transitions"
+ORIGIN = "Fine-tuned from common base policies, 12 M of the thesis's 295 M transitions."
+"""What every caption on robots says."""
 PAIRS = "every line is a base, every dot the policy of a method that branched off it; bars are means."
 DIFFERENCES = (
     "differences from Uniform. Every dot is a base; bars are 95 % t intervals of the mean. To the right is more: of "
@@ -31,11 +32,6 @@ _MARKERS = "osD^vP"
 _COLUMNS = 5
 
 
-def paired(data: Data, environment: str) -> bool:
-    """Whether the policies of a seed branched off the same base in an environment."""
-    return any(row["environment"] == environment and row.get("block") for row in data.rows)
-
-
 def figures(data: Data, environment: str) -> Figures:
     """The figures of an environment whose methods branched off common bases, in place of those of every study."""
     found: Figures = {}
@@ -43,13 +39,13 @@ def figures(data: Data, environment: str) -> Figures:
         number, place = NUMBERS.get((environment, period)), f"{environment}, T = {period}"
         title = f"Figure {number} in pairs, {place}" if number else place
         found |= {
-            f"evaluation-{environment}-T{period}": (f"{title}, {ORIGIN}: {PAIRS}", pairs(data, environment, period)),
+            f"evaluation-{environment}-T{period}": (f"{title}: {PAIRS}", pairs(data, environment, period)),
             f"differences-{environment}-T{period}": (
-                f"{place}, {ORIGIN}: {DIFFERENCES}", differences(data, environment, period)
+                f"{place}: {DIFFERENCES}", differences(data, environment, period)
             ),
         }  # fmt: skip
     title = f"Figure {CURVES[environment]} in pairs, {environment}" if environment in CURVES else environment
-    found[f"training-{environment}"] = (f"{title}, {ORIGIN}: {TRAINING} {CAVEAT}", training(data, environment))
+    found[f"training-{environment}"] = (f"{title}: {TRAINING} {CAVEAT}", training(data, environment))
     return found
 
 

@@ -195,6 +195,17 @@ def test_bases_widen_no_spread_and_hide_no_equivalence():
     assert spread.p_for < spread.p_against
 
 
+def test_verdicts_on_bases_are_seldom_wrong():
+    """Of studies in which two methods differ on no base but by noise, at most one in twenty has a verdict."""
+    rng, wrong, studies = np.random.default_rng(5), 0, 200
+    for _ in range(studies):
+        base = rng.normal(0.0, 3.0, 8)
+        values = {name: np.exp(base + rng.normal(0.0, 0.2, 8)) for name in ("vds", "uniform")}
+        wrong += Ordered(NAIVE, (("vds", "uniform"),)).find(in_blocks(values), HERE).verdict != "undecided"
+    # The count of 200 at 5 % is 10 on average; four standard deviations above.
+    assert wrong <= 10 + 4 * math.sqrt(200 * 0.05 * 0.95)
+
+
 def test_a_base_counts_once_in_a_sign_test():
     """Policies of several methods from one base are one vote, by their mean."""
     data = in_blocks({"p25": [1.0] * 6, "p75": [-0.5] * 6, "p90": [2.0] * 3}, "score")

@@ -14,8 +14,9 @@ from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import particle
 from deimos.study import cell as worker
 from deimos.study import plan, stats
-from deimos.study.data import Data
+from deimos.study.data import Data, Where
 from deimos.study.folder import StudyFolder
+from deimos.study.report import outcomes
 from deimos.study.results import merge
 from reproduction import claim_tests, legged_bases, legged_contrasts, legged_figures, report
 from reproduction.measures import SCORE, Evidence, Place
@@ -197,6 +198,16 @@ def test_report_has_pairs_claims_and_pictures(tables, tmp_path):
         assert words in text, words
     for name in ("evaluation-quad-T100", "differences-quad-T100", "training-quad"):
         assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 10_000
+
+
+def test_tables_of_every_study_compare_in_pairs(tables):
+    """How often a method is safer than Uniform is counted over seeds where they began with the same policy."""
+    data = Data.read(tables)
+    (_, _, rows, *_) = outcomes(data, "quad", 100)
+    shown = {row["method"]: row["P(safer than uniform)"] for row in rows}
+    uniform, p75 = (data.sample(Where("quad", "naive", 100), name, "worst") for name in ("uniform", "p75"))
+    assert shown["p75"].startswith(f"{(np.sign(uniform - p75) + 1).mean() / 2:.2f} [")
+    assert shown["uniform"] == "-"
 
 
 def test_pictures_show_every_policy(tables):
