@@ -3,10 +3,13 @@
 ``Ordered`` compares methods by P(X > Y), or by their spread; ``Alike`` asks within which ratio two are equivalent;
 ``Mostly`` looks at each policy by itself; ``Highest`` at the best policies alone; ``Matters`` at how much hangs on the
 method; ``Best`` chooses the methods on half of the seeds and has another test on the others.
+
+Where policies of one seed began with the same one, it is a block: methods are compared within blocks, labels are
+permuted within them, and resamples are of blocks.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -18,7 +21,7 @@ from deimos.study import permutation, stats
 from deimos.study.permutation import Pairs
 from deimos.study.stats import POWER, Array, Interval
 from reproduction.claims import ALPHA, LEAST, Finding, Test
-from reproduction.measures import NAIVE, Evidence, Measure, Place
+from reproduction.measures import NAIVE, Evidence, Measure, Numbers, Place
 
 SETTLED_RATIO = 1.5  # an equivalence is settled within this ratio,
 SETTLED_SHARE = 0.05  # or, of what has no ratios, within this share of the score's range from 0 to 1
@@ -53,20 +56,30 @@ class Ordered:
             return None
         names = [name for name in samples if any(name in pair for pair in pairs)]
         numbers = [(names.index(a), names.index(b)) for a, b in pairs]
-        values = [samples[name] for name in names]
-        more, less = (2 * float(p[0]) for p in self.p_values([x[None] for x in values], numbers))
+        values, paired = [samples[name] for name in names], evidence.paired(place, self.methods)
         if self.spread:
             statistic, effect, at = permutation.log_spread_ratio(numbers), "ratio of spreads", 1.0
         else:
-            statistic, effect, at = permutation.superiority(numbers), "P(X > Y)", 0.5
-        found = stats.bootstrap(values, statistic, resamples=RESAMPLES)
-        interval = _exp(found) if self.spread else found
-        sizes = [sum(len(samples[name]) for name in dict.fromkeys(side)) for side in zip(*pairs, strict=True)]
+            order = permutation.superiority_in_blocks if paired else permutation.superiority
+            statistic, effect, at = order(numbers), "P(X > Y)", 0.5
+        if paired:
+            centred = [x - np.median(x) for x in values] if self.spread else values
+            more, less = permutation.p_values_in_blocks(centred, statistic)
+        else:
+            more, less = map(float, self.p_values(values, numbers))
+        found = stats.bootstrap(values, statistic, resamples=RESAMPLES, paired=paired)
         return Finding(
-            effect=effect, interval=interval, no_difference=at, p_for=min(1.0, more), p_against=min(1.0, less),
-            detectable=detectable_spread(*sizes) if self.spread else stats.detectable_probability(*sizes),
+            effect=effect, interval=_exp(found) if self.spread else found, no_difference=at,
+            p_for=min(1.0, 2 * more), p_against=min(1.0, 2 * less), detectable=self._detectable(samples, pairs, paired),
             n={name: len(samples[name]) for name in names},
         )  # fmt: skip
+
+    def _detectable(self, samples: Mapping[str, Array], pairs: Sequence[tuple[str, str]], paired: bool) -> float:
+        """In blocks what independent policies would show, but nothing where even n of n signs are not significant."""
+        sizes = [sum(len(samples[name]) for name in dict.fromkeys(side)) for side in zip(*pairs, strict=True)]
+        if paired and len(pairs) == 1 and math.isinf(stats.detectable_share(sizes[0])):
+            return math.inf
+        return detectable_spread(*sizes) if self.spread else stats.detectable_probability(*sizes)
 
     def p_values(self, samples: Sequence[Array], pairs: Pairs, permutations: int | None = None) -> tuple[Array, Array]:
         """One-sided p-values for and against, of samples of shape (studies, n)."""
@@ -115,10 +128,11 @@ class Alike:
         if len(samples) < 2:
             return None
         x, y = (self.values(samples[name]) for name in self.methods)
-        middle = float(np.median(x[:, None] - y))  # Hodges and Lehmann's estimate
-        interval = Interval(middle, -_furthest(y, x), _furthest(x, y))
+        sides = _sides_in_blocks if evidence.paired(place, self.methods) else _sides
+        middle = float(np.median(x - y if sides is _sides_in_blocks else x[:, None] - y))  # Hodges and Lehmann's
+        interval = Interval(middle, -_furthest(y, x, sides), _furthest(x, y, sides))
         within = max(interval.high, 0.0 if self.at_most else -interval.low)
-        p_for, p_against = (float(p[0]) for p in self.p_values(x[None], y[None]))
+        p_for, p_against = map(float, self.p_values(x, y, sides=sides))
         error = (interval.high - interval.low) / (2 * scipy_stats.norm.ppf(1 - ALPHA))
         reach = float(scipy_stats.norm.ppf(1 - ALPHA) + scipy_stats.norm.ppf((1 + POWER) / 2)) * error
         if self.measure.ratio:
@@ -132,13 +146,19 @@ class Alike:
             equivalent_within=within,
         )  # fmt: skip
 
-    def p_values(self, x: Array, y: Array, permutations: int | None = None) -> tuple[Array, Array]:
-        """p-values for and against of being settled, of ``values`` of shape (studies, n)."""
-        above, below = _sides(x, y, self.settled, permutations)
+    def p_values(
+        self, x: Array, y: Array, permutations: int | None = None, *, sides: "Sides | None" = None
+    ) -> tuple[Array, Array]:
+        """p-values for and against of being settled, of ``values`` of shape (..., n); ``sides`` as ``_sides``."""
+        sides = sides or _sides
+        above, below = sides(x, y, self.settled, permutations)
         if self.at_most:
             return below, above
-        back_above, back_below = _sides(y, x, self.settled, permutations)
+        back_above, back_below = sides(y, x, self.settled, permutations)
         return np.maximum(below, back_below), np.minimum(1.0, 2 * np.minimum(above, back_above))
+
+
+Sides = Callable[[Array, Array, float, int | None], tuple[Array, Array]]
 
 
 def _sides(x: Array, y: Array, margin: float, permutations: int | None = None) -> tuple[Array, Array]:
@@ -146,14 +166,21 @@ def _sides(x: Array, y: Array, margin: float, permutations: int | None = None) -
     return permutation.p_values([x, y + margin], [(0, 1)], "superiority", permutations=permutations)
 
 
-def _furthest(x: Array, y: Array) -> float:
+def _sides_in_blocks(x: Array, y: Array, margin: float, permutations: int | None = None) -> tuple[Array, Array]:
+    """The same of values that belong together, shapes (n,)."""
+    order = permutation.superiority_in_blocks([(0, 1)])
+    more, less = permutation.p_values_in_blocks([x, y + margin], order, permutations=permutations)
+    return np.asarray(more), np.asarray(less)
+
+
+def _furthest(x: Array, y: Array, sides: Sides) -> float:
     """Smallest shift d, to 1 %, for which P(x > y + d) is significantly below 1/2, at 5 % on this side."""
     low, high = float(x.min() - y.max()) - 0.01, float(x.max() - y.min()) + 0.01
-    if _sides(x, y, high)[1] > ALPHA:
+    if sides(x, y, high, None)[1] > ALPHA:
         return math.inf
     while high - low > 0.01:
         middle = (low + high) / 2
-        low, high = (low, middle) if _sides(x, y, middle)[1] <= ALPHA else (middle, high)
+        low, high = (low, middle) if sides(x, y, middle, None)[1] <= ALPHA else (middle, high)
     return high
 
 
@@ -170,9 +197,12 @@ class Mostly:
 
     def find(self, evidence: Evidence, place: Place) -> Finding | None:
         """See ``Test``."""
-        numbers = {name: np.array([*self.measure(evidence, place, name).values()]) for name in self.methods}
-        numbers = {name: x for name, x in numbers.items() if len(x)}
-        x = np.concatenate([*numbers.values(), np.empty(0)])
+        numbers = {name: found for name in self.methods if (found := self.measure(evidence, place, name))}
+        if evidence.paired(place):  # a block counts once, by the mean of its policies
+            seeds = sorted({seed for own in numbers.values() for seed in own})
+            x = np.array([np.mean([own[seed] for own in numbers.values() if seed in own]) for seed in seeds])
+        else:
+            x = np.array([number for own in numbers.values() for number in own.values()])
         n = len(x)
         if n < LEAST:
             return None
@@ -180,7 +210,7 @@ class Mostly:
         p_for, p_against = (min(1.0, 2 * float(p)) for p in self.p_values(x))
         return Finding(
             effect="share of policies", interval=stats.share(np.arange(n) < positive), no_difference=0.5,
-            p_for=p_for, p_against=p_against, detectable=detectable_share(n),
+            p_for=p_for, p_against=p_against, detectable=stats.detectable_share(n),
             n={name: len(own) for name, own in numbers.items()},
         )  # fmt: skip
 
@@ -272,29 +302,35 @@ class Matters:
 
     def find(self, evidence: Evidence, place: Place) -> Finding | None:
         """See ``Test``."""
-        both: dict[str, Array] = {}
+        more, less, paired = {}, {}, evidence.paired(place)
         for name in self.methods:
             a, b = (measure(evidence, place, name) for measure in (self.more, self.less))
-            seeds = sorted(a.keys() & b.keys())
-            if len(seeds) >= LEAST:
-                both[name] = np.array([[a[seed] for seed in seeds], [b[seed] for seed in seeds]])
+            more[name], less[name] = ({seed: x[seed] for seed in a.keys() & b.keys()} for x in (a, b))
+        both = [*_enough(more, paired).items()]
         if len(both) < 3:
             return None
-        sizes = [x.shape[1] for x in both.values()]
-        values = np.concatenate(list(both.values()), axis=1)
-        p_for, p_against = (min(1.0, 2 * float(p[0])) for p in self.p_values(values[None], sizes))
+        sizes = [len(x) for _, x in both]
+        values = np.array([np.concatenate([x for _, x in both]),
+                           np.concatenate([*_enough(less, paired).values()])])  # fmt: skip
+        p_for, p_against = (min(1.0, 2 * float(p[0])) for p in self.p_values(values[None], sizes, paired=paired))
         ranks = scipy_stats.rankdata(values, axis=-1)
-        interval, error = self._interval(ranks, sizes)
+        interval, error = self._interval(ranks, sizes, paired)
         reach = float(scipy_stats.norm.ppf(1 - ALPHA / 2) + scipy_stats.norm.ppf(POWER)) * error
         return Finding(
             effect="difference in omega^2", interval=interval, no_difference=0.0, p_for=p_for, p_against=p_against,
-            detectable=reach, n=dict(zip(both, sizes, strict=True)),
+            detectable=reach, n={name: len(x) for name, x in both},
         )  # fmt: skip
 
-    def p_values(self, values: Array, sizes: Sequence[int], permutations: int = 999) -> tuple[Array, Array]:
-        """One-sided p-values for and against, of values of shape (studies, 2, policies)."""
+    def p_values(
+        self, values: Array, sizes: Sequence[int], permutations: int = 999, *, paired: bool = False
+    ) -> tuple[Array, Array]:
+        """One-sided p-values for and against, of values of shape (studies, 2, policies).
+
+        If they are ``paired``, sizes are equal, and the policies of a block are exchanged together.
+        """
         ranks = scipy_stats.rankdata(values, axis=-1)
-        swapped = np.random.default_rng(0).random((permutations + 1, 1, values.shape[-1])) < 0.5
+        swapped = np.random.default_rng(0).random((permutations + 1, 1, sizes[0] if paired else sum(sizes))) < 0.5
+        swapped = np.tile(swapped, len(sizes)) if paired else swapped
         swapped[0] = False
         found = []
         for own in ranks:
@@ -305,9 +341,9 @@ class Matters:
         more, less = np.array(found).T
         return more, less
 
-    def _interval(self, ranks: Array, sizes: Sequence[int]) -> tuple[Interval, float]:
+    def _interval(self, ranks: Array, sizes: Sequence[int], paired: bool) -> tuple[Interval, float]:
         ends = np.cumsum(sizes)
-        drawn = [np.random.default_rng(i).integers(end - n, end, (RESAMPLES, n))
+        drawn = [np.random.default_rng(0 if paired else i).integers(end - n, end, (RESAMPLES, n))
                  for i, (end, n) in enumerate(zip(ends, sizes, strict=True))]  # fmt: skip
         share = omega_squared(ranks[:, np.concatenate(drawn, axis=1)], sizes)
         difference = share[0] - share[1]
@@ -365,24 +401,21 @@ class Best:
 
 
 def samples_of(measure: Measure, evidence: Evidence, place: Place, methods: Sequence[str]) -> dict[str, Array]:
-    """The samples of the methods that have enough policies."""
-    found = {name: np.array([*measure(evidence, place, name).values()]) for name in methods}
-    return {name: x for name, x in found.items() if len(x) >= LEAST}
+    """The samples of the methods that have enough policies; in blocks, of those blocks that all of them have."""
+    return _enough({name: measure(evidence, place, name) for name in methods}, evidence.paired(place, methods))
+
+
+def _enough(numbers: Mapping[str, Numbers], paired: bool) -> dict[str, Array]:
+    found = {name: own for name, own in numbers.items() if len(own) >= LEAST}
+    if paired and found:
+        shared = set.intersection(*map(set, found.values()))
+        found = {name: {seed: own[seed] for seed in own if seed in shared} for name, own in found.items()}
+    return {name: np.array([own[seed] for seed in sorted(own)]) for name, own in found.items() if len(own) >= LEAST}
 
 
 def _exp(interval: Interval) -> Interval:
     with np.errstate(over="ignore"):
         return Interval(*np.exp([interval.estimate, interval.low, interval.high]).tolist())
-
-
-@lru_cache
-def detectable_share(n: int) -> float:
-    """Smallest share above 1/2 that the two-sided sign test finds with a power of 80 %.
-
-    Infinite where even n of n is not significant.
-    """
-    enough = [count for count in range(n) if 2 * scipy_stats.binom.cdf(count, n, 0.5) <= ALPHA]
-    return 1 - float(scipy_stats.beta.ppf(1 - POWER, enough[-1] + 1, n - enough[-1])) if enough else math.inf
 
 
 @lru_cache

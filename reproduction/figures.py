@@ -10,6 +10,7 @@ from deimos.study.data import Data, Style, Where
 from deimos.study.figures import WIDTH, Figures, as_rates, instead, legend, subplots
 from deimos.study.outcomes import DOSE, of_environment
 from deimos.study.results import Row
+from reproduction import legged_figures
 from reproduction.thesis import DIRECTOR_METHODS, ENVIRONMENTS
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ STYLE = Style(
 def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figures:
     """The figures of every study; beside the delivered dose, Uniform policies under shifted goals.
 
+    Where methods branched off common bases, those of ``legged_figures`` in place of boxes and bands.
+
     Args:
         data: The study's.
         environment: Its name.
@@ -46,7 +49,10 @@ def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figure
         own = [row for row in shifted if (row["environment"], row["goal_period"]) == (environment, period)]
         text = f"{environment}, T = {period}: {DOSE} {SHIFTED}"
         found[f"dose-{environment}-T{period}"] = (text, dose_response(data, environment, period, own))
-    return found
+    if not data.paired(environment):
+        return found
+    found |= legged_figures.figures(data, environment)
+    return {name: (f"{caption} {legged_figures.ORIGIN}", figure) for name, (caption, figure) in found.items()}
 
 
 def dose_response(data: Data, environment: str, period: int, shifted: Sequence[Row]) -> "Figure | None":

@@ -1,15 +1,17 @@
 """Train the policies that the legged studies branch off, and the networks of the attacker ``pooled`` that they meet.
 
-    python -m reproduction.legged_bases runs/legged_bases    # five of Quad; again to continue what was killed
+    python -m reproduction.legged_bases runs/legged_bases    # eight; again to continue what was killed
+    python -m reproduction.legged_bases runs/legged_bases --robots quad
 
-A base is trained under Uniform at T10: 4 M transitions on flat ground, then, with these networks, 6 M on rough ground.
-Its rough run is what studies branch off. The pool of a base is made from the other bases, so no policy has taught its
-own attacker. A file that exists is not written again.
+A base is trained under Uniform, in two stages, of which the second begins with the first one's networks; studies branch
+off the second. Its policy is judged under uniform goals before anything branches off. The pool of a base is made from
+the other bases of its robot, so no policy has taught its own attacker. A file that exists is not written again.
 """
 
 import argparse
 import shutil
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -18,45 +20,93 @@ from deimos.learn.policy import load_policy
 from deimos.nn.threads import torch_on_one
 from deimos.run import training
 from deimos.run.attackers.pooled import make_pool
-from deimos.run.evaluation import EvalConfig, make_target
+from deimos.run.evaluation import EvalConfig, evaluate_run, make_target
 from deimos.run.folder import RunFolder
 from deimos.run.presets import preset
 from deimos.run.trainer import TrainConfig
+from deimos.sim.shared import one_stream
 from reproduction.particle_pool import POOL, note_checksums
 from reproduction.runs import finished
 
-BASES = Path(__file__).parent.parent / "docs/results/legged"
+KEPT_IN = Path(__file__).parent.parent / "docs/results/legged"
 KEPT = ("config.json", "checkpoint.pt", "policy.pt", "progress.csv")
-SEEDS = (7001, 7002, 7003, 7004, 7005)  # of no other run; base_1 has the first
 LONG, SHORT = 500, 100  # T10 and T2 [steps]
-FLAT, ROUGH = 4_000_000, 6_000_000  # transitions
 ATTACKS = EvalConfig(worlds=512, steps=1500)
 
 
-def base_config(name: str, transitions: int, seed: int) -> TrainConfig:
-    """A preset at T10 under Uniform, with episodes of two goals."""
+@dataclass(frozen=True)
+class Bases:
+    """The bases of a robot."""
+
+    seeds: tuple[int, ...]
+    """Of no other run; the first base has the first."""
+    stages: tuple[tuple[str, int], ...]
+    """Presets and transitions, one after the other."""
+    period: int
+    """T of their training [steps]."""
+    judged: tuple[int, ...]
+    """The T that they are judged at [steps]."""
+
+
+ROBOTS: Mapping[str, Bases] = {
+    # As the thesis trains them: T10, and episodes of two goals.
+    "quad": Bases(
+        (7001, 7002, 7003, 7004, 7005), (("quad-walk", 4_000_000), ("quad-rough", 6_000_000)), LONG, (SHORT, LONG)
+    ),
+    # As the presets have it (docs/lab/quad_arm.md), whose goals of two seconds make it walk and reach.
+    "quad_arm": Bases(
+        (7101, 7102, 7103), (("quad-arm-walk", 4_030_464), ("quad-arm-reach", 6_144_000)), SHORT, (SHORT,)
+    ),
+}  # fmt: skip
+
+
+def base_name(robot: str, index: int) -> str:
+    """Name of a base's folder and of the file of its pool; studies call the first one 1."""
+    return f"{robot}_base_{index + 1}"
+
+
+def base_config(bases: Bases, stage: int, index: int) -> TrainConfig:
+    """A stage of a base: its preset under Uniform, with goals of the bases' T and episodes of at least two."""
+    name, transitions = bases.stages[stage]
     config = preset(name)
-    env = replace(config.env, goal_period=LONG, episode_steps=2 * LONG)
+    env = replace(
+        config.env, goal_period=bases.period, episode_steps=max(config.env.episode_steps, 2 * bases.period)
+    )  # fmt: skip
     return replace(
-        config, env=env, method="uniform", env_steps=transitions // config.num_envs, seed=seed, evaluation=False,
-        device="cpu", threads=1,
+        config, env=env, method="uniform", env_steps=transitions // config.num_envs, seed=bases.seeds[index],
+        evaluation=False, device="cpu", threads=1,
     )  # fmt: skip
 
 
-def base(index: int, root: Path) -> Path:
-    """Train a base, or go on with it; gives the folder that is kept of it."""
-    kept = BASES / f"base_{index + 1}"
+def base(robot: str, index: int, root: Path) -> Path:
+    """Train a base, or go on with it, and judge it; gives the folder that is kept of it."""
+    bases = ROBOTS[robot]
+    kept = KEPT_IN / base_name(robot, index)
     if not kept.exists():
-        home = root / kept.name
-        flat, _ = finished(base_config("quad-walk", FLAT, SEEDS[index]), home / "flat")
-        rough, _ = finished(base_config("quad-rough", ROUGH, SEEDS[index]), home / "rough", flat.path)
+        home, last = root / kept.name, None
+        for stage, (name, _) in enumerate(bases.stages):
+            folder, _ = finished(base_config(bases, stage, index), home / name, last)
+            last = folder.path
         shutil.rmtree(home / "kept", ignore_errors=True)
         for name in KEPT:
             (home / "kept").mkdir(exist_ok=True)
-            shutil.copy2(rough.path / name, home / "kept" / name)
+            shutil.copy2(folder.path / name, home / "kept" / name)
         kept.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(home / "kept", kept)
+    judge(kept, bases.judged)
     return kept
+
+
+def judge(folder: Path, periods: tuple[int, ...]) -> list[dict]:
+    """The rows of a base under uniform goals, for each T; they are kept in its folder."""
+    run, device = RunFolder.open(folder), torch.device("cpu")
+    env = training.read_config(run).env
+    naive = replace(ATTACKS, attackers=())
+    with one_stream(device):
+        return [
+            row for period in periods
+            for row in evaluate_run(run, env.with_goal_period(period), naive, device, again=False)
+        ]  # fmt: skip
 
 
 def pool(folders: list[Path], path: Path) -> None:
@@ -73,12 +123,14 @@ def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", type=Path, help="where the runs are kept")
-    root = parser.parse_args().root
-    bases = [base(index, root) for index in range(len(SEEDS))]
-    for own in bases:
-        path = POOL / f"quad_{own.name}.pt"
-        if not path.exists():
-            pool([other for other in bases if other != own], path)
+    parser.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=list(ROBOTS))
+    options = parser.parse_args()
+    for robot in options.robots:
+        folders = [base(robot, index, options.root) for index in range(len(ROBOTS[robot].seeds))]
+        for own in folders:
+            path = POOL / f"{own.name}.pt"
+            if not path.exists():
+                pool([other for other in folders if other != own], path)
     note_checksums()
 
 

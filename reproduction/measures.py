@@ -41,8 +41,8 @@ class Place:
 class Evidence:
     """The policies of a study, as the thesis names their methods.
 
-    Where a study has Directors that learn fear as the thesis does (``p25-literal``), they are its ``p25``, and those
-    with a crash memory take no part. All policies count, also those whose attacker found nothing to learn from.
+    Where an environment has Directors that learn fear as the thesis does (``p25-literal``), they are its ``p25``, and
+    those with a crash memory take no part. All policies count, also those whose attacker found nothing to learn from.
 
     Args:
         rows: Of evaluations, see ``deimos.study.results``; columns that they lack are not known.
@@ -56,11 +56,10 @@ class Evidence:
     ) -> None:
         rows, curves = list(rows), list(curves)
         names = {row["method"] for row in [*rows, *curves]}
-        self.methods = {
-            name: name + LITERAL if renamed and name + LITERAL in names else name
-            for name in {name.removesuffix(LITERAL) if renamed else name for name in names}
-        }
-        """The names that are compared, and those of the rows."""
+        self.methods = sorted({name.removesuffix(LITERAL) if renamed else name for name in names})
+        """The names that are compared."""
+        self._literal = {(row["environment"], row["method"]) for row in [*rows, *curves]
+                         if renamed and row["method"].endswith(LITERAL)}  # fmt: skip
         self.rows: dict[tuple[str, str, str, int], dict[int, Row]] = defaultdict(dict)
         """Evaluations by method, goals, environment and T, and by seed."""
         for row in rows:
@@ -72,6 +71,7 @@ class Evidence:
             self.curves[row["method"], row["environment"]][row["seed"]] = row
         self.speeds = speeds
         """Rounds of Table 4.1."""
+        self._blocked = {row["environment"] for row in [*rows, *curves] if row.get("block")}
 
     def only(self, seeds: Collection[int]) -> "Evidence":
         """The same without the policies of other seeds."""
@@ -80,7 +80,7 @@ class Evidence:
             for table in (self.rows, self.curves)
         )
         found = Evidence(rows, curves, self.speeds, renamed=False)
-        found.methods = self.methods
+        found.methods, found._literal = self.methods, self._literal
         return found
 
     @classmethod
@@ -95,9 +95,13 @@ class Evidence:
             periods = [0]
         return [Place(environment, period) for period in periods]
 
+    def paired(self, place: Place, methods: Iterable[str] = ()) -> bool:
+        """Whether policies of one seed began with the same one, so that ``methods`` are compared seed by seed."""
+        return place.environment in self._blocked and not any(name.endswith("@ particle") for name in methods)
+
     def evaluations(self, place: Place, goals: str, method: str) -> dict[int, Row]:
         """The rows of a method under some goals, by seed."""
-        return self.rows.get((self.methods.get(method, method), goals, place.environment, place.period), {})
+        return self.rows.get((self._name(place, method), goals, place.environment, place.period), {})
 
     def goals(self, place: Place) -> list[str]:
         """Who chose the goals of a place's evaluations: naive, then attackers by name."""
@@ -106,7 +110,12 @@ class Evidence:
 
     def trainings(self, place: Place, method: str) -> dict[int, Row]:
         """The training curves of a method, by seed."""
-        return self.curves.get((self.methods.get(method, method), place.environment), {})
+        return self.curves.get((self._name(place, method), place.environment), {})
+
+    def _name(self, place: Place, method: str) -> str:
+        """What the rows of a place call a method."""
+        literal = method + LITERAL
+        return literal if (place.environment, literal) in self._literal else method
 
 
 @dataclass(frozen=True)

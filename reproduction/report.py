@@ -12,15 +12,20 @@ from deimos.study import figures as drawing
 from deimos.study import report
 from deimos.study.data import Data
 from deimos.study.document import Block
-from reproduction import claims, deviations, overview, shifted_goals
+from reproduction import claims, deviations, legged_contrasts, overview, shifted_goals
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import SETTLED_RATIO, SETTLED_SHARE
 from reproduction.claims import LEAST, Outcome, Result
 from reproduction.figures import STYLE, figures
+from reproduction.legged_figures import ORIGIN
 from reproduction.measures import Evidence
 
 CLAUSES = "clauses"
 """Name of the figure on the first page."""
+PAIRED = (
+    "Policies that branched off the same base are compared with each other alone: clauses permute and resample within "
+    "bases. Two methods on five bases cannot be ordered by that, for even five of five is p = 1/16 on both sides."
+)
 
 
 def write(folder: Path, out: Path, speeds: Path | None = None) -> Path:
@@ -51,11 +56,13 @@ def page(data: Data, pictures: report.Pictures, out: Path, speeds: Sequence[Mapp
     evidence = Evidence.of(data, speeds)
     outcomes = [claims.test(claim, evidence) for claim in CLAIMS]
     figure = overview.draw(outcomes, data.environments)
-    first = drawing.write({CLAUSES: (overview.CAPTION, figure)}, out / report.FIGURES)
+    pairs = [f"Robots: {ORIGIN}"] if any(map(data.paired, data.environments)) else []
+    first = drawing.write({CLAUSES: (" ".join([overview.CAPTION, *pairs]), figure)}, out / report.FIGURES)
     return [
         "# What the thesis claims, clause by clause", _summary(outcomes, data), *first,
         "# The study", *_lines(outcomes), *report.environments(data, pictures), *report.over_all(data),
-        *report.what_was_run(data), *deviations.blocks(), *report.speed(data), *report.distributions(data),
+        *legged_contrasts.blocks(evidence), *report.what_was_run(data), *deviations.blocks(), *report.speed(data),
+        *report.distributions(data),
         "## Every clause", *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
@@ -110,12 +117,14 @@ def _row(each: Result) -> dict[str, str]:
 def _limits(data: Data) -> list[str]:
     """Those of every study, and of the tests of claims."""
     unit, power, *rest = report.limits(data)
+    pairs = [PAIRED] if any(map(data.paired, data.environments)) else []
     return [
         unit,
         f"{power} Nothing is tested below {LEAST} policies.",
         "A clause is one comparison. It holds where a test rejects its opposite, does not hold where it rejects the "
         "clause, each wrongly in at most 5 % of all studies, and is undecided otherwise. Nothing is corrected over "
         f"clauses. An equivalence is settled within a ratio of {SETTLED_RATIO:g}, or {SETTLED_SHARE:g} of the score.",
+        *pairs,
         *rest,
         "`python -m reproduction coverage` measures again how often these intervals contain the truth.",
         "What the thesis measured its Table 4.1 on is not known; its claim on speed rests on `python -m benchmarks "

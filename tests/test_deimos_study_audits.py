@@ -133,6 +133,17 @@ def test_stairs_are_told_from_flat_ground():
     assert Locomotion.risk_contrast(Ground("stairs-up", "waves")) is None
 
 
+def test_the_ground_of_studies_has_stairs_and_flat_places():
+    """Robots on the rough ground of the presets stand on stairs, and on slopes of level 0, which are flat."""
+    from deimos.run.presets import preset
+
+    env = preset("quad-rough").env.for_evaluation().resolved(CPU).build(audits.PLACES, CPU, 0)
+    risky, safe = env.risk_contrast()
+    tiles = env.tiles()
+    assert {tiles[i][0] for i in risky.tolist()} == {"stairs-up", "stairs-down"}
+    assert {tiles[i] for i in safe.tolist()} == {("slope-up", 0), ("slope-down", 0)}
+
+
 def test_map_counts_places_and_goals():
     """Every axis of every choice is one count, at the place of its world and that of its goal."""
     place, chosen = torch.tensor([[-1.0, 0.0], [1.0, 2.0]]), torch.tensor([[1.0, 0.01], [-1.0, -5.0]])

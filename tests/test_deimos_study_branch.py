@@ -1,6 +1,7 @@
 """Studies whose cells branch off one run, and cells whose environment is built from files."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ from deimos.sim.envs import particle
 from deimos.study import cell as worker
 from deimos.study import plan
 from deimos.study.folder import StudyFolder
+from deimos.study.results import check_comparable, identity
 
 CONFIG = TrainConfig(
     env=particle.Config(goal_period=8, max_speed=40.0), method="p25", ppo=PPOConfig(num_steps=8, hidden=(16, 16)),
@@ -83,6 +85,48 @@ def test_the_checkpoint_is_part_of_the_hash(origin, tmp_path):
     study.add([moved])
     with pytest.raises(RunError, match="the file of 'branch_from' is not the one that it was made with"):
         worker.run(study, study.cells()[0])
+
+
+def moved(origin, path, added=b""):
+    """A copy of a run, with more at the end of its checkpoint."""
+    shutil.copytree(origin, path)
+    with (path / "checkpoint.pt").open("ab") as file:
+        file.write(added)
+
+
+def test_every_seed_may_have_a_run_of_its_own(origin, tmp_path):
+    """``{seed}`` in a text is the seed: methods share what their seed began with, and all seeds one setting."""
+    for seed in (1, 2):
+        moved(origin, tmp_path / f"run_{seed}", bytes(seed))
+    (tmp_path / "pool_1").write_bytes(b"1")
+    (tmp_path / "pool_2").write_bytes(b"2")
+    study = described(str(tmp_path / "run_{seed}"), train={"eval": {"pool": str(tmp_path / "pool_{seed}")}})
+    cells = plan.expand(study, seeds="1-2")
+    found = [(cell.config.seed, cell.branch_from.name, cell.config.eval.pool.name, cell.by_seed) for cell in cells]
+    assert found == [(seed, f"run_{seed}", f"pool_{seed}", ("pool", "branch_from")) for seed in (1, 1, 2, 2)]
+    assert len({cell.setting for cell in cells}) == 1
+    first, second, third, fourth = (cell.block for cell in cells)
+    assert first == second != third == fourth
+    assert len({cell.digest for cell in cells}) == 4
+    check_comparable(map(identity, cells))
+    assert plan.expand(described(origin), seeds=[1])[0].block == ""
+
+
+def test_policies_that_began_elsewhere_are_no_pair(origin, tmp_path):
+    """A seed whose run was made anew between two methods is refused; a file that all seeds share stays a setting."""
+    study, cells = described(str(tmp_path / "run_{seed}")), []
+    for method in ("uniform", "p75"):
+        moved(origin, tmp_path / "run_1", method.encode())
+        cells += plan.expand(study, seeds=[1], methods=[method])
+        shutil.rmtree(tmp_path / "run_1")
+    with pytest.raises(
+        RunError, match="The cells of seed 1 in environment 'after' began with 2 different sets of files"
+    ):
+        check_comparable(map(identity, cells))
+    moved(origin, tmp_path / "other", b"x")
+    cells = [*plan.expand(described(origin), seeds=[1]), *plan.expand(described(tmp_path / "other"), seeds=[2])]
+    with pytest.raises(RunError, match="run with 2 different settings"):
+        check_comparable(map(identity, cells))
 
 
 def test_a_cell_begins_where_the_run_ended(origin, tmp_path):

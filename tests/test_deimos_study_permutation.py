@@ -110,3 +110,36 @@ def test_spread_does_not_see_the_middle():
     shifted = permutation.p_values([x + 100, y], ONE, "spread", permutations=999)
     assert shifted == (pytest.approx(permutation.p_values([x, y], ONE, "spread", permutations=999)[0]), shifted[1])
     assert shifted[1] <= 0.01
+
+
+def mean_difference(x, y):
+    """The mean difference of two samples that belong together."""
+    return (x - y).mean(axis=-1)
+
+
+def test_blocks_of_two_are_sign_flips():
+    """Of two samples in blocks every pattern of signs counts once: the p-value is that of all of them."""
+    x, y = np.array([3.0, 1.0, 4.0, 1.0, 5.0]), np.array([1.0, 2.0, 1.0, 0.5, 2.0])
+    signs = np.array(list(itertools.product([1, -1], repeat=5)))
+    flipped = signs @ (x - y)
+    expected = (flipped >= (x - y).sum() - 1e-12).mean(), (flipped <= (x - y).sum() + 1e-12).mean()
+    assert permutation.p_values_in_blocks([x, y], mean_difference) == pytest.approx(expected)
+    assert permutation.p_values_in_blocks([y + 9, y], mean_difference) == (1 / 32, 1.0)
+
+
+def test_blocks_take_away_what_they_share():
+    """A small difference in every pair is found however far apart the pairs are; without blocks it is not."""
+    base = 10.0 * np.arange(8)
+    samples = [base + 0.1, base]
+    order = permutation.superiority_in_blocks([(0, 1)])
+    more, less = permutation.p_values_in_blocks(samples, order)
+    assert (more, less, order(*samples)) == (1 / 256, 1.0, 1.0)
+    assert permutation.p_values(samples, [(0, 1)], "superiority")[0] > 0.3
+
+
+def test_labels_are_permuted_within_blocks_alone():
+    """Of three samples in two blocks there are 36 orders, and one of them has the first ahead in both, by most."""
+    samples = [np.array([5.0, 50.0]), np.array([1.0, 20.0]), np.array([2.0, 10.0])]
+    pairs = [(0, 1), (0, 2)]
+    more, less = permutation.p_values_in_blocks(samples, permutation.superiority_in_blocks(pairs))
+    assert (more, less) == pytest.approx((4 / 36, 1.0))  # the other two in either order, in either block

@@ -8,8 +8,8 @@ from scipy import stats as scipy_stats
 
 from deimos.study import permutation, stats
 from reproduction import claim_tests
-from reproduction.claim_tests import Alike, Best, Highest, Mostly, Ordered, falling, versus
-from reproduction.measures import NAIVE, SCORE, Evidence, Place
+from reproduction.claim_tests import Alike, Best, Highest, Matters, Mostly, Ordered, falling, versus
+from reproduction.measures import ATTACKED, NAIVE, SCORE, Evidence, Place
 
 HERE = Place("directional", 100)
 
@@ -100,9 +100,9 @@ def test_mostly_is_the_sign_test():
 
 def test_detectable_share_has_the_promised_power():
     """A share that large keeps to the sign test's bound in 80 % of all samples; of five nothing is found."""
-    share = claim_tests.detectable_share(10)
+    share = stats.detectable_share(10)
     assert scipy_stats.binom(10, share).sf(8) == pytest.approx(0.8)  # 9 of 10 is p = 0.02, 8 of 10 is 0.11
-    assert claim_tests.detectable_share(5) == math.inf
+    assert stats.detectable_share(5) == math.inf
 
 
 def test_detectable_spread_has_the_promised_power():
@@ -149,3 +149,81 @@ def test_best_is_chosen_and_tested_on_different_seeds():
     assert (found.chosen, found.interval.estimate, found.n) == ("p10 against uniform", 1.0, {"p10": 5, "uniform": 5})
     assert found.verdict == "holds"
     assert test.find(only({name: x[:4] for name, x in rates.items()}), HERE) is None
+
+
+def in_blocks(method_values, column="crash_rate", **more):
+    """The evidence of ``only`` where the policies of a seed began with the same one."""
+    found = only(method_values, column, **more)
+    rows = [row | {"block": f"base {row['seed']}"} for own in found.rows.values() for row in own.values()]
+    return Evidence(rows)
+
+
+BASE = 10.0 ** -np.arange(1.0, 7.0)  # six bases, of which each crashes ten times as often as the next
+
+
+def test_policies_are_compared_within_their_bases():
+    """A method that is better on each of six bases is better, though bases differ by much more; apart nothing shows."""
+    values = {"vds": 1.2 * BASE, "uniform": BASE, "rnd": 1.1 * BASE[:5]}
+    test = Ordered(NAIVE, (("vds", "uniform"),))
+    found, apart = test.find(in_blocks(values), HERE), test.find(only(values), HERE)
+    assert (found.interval.estimate, found.p_for, found.verdict) == (1.0, 2 / 64, "holds")
+    assert apart.verdict == "undecided"
+    three = Ordered(NAIVE, versus(["vds", "rnd"], ["uniform"])).find(in_blocks(values), HERE)
+    assert three.n == {"vds": 5, "uniform": 5, "rnd": 5}  # the bases that all of them have
+
+
+def test_five_bases_cannot_order_two_methods():
+    """Five signs of five are p = 1/16 on both sides: the clause is undecided, and says that nothing would be found."""
+    found = Ordered(NAIVE, (("vds", "uniform"),)).find(in_blocks({"vds": 2 * BASE[:5], "uniform": BASE[:5]}), HERE)
+    assert (found.p_for, found.verdict, found.detectable) == (2 / 32, "undecided", math.inf)
+    groups = Ordered(NAIVE, versus(["rnd", "vds"], ["uniform"]))
+    values = {"vds": 2 * BASE[:5], "rnd": 2.1 * BASE[:5], "uniform": BASE[:5]}
+    assert groups.find(in_blocks(values), HERE).verdict == "holds"  # of three in five blocks there are 6^5 orders
+    assert math.isfinite(groups.find(in_blocks(values), HERE).detectable)
+
+
+def test_bases_widen_no_spread_and_hide_no_equivalence():
+    """Within blocks methods are alike whose bases differ, and a method is wider whose policies move apart on them."""
+    base = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
+    near = in_blocks({"vds": 1.05 * base, "uniform": base})
+    found = Alike(NAIVE, "vds", "uniform").find(near, HERE)
+    assert (found.verdict, found.interval.estimate) == ("holds", pytest.approx(1.05, rel=1e-3))
+    assert Alike(NAIVE, "vds", "uniform").find(only({"vds": 1.05 * base, "uniform": base}), HERE).verdict == "undecided"
+    wide = in_blocks({"vds": 0.5 + 3 * (BASE - BASE.mean()), "uniform": 0.5 + (BASE - BASE.mean())})
+    spread = Ordered(NAIVE, (("vds", "uniform"),), spread=True).find(wide, HERE)
+    assert spread.interval.estimate == pytest.approx(3.0)
+    assert spread.p_for < spread.p_against
+
+
+def test_verdicts_on_bases_are_seldom_wrong():
+    """Of studies in which two methods differ on no base but by noise, at most one in twenty has a verdict."""
+    rng, wrong, studies = np.random.default_rng(5), 0, 200
+    for _ in range(studies):
+        base = rng.normal(0.0, 3.0, 8)
+        values = {name: np.exp(base + rng.normal(0.0, 0.2, 8)) for name in ("vds", "uniform")}
+        wrong += Ordered(NAIVE, (("vds", "uniform"),)).find(in_blocks(values), HERE).verdict != "undecided"
+    # The count of 200 at 5 % is 10 on average; four standard deviations above.
+    assert wrong <= 10 + 4 * math.sqrt(200 * 0.05 * 0.95)
+
+
+def test_a_base_counts_once_in_a_sign_test():
+    """Policies of several methods from one base are one vote, by their mean."""
+    data = in_blocks({"p25": [1.0] * 6, "p75": [-0.5] * 6, "p90": [2.0] * 3}, "score")
+    found = Mostly(SCORE, ("p25", "p75", "p90")).find(data, HERE)
+    assert found.p_for == pytest.approx(scipy_stats.binomtest(6, 6).pvalue)
+    assert found.n == {"p25": 6, "p75": 6, "p90": 3}
+
+
+def test_bases_are_exchanged_as_a_whole():
+    """Whether more hangs on the method is asked of whole bases: of six there are 64 exchanges, not one per policy."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for goals, effect in (("naive", 0.0), ("argmax", 3.0)):
+        values = {name: np.exp(effect * i + rng.normal(size=6)) for i, name in enumerate(("coop", "p25", "vds", "rnd"))}
+        rows += [row for own in in_blocks(values, goals=goals).rows.values() for row in own.values()]
+    test = Matters(ATTACKED, NAIVE, ("coop", "p25", "vds", "rnd"))
+    paired = test.find(Evidence(rows), HERE)
+    assert paired.interval.estimate > 0.3
+    assert paired.p_for == pytest.approx(2 / 64, abs=0.03)  # of 999 random exchanges
+    apart = test.find(Evidence([{**row, "block": ""} for row in rows]), HERE)
+    assert apart.p_for <= paired.p_for

@@ -1,13 +1,20 @@
 """The studies of the thesis, as files: what is in them, and that their cells are still those of the committed rows."""
 
+import dataclasses
 import os
 import subprocess
 from pathlib import Path
 
 import pytest
+import torch
 
+from deimos.checks import RunError
+from deimos.run import training
+from deimos.run.config import kind, to_dict
+from deimos.run.folder import RunFolder
 from deimos.study import plan
 from deimos.study.results import check_comparable, identity
+from reproduction import legged_bases
 from reproduction.thesis import DIRECTOR_METHODS, LEGGED_METHODS, PARTICLE_METHODS
 
 PARTICLE_VARIANTS = ("directional", "relative", "absolute")
@@ -17,6 +24,9 @@ STUDIES = ROOT / "reproduction" / "studies"
 FILES = {path.stem: path for path in [*STUDIES.glob("*.toml"), *(ROOT / "examples").glob("*.toml")]}
 BLOCKS = {f"particle_{letter}": count for letter, count in zip("abcdef", (330, 90, 40, 40, 80, 80), strict=True)}
 """The blocks of the populations of Particle Gym, with their numbers of cells."""
+BRANCHES = {"legged": (25, (100, 500)), "legged_long": (4, (100, 500)), "legged_warp": (4, (100,)),
+            "legged_arm": (12, (100,))}  # fmt: skip
+"""The populations of robots that branch off bases, with their numbers of cells and the T of their evaluations."""
 
 
 @pytest.fixture
@@ -29,12 +39,27 @@ def pools(tmp_path, monkeypatch, new_plugins):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.fixture
+def bases(pools, tmp_path):
+    """The same with the bases of robots as their script describes them, whose networks are a few bytes, and pools."""
+    for robot, own in legged_bases.ROBOTS.items():
+        for index in range(len(own.seeds)):
+            name = legged_bases.base_name(robot, index)
+            config = legged_bases.base_config(own, len(own.stages) - 1, index)
+            config = dataclasses.replace(config, env=config.env.resolved(torch.device("cpu")))
+            folder = RunFolder.create(tmp_path / "docs" / "results" / "legged" / name)
+            folder.write_json("config.json", {"schema": training.SCHEMA, "config": to_dict(config)})
+            (folder.path / "checkpoint.pt").write_text(name)
+            (tmp_path / "reproduction" / "pool" / f"{name}.pt").write_text(name)
+
+
 def test_every_study_of_the_thesis_is_there():
-    """Particle Gym has its blocks and their base, each robot its study."""
-    assert set(FILES) == {*BLOCKS, "particle", "quad", "quad_arm", "population", "pilots", "study", "sweep"}
+    """Particle Gym has its blocks and their base, each robot its study and its branches."""
+    others = {"particle", "quad", "quad_arm", "population", "pilots", "study", "sweep"}
+    assert set(FILES) == {*BLOCKS, *BRANCHES} | others
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if not name.startswith("quad")])
+@pytest.mark.parametrize("name", [name for name in FILES if not name.startswith(("quad", "legged"))])
 def test_studies_of_particle_gym_expand(name, pools):
     """Every study of Particle Gym is a valid grid of different cells."""
     cells = plan.expand(plan.read(FILES[name]))
@@ -51,6 +76,42 @@ def test_blocks_make_one_table(pools):
     for name in BLOCKS:
         (more,) = plan.rounds(plan.read(FILES[name]))
         assert (more.attackers, more.seeds) == (("argmax-long", "search", "q-fear"), (0, 3, 6, 9))
+
+
+@pytest.mark.parametrize("name", BRANCHES)
+def test_branches_are_pairs(name, bases):
+    """Every seed of a study of branches is a base of its robot, which its methods share, and all are one setting."""
+    cells = plan.expand(plan.read(FILES[name]))
+    count, periods = BRANCHES[name]
+    assert len({cell.digest for cell in cells}) == len({cell.name for cell in cells}) == len(cells) == count
+    check_comparable(map(identity, cells))
+    assert {cell.goal_periods for cell in cells} == {periods}
+    robot = "quad_arm" if name == "legged_arm" else "quad"
+    for cell in cells:
+        own = f"{robot}_base_{cell.config.seed}"
+        assert (cell.branch_from.name, kind(cell.config.env).replace("-", "_")) == (own, robot)
+        assert cell.config.eval.pool is None or cell.config.eval.pool.stem == own
+        assert cell.config.critic_warmup == 10
+    assert len({cell.block for cell in cells}) == len({cell.config.seed for cell in cells})
+    transitions = {cell.config.num_envs * cell.config.env_steps for cell in cells}
+    assert [round(x / 1e6, 1) for x in transitions] == [1.5 if robot == "quad_arm" else 2.0]
+
+
+def test_branches_differ_in_what_they_are_about(bases):
+    """Quad's studies differ by the T of the training and by the engine alone, and by the worlds of the evaluation."""
+    quad, long, warp = (plan.expand(plan.read(FILES[name]))[0] for name in list(BRANCHES)[:3])
+    assert (quad.config.env.goal_period, long.config.env.goal_period) == (100, 500)
+    assert (quad.config.env.engine, warp.config.env.engine) == ("native", "warp")
+    assert dataclasses.replace(long.config, env=quad.config.env) == quad.config
+    assert dataclasses.replace(warp.config, env=quad.config.env, eval=quad.config.eval) == quad.config
+    assert dataclasses.replace(long.config.env, goal_period=100) == quad.config.env
+    assert {cell.environment for cell in (quad, long, warp)} == {"quad", "quad_long", "quad_warp"}
+
+
+def test_bases_are_not_needed_to_have_their_studies(pools):
+    """A study of branches whose bases are not trained yet is refused in one line that names what is missing."""
+    with pytest.raises(RunError, match="quad_base_1"):
+        plan.expand(plan.read(FILES["legged"]))
 
 
 def test_studies_are_the_thesis(pools):

@@ -132,6 +132,10 @@ class Data:
         found = [set(self._samples.get((where, name), {})) for name in methods]
         return sorted(set.intersection(*found)) if found else []
 
+    def paired(self, environment: str) -> bool:
+        """Whether methods are compared seed by seed: those of a seed began with the same files (``Cell.block``)."""
+        return any(row["environment"] == environment and row.get("block") for row in self.rows)
+
     def sample(self, where: Where, method: str, metric: str, seeds: Sequence[int] | None = None) -> Array:
         """The values of a metric over the seeds of a method, in the seeds' order; NaN are left out.
 

@@ -153,7 +153,7 @@ def _curve(axes: "Axes", data: Data, environment: str, name: str, column: str) -
     curves, steps = data.curves(environment, name, column), data.curves(environment, name, "env_steps")
     length = min(map(len, curves))
     window = max(1, round(WINDOW * length))
-    low, middle, high = np.quantile([_rolling(curve[:length], window) for curve in curves], [0.25, 0.5, 0.75], axis=0)
+    low, middle, high = np.quantile([rolling(curve[:length], window) for curve in curves], [0.25, 0.5, 0.75], axis=0)
     line(axes, data.style, name, steps[0][:length], middle, (low, high), every=max(1, length // 8), alpha=0.18)
 
 
@@ -185,6 +185,6 @@ def legend(
     figure.legend(handles=handles, frameon=False, **where)
 
 
-def _rolling(x: Array, window: int) -> Array:
+def rolling(x: Array, window: int) -> Array:
     """Mean of the last ``window`` values; of fewer at the start."""
     return np.convolve(x, np.ones(window))[: len(x)] / np.minimum(np.arange(1, len(x) + 1), window)

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from deimos.study.stats import Array, Statistic
 
@@ -37,6 +38,15 @@ def superiority(pairs: Pairs) -> Statistic:
     def statistic(*samples: Array) -> Array:
         wins = [np.sign(samples[a][..., :, None] - samples[b][..., None, :]).mean(axis=(-2, -1)) for a, b in pairs]
         return 0.5 + np.mean(wins, axis=0) / 2
+
+    return statistic
+
+
+def superiority_in_blocks(pairs: Pairs) -> Statistic:
+    """The same of samples whose i-th values belong together: how often the first has more, within their blocks."""
+
+    def statistic(*samples: Array) -> Array:
+        return 0.5 + np.mean([np.sign(samples[a] - samples[b]).mean(axis=-1) for a, b in pairs], axis=0) / 2
 
     return statistic
 
@@ -90,6 +100,31 @@ def p_values(
     slack = 1e-9 * (1 + np.abs(found[:, :1]))  # the same value, summed in another order
     more, less = (found >= found[:, :1] - slack).mean(axis=1), (found <= found[:, :1] + slack).mean(axis=1)
     return more.reshape(shape), less.reshape(shape)
+
+
+def p_values_in_blocks(
+    samples: Sequence[Array], statistic: Statistic, *, permutations: int | None = None, seed: int = 0
+) -> tuple[float, float]:
+    """One-sided p-values of a statistic being as large as it is, and as small, of samples that are compared in blocks.
+
+    The i-th values of all samples are a block (policies that began with the same one), and labels are permuted within
+    blocks alone: of two samples, the signs of their differences are flipped. Where there are not more such orders than
+    ``permutations`` the p-values are exact.
+
+    Args:
+        samples: At least two, each of shape (n,).
+        statistic: Of the samples; the larger, the more has what is claimed to have more.
+        permutations: How many random ones at most; ``None``: ``PERMUTATIONS``.
+        seed: Of the permutations.
+    """
+    more, less = (
+        stats.permutation_test(
+            samples, lambda *x, axis: statistic(*x), permutation_type="samples", vectorized=True,
+            n_resamples=permutations or PERMUTATIONS, alternative=side, rng=np.random.default_rng(seed),
+        ).pvalue
+        for side in ("greater", "less")
+    )  # fmt: skip
+    return float(more), float(less)
 
 
 def _blocks(studies: int, permutations: int, number: int) -> Iterator[tuple[slice, slice]]:

@@ -42,6 +42,7 @@ _ENVIRONMENT_KEYS: dict[str, tuple[type, type | None]] = _OWN | {
     "name": (str, None), "preset": (str, None), "env": (dict, None), "goal_periods": (list, int),
 }  # fmt: skip
 _GRID = {"env", "method", "selector", "seed", "evaluation"}  # of TrainConfig: the grid's, not the settings'
+_SEED = "{seed}"  # stands for the number in texts of a study's file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +67,8 @@ class Cell:
     """Folder of the run that it branches off; ``None`` to begin from nothing."""
     sources: dict[str, str] = field(default_factory=dict)
     """What the numbers depend on beside all this: the ``code``, and by their SHA-256 the plugins and ``files``."""
+    by_seed: tuple[str, ...] = ()
+    """Names of the ``files`` that are another one for each seed."""
 
     def __post_init__(self) -> None:
         check_at_least("audit_worlds", self.audit_worlds, 0)
@@ -84,10 +87,23 @@ class Cell:
 
     @cached_property
     def setting(self) -> str:
-        """The same of what the cells of one environment must share to be compared: all but selector, seed, plugins."""
+        """The same of what the cells of one environment must share to be compared: all but selector, seed, plugins.
+
+        Nor the files that are another one for each seed; see ``block``.
+        """
         shared = {name: value for name, value in self._config().items() if name not in ("method", "selector", "seed")}
-        common = {name: value for name, value in self.sources.items() if name not in self.plugins}
+        own = (*self.plugins, *self.by_seed)
+        common = {name: value for name, value in self.sources.items() if name not in own}
         return _digest(config=shared, goal_periods=list(self.goal_periods), sources=common)
+
+    @cached_property
+    def block(self) -> str:
+        """The same of the files that all cells of a seed have in common, and no other seed; empty without such files.
+
+        Methods are compared within a block: what they began with is then no chance.
+        """
+        own = {name: value for name, value in self.sources.items() if name in self.by_seed}
+        return _digest(sources=own) if own else ""
 
     @cached_property
     def selector(self) -> str:
@@ -162,6 +178,8 @@ def read(path: Path) -> dict:
       ``deimos.run.presets``, where its environment and settings come from that are not said;
     * ``branch_from``: folder of a run that all cells branch off, or those of an environment (``deimos.run.branch``);
       what is not said is as it was there, and critics learn first;
+    * ``{seed}`` in the name of a file or of a run stands for the number of the seed: each seed branches off a run of
+      its own, say, and methods are compared in pairs, seed by seed;
     * ``factors`` and ``design``: see ``deimos.study.factors``;
     * ``audit_worlds``: see ``Cell``;
     * ``plugins``: names of modules that register selectors, attackers or environments;
@@ -217,18 +235,60 @@ def expand(
     wanted = names if environments is None else environments
     numbers = parse_seeds(description.get("seeds", 10) if seeds is None else seeds)
     import_plugins(description.get("plugins", ()))
+    said: dict | None = None
+    cells: list[Cell] = []
     try:
-        points = factors.expand(description.get("factors", {}), description.get("design", {}))
-        grid = [
-            cell for name, table in zip(names, tables, strict=True) if name in wanted
-            for index, point in enumerate(points)
-            for cell in _environment(table, description, methods, train or {}, point, _place(index, len(points)))
-        ]  # fmt: skip
-        made_by = {"code": code().name}
-        grid = [replace(cell, sources=made_by | hashes(cell.plugins, cell.files)) for cell in grid]
-        return [replace(cell, config=replace(cell.config, seed=seed)) for seed in numbers for cell in grid]
+        for seed in numbers:
+            own = _with_seed(description, seed)
+            if own != said:  # most studies say the same for every seed
+                said, grid = own, _grid(description, own, wanted, methods, train or {})
+            cells += [replace(cell, config=replace(cell.config, seed=seed)) for cell in grid]
     except (AttributeError, RecursionError, TypeError, ValueError) as error:  # of from_dict and the configurations
         raise RunError(one_line(error)) from error
+    return cells
+
+
+def _with_seed(value: Any, seed: int) -> Any:
+    """A description in which texts have the number of a seed in its place."""
+    match value:
+        case str():
+            return value.replace(_SEED, str(seed))
+        case dict():
+            return {name: _with_seed(each, seed) for name, each in value.items()}
+        case list():
+            return [_with_seed(each, seed) for each in value]
+    return value
+
+
+def _grid(
+    pattern: dict, study: dict, wanted: Collection[str], methods: Sequence[str] | None, train: dict
+) -> list[Cell]:
+    """The cells of one seed, without its number.
+
+    Args:
+        pattern: The description as the file has it.
+        study: The same with the number of the seed in its texts.
+        wanted: Names of environments.
+        methods: See ``expand``.
+        train: See ``expand``.
+    """
+    points, made_by = factors.expand(study.get("factors", {}), study.get("design", {})), {"code": code().name}
+    grid = [
+        replace(cell, by_seed=_by_seed(raw, pattern))
+        for raw, table in zip(pattern["environment"], study["environment"], strict=True)
+        if raw.get("name", "") in wanted
+        for index, point in enumerate(points)
+        for cell in _environment(table, study, methods, train, point, _place(index, len(points)))
+    ]
+    return [replace(cell, sources=made_by | hashes(cell.plugins, cell.files)) for cell in grid]
+
+
+def _by_seed(table: dict, study: dict) -> tuple[str, ...]:
+    """Names of the files of an environment's cells that are another one for each seed."""
+    train = merged(study.get("train", {}), table.get("train", {}))
+    origin, pool = table.get("branch_from", study.get("branch_from")), train.get("eval", {}).get("pool")
+    texts = {**table.get("env", {}), "pool": pool, "branch_from": origin}
+    return tuple(name for name, text in texts.items() if _SEED in str(text))
 
 
 def _place(index: int, count: int) -> str:

@@ -22,7 +22,8 @@ from deimos.study import figures, stats
 from deimos.study.data import Data, Style, Where
 from deimos.study.document import Block, to_html, to_markdown
 from deimos.study.figures import Figures
-from deimos.study.outcomes import SAFE, attacked, base_of, of_environment, of_factors, settings_of
+from deimos.study.outcomes import SAFE, Attacked, attacked, base_of, of_environment, of_factors, settings_of
+from deimos.study.permutation import superiority_in_blocks
 from deimos.study.plan import Cell
 from deimos.study.stats import Array
 
@@ -172,13 +173,11 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
     hard, easy = attacked(data, environment, period), Where(environment, "naive", period)
     names = data.methods(environment)
     under_attack = {name: data.sample(hard.where, name, hard.metric) for name in names}
-    base, rows, by_attacker = under_attack.get(data.style.reference, np.array([])), [], []
+    rows, by_attacker = [], []
     for name, rate in under_attack.items():
         score = data.sample(easy, name, "score")
         doses = [*data.delivered(environment, name).values()]
-        better = "-"
-        if name != data.style.reference and min(len(rate), len(base)) >= 2:
-            better = f"{stats.probability_of_improvement([(base, rate)]):.2f}"
+        better = _safer(data, hard, name) if name != data.style.reference else "-"
         rows.append({
             "method": name, "seeds": str(max(len(rate), len(score))),
             f"policies below {SAFE:g} % [%]": _share(100 * rate < SAFE),
@@ -196,6 +195,18 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
         f"Crashes per interaction under {hard.by}, the score under uniform goals; with 95 % intervals over policies.",
         rows, "Mean crashes per interaction [%] by who chooses the goals:", by_attacker,
     ]  # fmt: skip
+
+
+def _safer(data: Data, hard: Attacked, method: str) -> str:
+    """P(safer than the reference); where methods are compared seed by seed, how often it is, over seeds."""
+    both, paired = (data.style.reference, method), data.paired(hard.where.environment)
+    seeds = data.seeds(hard.where, both) if paired else None
+    base, rate = (data.sample(hard.where, name, hard.metric, seeds) for name in both)
+    if min(len(base), len(rate)) < 2:
+        return "-"
+    if paired:
+        return f"{stats.bootstrap([base, rate], superiority_in_blocks([(0, 1)]), paired=True):.2f}"
+    return f"{stats.probability_of_improvement([(base, rate)]):.2f}"
 
 
 def distributions(data: Data) -> list[Block]:

@@ -28,6 +28,7 @@ _CELL: dict[str, type] = {
     "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
     # The environment in the study's file, the levels of its factors there, and the code that made the row.
     "base_environment": str, "levels": dict, "code": str,
+    "block": str,  # a hash of the files that are another one for each seed; none where all seeds have the same
 }  # fmt: skip
 RESULT_COLUMNS = _CELL | {
     # What was run.
@@ -62,6 +63,7 @@ FORMER_NAMES = {"selected_share": "selected_fraction"}
 """Columns of version 0.1.0 that have another name today."""
 LATER_COLUMNS = {
     "goal_groups", "uninformed", "even_interactions", "even_interaction_crashes", "base_environment", "levels", "code",
+    "block",
     "worst", "worst_attacker", "worst_interactions", "goal_percentile", "fear_chosen", "fear_auroc", "fear_fitted",
     *AUDITS,
 }  # fmt: skip
@@ -199,7 +201,7 @@ def identity(cell: Cell) -> Row:
         "environment": cell.environment, "method": cell.config.label, "seed": cell.config.seed,
         "hash": cell.digest, "setting": cell.setting, "selector": cell.selector, "num_envs": cell.config.num_envs,
         "base_environment": cell.base_environment or cell.environment, "levels": cell.levels,
-        "code": cell.sources.get("code"),
+        "code": cell.sources.get("code"), "block": cell.block,
     }  # fmt: skip
 
 
@@ -238,12 +240,13 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
 
 
 def check_comparable(rows: Iterable[Row]) -> None:
-    """Raise ``RunError`` unless an environment has one setting, and a method in it one selector.
+    """Raise ``RunError`` unless an environment has one setting, a method in it one selector, and a seed one block.
 
     ``rows`` are of either kind, or the identities of cells.
     """
-    settings, selectors, codes = defaultdict(set), defaultdict(set), defaultdict(set)
+    settings, selectors, codes, blocks = defaultdict(set), defaultdict(set), defaultdict(set), defaultdict(set)
     for row in rows:
+        blocks[row["environment"], row["seed"]].add(row.get("block") or "")
         codes[row["environment"], row.get("goals", "training")].add(row["code"])
         settings[row["environment"]].add(row["setting"])
         selectors[row["environment"], row["method"]].add(row["selector"])
@@ -264,6 +267,12 @@ def check_comparable(rows: Iterable[Row]) -> None:
             raise RunError(
                 f"Method '{method}' stands for {len(found)} different selectors in environment '{environment}' "
                 f"({', '.join(sorted(found))}), which are no one population; keep one of them in a folder."
+            )
+    for (environment, seed), found in blocks.items():
+        if len(found) > 1:
+            raise RunError(
+                f"The cells of seed {seed} in environment '{environment}' began with {len(found)} different sets of "
+                f"files ({', '.join(sorted(found))}) and are no pairs; keep those of one in a folder."
             )
 
 

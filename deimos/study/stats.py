@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import optimize, stats
 
 Array = NDArray[np.float64]
 Statistic = Callable[..., Array]
@@ -72,24 +72,25 @@ def cvar(x: Array, share: float = 0.2) -> Array:
 
 
 def distribution(
-    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0
+    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0, paired: bool = False
 ) -> Array:
     """A statistic of resamples that are drawn from every sample with replacement, shape (resamples,).
 
-    This is the stratified bootstrap, with one sample per stratum (method or task).
+    This is the stratified bootstrap, with one sample per stratum (method or task). ``paired`` samples have the same
+    length, and their values are drawn together.
     """
     with np.errstate(invalid="ignore"):  # scipy's own interval, which is not used, where a value is infinite
         return stats.bootstrap(
             [_checked(x) for x in samples], lambda *x, axis: statistic(*x), vectorized=True,
-            n_resamples=resamples or RESAMPLES, method="percentile", rng=np.random.default_rng(seed),
+            n_resamples=resamples or RESAMPLES, method="percentile", rng=np.random.default_rng(seed), paired=paired,
         ).bootstrap_distribution  # fmt: skip
 
 
 def bootstrap(
-    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0
+    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0, paired: bool = False
 ) -> Interval:
     """Percentile interval of a statistic by the stratified bootstrap; see ``distribution``."""
-    values = distribution(samples, statistic, resamples=resamples, seed=seed)
+    values = distribution(samples, statistic, resamples=resamples, seed=seed, paired=paired)
     return Interval(float(statistic(*map(_checked, samples))), *_ends(values))
 
 
@@ -111,6 +112,15 @@ def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Int
 
     low, high = _ends(distribution([x], student, resamples=resamples, seed=seed))
     return Interval(mean, mean - high * error, mean - low * error)
+
+
+def student(x: Array) -> Interval:
+    """Student's interval of the mean: exact for normal samples, and the one for a handful of differences of pairs."""
+    x = _checked(x)
+    mean, error = float(x.mean()), float(stats.sem(x))
+    if error == 0.0:
+        return Interval(mean, mean, mean)
+    return Interval(mean, *map(float, stats.t.interval(LEVEL, len(x) - 1, mean, error)))
 
 
 def share(holds: NDArray[np.bool_]) -> Interval:
@@ -182,6 +192,33 @@ def detectable_probability(n: int, m: int, alpha: float = 0.05) -> float:
         return math.inf
     z = stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(POWER)
     return min(1.0, 0.5 + float(z) * math.sqrt((n + m) / (12 * n * m)))
+
+
+def detectable_share(n: int, alpha: float = 0.05) -> float:
+    """Smallest share above 1/2 that the two-sided sign test finds with a power of 80 %.
+
+    Infinite where even n of n is not significant.
+    """
+    enough = [count for count in range(n) if 2 * stats.binom.cdf(count, n, 0.5) <= alpha]
+    return 1 - float(stats.beta.ppf(1 - POWER, enough[-1] + 1, n - enough[-1])) if enough else math.inf
+
+
+def detectable_mean(x: Array) -> float:
+    """Smallest mean that ``student`` tells from 0 with a power of 80 %, of normal samples of ``x``'s size and spread.
+
+    By the noncentral t distribution [1]_.
+
+    References:
+        .. [1] Cohen, *Statistical Power Analysis for the Behavioral Sciences*, 2nd ed., 1988, chapter 2.
+    """
+    x = _checked(x)
+    n = len(x)
+    critical = float(stats.t.ppf(ENDS[1], n - 1))
+
+    def lacking(effect: float) -> float:
+        return POWER - float(stats.nct.sf(critical, n - 1, effect * math.sqrt(n)))
+
+    return optimize.brentq(lacking, 0.0, 20.0) * float(x.std(ddof=1))
 
 
 def _ends(values: Array) -> tuple[float, float]:

@@ -284,8 +284,11 @@ class Locomotion(WarpEnv):
         return (0.0,) * walk + (None,) * sum(others)
 
     def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
-        """See ``Env.risk_contrast``: as they are, on stairs and on flat ground (thesis, 4.1)."""
-        shapes = [shape for shape, _ in self.tiles()]
+        """See ``Env.risk_contrast``: as they are, on stairs and on flat ground (thesis, 4.1).
+
+        Smooth slopes are flat on level 0.
+        """
+        shapes = ["flat" if shape.startswith("slope") and not level else shape for shape, level in self.tiles()]
         risky, safe = (
             torch.tensor([i for i, shape in enumerate(shapes) if shape.startswith(kind)], device=self.device)
             for kind in ("stairs", "flat")

@@ -1,0 +1,263 @@
+"""What goal selection does to policies that walk already: methods compared in pairs, base by base (legged.md).
+
+    python -m reproduction.legged_contrasts FOLDER    # of the merged studies; the report of the folder has it too
+
+The contrasts of p75, vds+p75 and penalty-30 against uniform at T2 are primary; all others are exploratory, and those of
+Quad+arm, of another engine and of T10 in training are estimates of a few bases.
+"""
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from deimos.run.folder import RunFolder
+from deimos.study import permutation, stats
+from deimos.study.data import Data
+from deimos.study.document import Block, to_markdown
+from deimos.study.results import Row
+from deimos.study.stats import Array, Interval
+from reproduction.claim_list import CLAIMS
+from reproduction.claims import Clause
+from reproduction.legged_bases import KEPT_IN, LONG, ROBOTS, SHORT, base_name
+from reproduction.measures import PENALTIES, SCORE, Evidence, Measure, Numbers, Place
+from reproduction.thesis import LEGGED, LEGGED_METHODS
+
+REFERENCE = "uniform"
+PRIMARY = ("p75", "vds+p75", "penalty-30")
+CORE_HOURS = {"quad": 1.6, "quad_arm": 0.5}
+"""What one more method takes on all bases of a robot (legged.md)."""
+LONGER_HOURS = {"quad": 2.7, "quad_arm": 1.3}
+"""What the evaluation of its policies at T10 takes."""
+TITLES = {
+    ("quad", 100): "Quad at T2", ("quad", 500): "Quad at T10, trained at T2",
+    ("quad_long", 100): "Quad at T2, trained at T10", ("quad_long", 500): "Quad at T10, trained at T10",
+    ("quad_on_warp", 100): "Quad at T2, evaluated on mujoco-warp",
+    ("quad_warp", 100): "Quad at T2, trained and evaluated on mujoco-warp",
+    ("quad_arm", 100): "Quad+arm at T2", ("quad_arm", 500): "Quad+arm at T10",
+}  # fmt: skip
+"""Of the places where methods are compared, in order."""
+ENGINES = {
+    "quad": "native", "quad_on_warp": "native, judged on mujoco-warp", "quad_warp": "mujoco-warp",
+}  # fmt: skip
+"""Environments of Quad by the engine of training and evaluation."""
+TEXT = (
+    "Paired differences, base by base, fine-tuned from common base policies, 12 M of the thesis's 295 M transitions. A "
+    "log rate is log(crashes + 1/2) - log(interactions + 1); worst is the worst of the attackers. p is that of flipped "
+    "signs, exact and one-sided: that the method is better (a higher score, a lower rate); five bases reach 1/32 at "
+    "best. Found: the smallest mean difference that as many bases with this spread would have shown in 80 %."
+)
+
+
+def log_rate(crashes: float, interactions: float) -> float:
+    """Logarithm of crashes per interaction, defined where nothing crashed."""
+    return math.log(crashes + 0.5) - math.log(interactions + 1.0)
+
+
+def _naive(row: Row) -> float:
+    return log_rate(row["interaction_crashes"], row["interactions"])
+
+
+def _worst(row: Row) -> float:
+    count = row.get("worst_interactions", math.nan)
+    return math.nan if math.isnan(count) else log_rate(round(row["worst"] * count), count)
+
+
+def _of_naive_rows(number: Callable[[Row], float]) -> Callable[[Evidence, Place, str], Numbers]:
+    def numbers(evidence: Evidence, place: Place, method: str) -> Numbers:
+        return {seed: number(row) for seed, row in evidence.evaluations(place, "naive", method).items()}
+
+    return numbers
+
+
+NAIVE = Measure("log rate (Naive)", _of_naive_rows(_naive))
+WORST = Measure("log rate (worst)", _of_naive_rows(_worst))
+OUTCOMES = {SCORE: 1, NAIVE: -1, WORST: -1}
+"""What is compared, and the sign of what is better."""
+
+
+def mean_difference(x: Array, y: Array) -> Array:
+    """Of samples whose i-th values belong together."""
+    return np.asarray((x - y).mean(axis=-1))
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A method against another on the bases that both branched off; two at least."""
+
+    method: str
+    """The method."""
+    reference: str
+    """What it is compared with."""
+    measure: Measure
+    """The outcome; one of ``OUTCOMES``."""
+    bases: tuple[int, ...]
+    """Their numbers."""
+    values: Array
+    """Of the method and of the reference, shape (2, bases)."""
+
+    @property
+    def differences(self) -> Array:
+        """Of every base, shape (bases,)."""
+        return np.subtract(*self.values)
+
+    @cached_property
+    def mean(self) -> Interval:
+        """The mean difference with Student's interval."""
+        return stats.student(self.differences)
+
+    @cached_property
+    def p(self) -> float:
+        """Exact one-sided p-value of the method being better, by flipping signs."""
+        more, less = permutation.p_values_in_blocks([*self.values], mean_difference)
+        return more if OUTCOMES[self.measure] > 0 else less
+
+    @cached_property
+    def detectable(self) -> float:
+        """Smallest mean difference that as many bases with the observed spread would have shown in 80 %."""
+        return stats.detectable_mean(self.differences)
+
+    def row(self, *, judged: bool) -> dict[str, str]:
+        """Its line in a table; only estimates unless ``judged``."""
+        verdict = {"p (better)": f"{self.p:.3g}", "found": f"{self.detectable:.3g}"} if judged else {}
+        return {
+            "contrast": f"{self.method} - {self.reference}", "outcome": self.measure.name,
+            "bases": str(len(self.bases)), "mean difference [95 %]": f"{self.mean:+.3g}",
+            "of every base": ", ".join(f"{x:+.3g}" for x in self.differences), **verdict,
+        }  # fmt: skip
+
+
+def contrast(evidence: Evidence, place: Place, method: str, reference: str, measure: Measure) -> Contrast | None:
+    """A contrast in a place; ``None`` unless two bases or more have both methods."""
+    own, other = (measure(evidence, place, name) for name in (method, reference))
+    bases = tuple(sorted(own.keys() & other.keys()))
+    if len(bases) < 2:
+        return None
+    values = np.array([[each[base] for base in bases] for each in (own, other)])
+    return Contrast(method, reference, measure, bases, values)
+
+
+def contrasts(evidence: Evidence, place: Place, methods: Sequence[str], reference: str = REFERENCE) -> list[Contrast]:
+    """The contrasts of some methods against one in a place, in all outcomes that are known there."""
+    found = [contrast(evidence, place, name, reference, each) for name in methods for each in OUTCOMES]
+    return [each for each in found if each is not None]
+
+
+def blocks(evidence: Evidence) -> list[Block]:
+    """The section of a report; nothing unless a study has methods that branched off the same bases."""
+    found: list[Block] = []
+    for environment, period in TITLES:
+        place = Place(environment, period)
+        if evidence.paired(place) and period in [each.period for each in evidence.places(environment)]:
+            found += _tables(evidence, place)
+    if not found:
+        return []
+    return ["## Methods in pairs, base by base", TEXT, *found, *_engines(evidence), *bases(), *not_run(evidence)]
+
+
+def _tables(evidence: Evidence, place: Place) -> list[Block]:
+    """The contrasts of a place: the primary ones first where there are some."""
+    known = [name for name in evidence.methods if evidence.evaluations(place, "naive", name) and name != REFERENCE]
+    others = contrasts(evidence, place, sorted(set(known) - set(PRIMARY)))
+    others += contrasts(evidence, place, ["vds+p75"], "vds")
+    first, title = contrasts(evidence, place, PRIMARY), TITLES[place.environment, place.period]
+    if place.environment != "quad":
+        return _table(f"{title}: estimates", first + others, judged=False)
+    kind = "primary contrasts" if place.period == SHORT else "exploratory"
+    return [*_table(f"{title}: {kind}", first, judged=True), *_table(f"{title}: exploratory", others, judged=True)]
+
+
+def _table(title: str, found: Sequence[Contrast], *, judged: bool) -> list[Block]:
+    return [f"### {title}", [each.row(judged=judged) for each in found]] if found else []
+
+
+def _engines(evidence: Evidence) -> list[Block]:
+    """p75 against uniform, base by base, in one engine and in the other; nothing where one of them was not used."""
+    rows = []
+    for measure in (SCORE, NAIVE):
+        found = {
+            title: dict(zip(each.bases, each.differences, strict=True)) for name, title in ENGINES.items()
+            if (each := contrast(evidence, Place(name, SHORT), "p75", REFERENCE, measure)) is not None
+        }  # fmt: skip
+        if len(found) > 1:
+            rows += [
+                {"base": str(base), "outcome": measure.name}
+                | {title: f"{own[base]:+.3g}" if base in own else "-" for title, own in found.items()}
+                for base in sorted(set().union(*found.values()))
+            ]
+    return ["### p75 - uniform on both engines, at T2", rows] if rows else []
+
+
+def bases(folder: Path = KEPT_IN) -> list[Block]:
+    """What the bases are before anything branches off; nothing where they are not there."""
+    found: list[Block] = []
+    for robot, own in ROBOTS.items():
+        homes = [RunFolder(folder / base_name(robot, index)) for index in range(len(own.seeds))]
+        homes = [home for home in homes if (home.path / "evaluation.json").exists()]
+        judged = {
+            (home.path.name, row["goal_period"]): row for home in homes for row in home.read_rows("evaluation.json")
+        }
+        rows = []
+        for period in own.judged:
+            numbers = [_of_base(home, judged[home.path.name, period]) for home in homes]
+            rows += [
+                {"base": home.path.name, "T": str(period)} | {name: f"{x:.3g}" for name, x in each.items()}
+                for home, each in zip(homes, numbers, strict=True)
+            ]
+            if len(numbers) > 1:
+                rows.append({"base": "mean ± standard deviation", "T": str(period)} | {
+                    name: f"{np.mean(x):.3g} ± {np.std(x, ddof=1):.2g}"
+                    for name in numbers[0] if (x := [each[name] for each in numbers])
+                })  # fmt: skip
+        found += [f"### The bases of {robot}", rows] if rows else []
+    return found
+
+
+def _of_base(home: RunFolder, row: Row) -> dict[str, float]:
+    last = home.read_csv("progress.csv")[-1]
+    return {
+        "score": row["score"], "crashes per interaction [%]": 100 * row["crash_rate"], "log rate": _naive(row),
+        **({"level at the end of training": float(last["level"])} if "level" in last else {}),
+    }  # fmt: skip
+
+
+def not_run(evidence: Evidence) -> list[Block]:
+    """What the thesis's claims on robots speak of and was not run, with what it would take."""
+    rows = []
+    for robot in LEGGED:
+        places = [place for place in evidence.places(robot) if evidence.paired(place)]
+        ran = {name for name in evidence.methods for place in places if evidence.evaluations(place, "naive", name)}
+        lacking = {
+            name: (_claims(robot, lambda clause, name=name: name in clause.test.methods), CORE_HOURS[robot])
+            for name in (*LEGGED_METHODS, *PENALTIES) if name not in ran
+        }  # fmt: skip
+        if LONG not in [place.period for place in places]:
+            lacking["T10"] = _claims(robot, lambda clause: LONG in clause.periods), LONGER_HOURS[robot]
+        rows += [
+            {"robot": robot, "not run": name, "claims that speak of it": text, "would take [core-hours]": f"{hours:g}"}
+            for name, (text, hours) in lacking.items() if text
+        ]  # fmt: skip
+    return ["### Not run", rows] if rows else []
+
+
+def _claims(robot: str, about: Callable[[Clause], bool]) -> str:
+    """The claims that have clauses about something on a robot."""
+    return ", ".join(
+        claim.id for claim in CLAIMS
+        if any(robot in clause.environments and about(clause) for clause in claim.clauses)
+    )  # fmt: skip
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    print(to_markdown(blocks(Evidence.of(Data.read(parser.parse_args().folder))), ""))
+
+
+if __name__ == "__main__":
+    main()

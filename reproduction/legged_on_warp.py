@@ -1,0 +1,83 @@
+"""Judge the policies of ``studies/legged.toml``, which were trained on the native engine, on mujoco-warp.
+
+    python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp    # again to continue what was killed
+    python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp --methods uniform p75 --seeds 1-2
+
+Uniform goals at T2, as ``studies/legged_warp.toml`` has them. The rows are those of an environment of its own,
+``quad_on_warp``, in a folder that ``deimos study merge`` takes.
+"""
+
+import argparse
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+
+from deimos.checks import RunError
+from deimos.run.evaluation import EvalConfig, evaluate_run
+from deimos.run.folder import RunFolder
+from deimos.sim.legged.config import LocomotionConfig
+from deimos.sim.shared import one_stream
+from deimos.study.folder import StudyFolder
+from deimos.study.plan import Cell, parse_seeds
+from deimos.study.results import result
+from deimos.study.source import check_sources
+from reproduction.legged_bases import SHORT
+
+ENVIRONMENT = "quad_on_warp"
+EVALUATION = EvalConfig(worlds=256, steps=2100, attackers=())
+
+
+def on_warp(cell: Cell) -> Cell:
+    """The cell that a policy's rows on mujoco-warp are of: another engine and evaluation of the same training."""
+    env = cast(LocomotionConfig, cell.config.env.with_goal_period(SHORT))
+    config = replace(cell.config, env=replace(env, engine=cast(Any, "warp")), eval=EVALUATION)
+    sources = {name: value for name, value in cell.sources.items() if name != "pool"}  # nobody attacks
+    return replace(
+        cell, environment=ENVIRONMENT, base_environment=ENVIRONMENT, config=config, goal_periods=(SHORT,),
+        sources=sources,
+    )  # fmt: skip
+
+
+def judge(study: StudyFolder, out: StudyFolder, methods: Collection[str], seeds: Collection[int]) -> None:
+    """Put the results of a study's finished policies of some methods and seeds, all where none are given, into ``out``.
+
+    Raises:
+        RunError: If there are no such policies, or other code trained them.
+    """
+    cells = [
+        cell for cell in study.cells()
+        if cell.environment == "quad" and (not methods or cell.config.label in methods)
+        and (not seeds or cell.config.seed in seeds) and (study.cell_path(cell) / "result.json").exists()
+    ]  # fmt: skip
+    if not cells:
+        raise RunError(f"{study.path} holds no finished policies of these methods and seeds.")
+    device = torch.device("cpu")
+    for cell in cells:
+        check_sources(f"Cell {cell.name}", {"code": cell.sources["code"]}, (), {})
+        run, own = RunFolder.open(study.cell_path(cell) / "run"), on_warp(cell)
+        out.add([own])
+        home = RunFolder(out.cell_path(own))
+        if not (home.path / "result.json").exists():
+            with one_stream(device):
+                rows = evaluate_run(run, own.config.env, own.config.eval, device, again=False)
+            home.write_json("result.json", result(own, run, rows))
+        print(own.name, flush=True)
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", type=Path)
+    parser.add_argument("out", type=Path, help="folder of the results, which is a study's too")
+    parser.add_argument("--methods", nargs="+", default=[])
+    parser.add_argument("--seeds", default="", help="of the bases, as a study has them")
+    options = parser.parse_args()
+    seeds = parse_seeds(options.seeds) if options.seeds else []
+    judge(StudyFolder(options.study), StudyFolder(options.out), options.methods, seeds)
+
+
+if __name__ == "__main__":
+    main()
