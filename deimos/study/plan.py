@@ -20,7 +20,7 @@ from deimos.goals.selector import SelectorConfig
 from deimos.run import presets, training
 from deimos.run.attack import attacker
 from deimos.run.branch import branch_config, check_branch
-from deimos.run.config import from_dict, to_dict
+from deimos.run.config import from_dict, multiplied, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
@@ -33,6 +33,7 @@ SCHEMA = 2  # of cell.json
 MOST_SEEDS = 100_000
 _OWN: dict[str, tuple[type, type | None]] = {
     "methods": (list, str), "train": (dict, None), "audit_worlds": (int, None), "branch_from": (str, None),
+    "pools": (str, None),
 }  # fmt: skip
 _KEYS: dict[str, tuple[type, type | None]] = _OWN | {
     "base": (str, None), "plugins": (list, str), "environment": (list, dict), "factors": (dict, None),
@@ -160,6 +161,8 @@ def read(path: Path) -> dict:
     * ``environment``: for each environment or variant its ``name``, ``env`` (``kind`` and fields) and, if they differ
       there, ``methods``, ``train``, ``audit_worlds`` and ``goal_periods``; its ``preset`` is one of
       ``deimos.run.presets``, where its environment and settings come from that are not said;
+    * ``pools``: folder with a file NAME.pt for every environment, or those of an environment, which the attacker
+      ``pooled`` attacks with (``deimos study pool`` makes it);
     * ``branch_from``: folder of a run that all cells branch off, or those of an environment (``deimos.run.branch``);
       what is not said is as it was there, and critics learn first;
     * ``factors`` and ``design``: see ``deimos.study.factors``;
@@ -198,7 +201,8 @@ def expand(
         description: See ``read``.
         seeds: See ``parse_seeds``; in place of its own, as ``methods`` are, in every environment.
         methods: Names.
-        environments: Names of those to take; ``None`` for all.
+        environments: Names of those to take, with all points of a design or with one (``directional.3``); ``None`` for
+            all.
         train: Fields of ``TrainConfig`` that come before its own.
 
     Raises:
@@ -212,23 +216,31 @@ def expand(
         _check_table("An [[environment]]", table, _ENVIRONMENT_KEYS)
     names = [table.get("name", "") for table in tables]
     _check_unique("environment", names)
-    if unknown := [name for name in environments or () if name not in names]:
-        raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}.")
-    wanted = names if environments is None else environments
     numbers = parse_seeds(description.get("seeds", 10) if seeds is None else seeds)
     import_plugins(description.get("plugins", ()))
     try:
         points = factors.expand(description.get("factors", {}), description.get("design", {}))
+        places = [_place(index, len(points)) for index in range(len(points))]
+        _check_known(environments or (), names, places)
         grid = [
-            cell for name, table in zip(names, tables, strict=True) if name in wanted
-            for index, point in enumerate(points)
-            for cell in _environment(table, description, methods, train or {}, point, _place(index, len(points)))
+            cell for name, table in zip(names, tables, strict=True)
+            for place, point in zip(places, points, strict=True)
+            if environments is None or {name, name + place} & {*environments}
+            for cell in _environment(table, description, methods, train or {}, point, place)
         ]  # fmt: skip
         made_by = {"code": code().name}
         grid = [replace(cell, sources=made_by | hashes(cell.plugins, cell.files)) for cell in grid]
         return [replace(cell, config=replace(cell.config, seed=seed)) for seed in numbers for cell in grid]
     except (AttributeError, RecursionError, TypeError, ValueError) as error:  # of from_dict and the configurations
         raise RunError(one_line(error)) from error
+
+
+def _check_known(wanted: Sequence[str], names: Sequence[str], places: Sequence[str]) -> None:
+    """Raise ``RunError`` for a wanted environment that is neither one of these names nor a point of one."""
+    points = [name + place for name in names for place in places if place]
+    if unknown := [name for name in wanted if name not in {*names, *points}]:
+        ends = f", and their points {points[0]} to {points[-1]}" if points else ""
+        raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}{ends}.")
 
 
 def _place(index: int, count: int) -> str:
@@ -244,7 +256,9 @@ def _environment(
     if not name.replace("_", "").replace(".", "").isalnum():
         raise RunError(f"An [[environment]] must have a name of letters, digits, '.' and '_', got {shown(name)}.")
     shared, own = study.get("train", {}), table.get("train", {})
-    if taken := sorted((set(shared) | set(own)) & _GRID | set(point.fields) & (_GRID - {"env"})):
+    tried = {key: value for key, value in point.fields.items() if key != factors.TIMES}
+    times = check_kind("[factors] times", point.fields.get(factors.TIMES, {}), dict)
+    if taken := sorted((set(shared) | set(own)) & _GRID | (set(tried) | set(times)) & (_GRID - {"env"})):
         raise RunError(f"{', '.join(taken)} cannot stand in 'train' or be a factor: the grid of the study says it.")
     methods = list(table.get("methods", study.get("methods")) or [] if methods is None else methods)
     if not methods:
@@ -254,12 +268,15 @@ def _environment(
     stored = None if origin is None else training.read_config(RunFolder.open(Path(origin)))
     try:
         ready = _training_preset(table) if stored is None else _branch(table, stored)
-        tried = point.fields.get("env", {})
-        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried)))
+        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried.get("env", {}))))
+        env = multiplied(env, check_kind("[factors] times.env", times.get("env", {}), dict))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error
-    fields = reduce(merged, (ready, {"threads": 1}, shared, own, train, point.fields, {"env": to_dict(env)}))
-    configs = [from_dict(TrainConfig, fields | {"method": each}) for each in methods]
+    pools = table.get("pools", study.get("pools"))
+    pool = {} if pools is None else {"eval": {"pool": str(Path(pools, f"{name}{place}.pt"))}}
+    fields = reduce(merged, (ready, {"threads": 1}, pool, shared, own, train, tried, {"env": to_dict(env)}))
+    others = {key: value for key, value in times.items() if key != "env"}
+    configs = [multiplied(from_dict(TrainConfig, fields | {"method": each}), others) for each in methods]
     if stored is not None:
         try:
             for config in configs:
