@@ -250,9 +250,10 @@ def test_every_environment_has_a_pool_of_its_own(tmp_path):
 
     pools = {cell.environment: cell.config.eval.pool for cell in cells()}
     assert pools == {
-        **{f"near.{i}": shared / "other.pt" for i in range(3)}, **{f"far.{i}": shared / f"far.{i}.pt" for i in range(3)},
+        **{f"near.{i}": shared / "other.pt" for i in range(3)},
+        **{f"far.{i}": shared / f"far.{i}.pt" for i in range(3)},
         **{f"own.{i}": own / f"own.{i}.pt" for i in range(3)},
-    }  # fmt: skip
+    }
     before = [cell.digest for cell in cells()]
     (own / "own.1.pt").write_text("made anew")
     changed = {cell.environment for cell, digest in zip(cells(), before, strict=True) if cell.digest != digest}

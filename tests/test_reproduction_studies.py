@@ -1,12 +1,14 @@
 """The studies of the thesis, as files: what is in them, and that their cells are still those of the committed rows."""
 
+import itertools
 import os
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from deimos.study import plan
+from deimos.study import factors, plan
 from deimos.study.results import check_comparable, identity
 from reproduction.thesis import DIRECTOR_METHODS, LEGGED_METHODS, PARTICLE_METHODS
 
@@ -17,6 +19,9 @@ STUDIES = ROOT / "reproduction" / "studies"
 FILES = {path.stem: path for path in [*STUDIES.glob("*.toml"), *(ROOT / "examples").glob("*.toml")]}
 BLOCKS = {f"particle_{letter}": count for letter, count in zip("abcdef", (330, 90, 40, 40, 80, 80), strict=True)}
 """The blocks of the populations of Particle Gym, with their numbers of cells."""
+MAP = {f"multiverse{part}": count for part, count in
+       {"": 160, "_screening": 32, "_headroom": 1280, "_ours": 90, "_long": 12}.items()}  # fmt: skip
+"""The studies of the map, with their numbers of cells before a command says which methods and setting they are for."""
 
 
 @pytest.fixture
@@ -26,12 +31,16 @@ def pools(tmp_path, monkeypatch, new_plugins):
     folder.mkdir(parents=True)
     for name in PARTICLE_VARIANTS:
         (folder / f"{name}.pt").write_text(name)
+    screened = tmp_path / "runs" / "multiverse_screening" / "pools"
+    screened.mkdir(parents=True)
+    for number in range(32):
+        (screened / f"map.{number:02}.pt").write_text(str(number))
     monkeypatch.chdir(tmp_path)
 
 
 def test_every_study_of_the_thesis_is_there():
-    """Particle Gym has its blocks and their base, each robot its study."""
-    assert set(FILES) == {*BLOCKS, "particle", "quad", "quad_arm", "population", "pilots", "study", "sweep"}
+    """Particle Gym has its blocks and their base, the map its studies, each robot its own."""
+    assert set(FILES) == {*BLOCKS, *MAP, "particle", "quad", "quad_arm", "population", "pilots", "study", "sweep"}
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if not name.startswith("quad")])
@@ -39,7 +48,7 @@ def test_studies_of_particle_gym_expand(name, pools):
     """Every study of Particle Gym is a valid grid of different cells."""
     cells = plan.expand(plan.read(FILES[name]))
     assert len({cell.digest for cell in cells}) == len({cell.name for cell in cells}) == len(cells)
-    assert len(cells) == BLOCKS.get(name, len(cells))
+    assert len(cells) == (BLOCKS | MAP).get(name, len(cells))
 
 
 def test_blocks_make_one_table(pools):
@@ -51,6 +60,45 @@ def test_blocks_make_one_table(pools):
     for name in BLOCKS:
         (more,) = plan.rounds(plan.read(FILES[name]))
         assert (more.attackers, more.seeds) == (("argmax-long", "search", "q-fear"), (0, 3, 6, 9))
+
+
+def test_the_map_tells_its_factors_apart(pools):
+    """All 32 settings differ, no factor's levels follow from others', nor from the product of any two."""
+    description = plan.read(FILES["multiverse"])
+    cells = plan.expand(description, methods=["uniform"])
+    assert len({cell.setting for cell in cells}) == len({cell.environment for cell in cells}) == 32
+    levels = factors.labels(description["factors"])
+    assert [len(own) for own in levels.values()] == [2] * 8
+    columns = {name: np.array([2 * own.index(cell.levels[name]) - 1 for cell in cells]) for name, own in levels.items()}
+    for name, column in columns.items():
+        assert column.sum() == 0
+        others = [columns[other] for other in columns if other != name]
+        assert not any(column @ other for other in others)
+        assert not any(column @ (a * b) for a, b in itertools.combinations(others, 2))
+
+
+def test_the_map_is_what_its_plan_says(pools):
+    """Goals follow from variant and speed, pools from the setting; screening, map and confirmation differ in seeds."""
+    screening, cells = (plan.expand(plan.read(FILES[name])) for name in ("multiverse_screening", "multiverse"))
+    ranges = {(cell.config.env.variant, cell.config.env.max_speed, cell.config.env.goal_range) for cell in cells}
+    assert ranges == {
+        ("directional", 10.0, 10.0), ("directional", 10.0, 15.0), ("directional", 5.0, 5.0), ("directional", 5.0, 7.5),
+        *(("relative", speed, size) for speed in (5.0, 10.0) for size in (1250.0, 1875.0)),
+    }  # fmt: skip
+    assert {cell.config.eval.pool.stem == cell.environment for cell in cells} == {True}
+    assert {cell.config.eval.attackers for cell in cells} == {("argmax", "pooled", "scripted")}
+    assert {(cell.environment, cell.config.env, cell.config.ppo) for cell in screening} == {
+        (cell.environment, cell.config.env, cell.config.ppo) for cell in cells
+    }
+    chosen = plan.expand(plan.read(FILES["multiverse_headroom"]), environments=["map.07"], methods=["uniform", "p75"])
+    assert {cell.environment for cell in chosen} == {"map.07"}
+    assert {cell.config.env for cell in chosen} == {cell.config.env for cell in cells if cell.environment == "map.07"}
+    others = [plan.expand(plan.read(FILES[name])) for name in ("multiverse_ours", "multiverse_long", "particle_d")]
+    seeds = [{cell.config.seed for cell in own} for own in (screening, cells, *others)]
+    assert [len(own) for own in seeds] == [1, 1, 30, 3, 20]
+    assert sum(map(len, seeds)) == len(set.union(*seeds))
+    assert len({cell.config.seed for cell in chosen}) == 20
+    assert {cell.config.env_steps for cell in others[1]} == {48_000}
 
 
 def test_studies_are_the_thesis(pools):
