@@ -142,7 +142,7 @@ def headlines(roles: Roles) -> list[Headline]:
         return lambda found: found[other].worst - found[own].worst
 
     return [
-        Headline("danger is hidden", f"uniform policies crash more than {HIDDEN:g} times as often under attack",
+        Headline("danger is hidden", "uniform crashes more than twice as often under attack",
                  lambda found: found[UNIFORM].worst - HIDDEN * found[UNIFORM].naive),
         Headline("p is safer", f"{p} crashes less than uniform", safer(p, UNIFORM)),
         Headline("p is free", f"{p} has more than {LEAST_SCORE:g} of uniform's score",

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "#777777"
 CURVE = (
-    "every column is a setting, ordered by how many points of crashes per interaction under the worst attacker the "
-    "method has less than Uniform (up is safer); full dots have headroom. The line is the mean over settings with its "
+    "every column is a setting, ordered by how much less often the method crashes under the worst attacker than "
+    "Uniform, in points of interactions (up is safer); full dots have headroom. The line is the mean over settings with its "
     "95 % interval. Below: the difference of the scores, and the levels of the factors, dark where it is the one named."
 )
 ROOM = (
-    "By how much a method's policy crashes less than Uniform's, over how often Uniform's of another seed does. The line "
+    "By how much a method's policy crashes less than Uniform's, over how often that of another seed crashes. The line "
     "is what the instrumental variable finds: a slope of 1 removes all danger, one of 0 none. Both axes: crashes per "
     "interaction under the worst attacker, in percent."
 )
@@ -43,7 +43,7 @@ SHARES = (
 MOVES = (
     "By how much a factor moves the margin of a clause, from its first level to its second, with 95 % intervals that "
     "hold for all factors of a clause at once; red where they exclude 0. Margins: points of crashes per interaction "
-    "under the worst attacker, of *p is free* hundredths of the score."
+    "under the worst attacker; of the clause that p is free, hundredths of the score."
 )
 
 
@@ -67,7 +67,7 @@ def named(name: str) -> str:
 
 def level_named(name: str, level: Any) -> str:
     """A level of a factor."""
-    return f"{named(name)} x {level:g}" if name.startswith("times.") else f"{named(name)} {level}"
+    return f"{named(name)} x {level:g}" if name.startswith("times.") else f"{named(name)}: {level}"
 
 
 def curve(settings: Sequence[Setting], method: str) -> "Figure":
@@ -85,11 +85,12 @@ def curve(settings: Sequence[Setting], method: str) -> "Figure":
             panel.plot(place[chosen], values[chosen], linestyle="", marker="o", markersize=4.5, color=BLUE,
                        markerfacecolor=filling)  # fmt: skip
         panel.grid(axis="y", alpha=0.3)
+        panel.tick_params(axis="x", which="both", length=0)
     mean = stats.bootstrap([safer], lambda x: x.mean(axis=-1))
     axes[0, 0].axhspan(mean.low, mean.high, color=GREY, alpha=0.2, linewidth=0)
     axes[0, 0].axhline(mean.estimate, color=GREY, linewidth=1)
-    axes[0, 0].set_ylabel("crashes less than\nUniform [points]")
-    axes[1, 0].set_ylabel("score less\nUniform's")
+    axes[0, 0].set_ylabel("fewer crashes than\nUniform [points]")
+    axes[1, 0].set_ylabel("score minus\nUniform's")
     axes[0, 0].set_title(f"{method}: {mean:.1f} points in the mean over {len(settings)} settings")
     _matrix(axes[2, 0], levels, design[order])
     return figure
@@ -127,9 +128,9 @@ def over_headroom(settings: Sequence[Setting], methods: Sequence[str]) -> "Figur
         panel.set_xlim(-4, 104)
         panel.set_ylim(-104, 104)
     for panel in axes[-1]:
-        panel.set_xlabel("Uniform's, screening [%]")
+        panel.set_xlabel("Uniform, screening [%]")
     for panel in axes[:, 0]:
-        panel.set_ylabel("less than Uniform's\n[points]")
+        panel.set_ylabel("fewer crashes than\nUniform [points]")
     return figure
 
 
@@ -146,7 +147,7 @@ def shares(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure 
         if interval is None:
             return None
         panel.plot([100 * interval.low, 100 * interval.high], [i, i], color=BLUE, linewidth=1.5)
-        panel.plot(100 * interval.estimate, i, marker="o", color=BLUE, markersize=5)
+        panel.plot(100 * interval.estimate, i, marker="o", color=BLUE, markersize=5, clip_on=False)
     panel.axvline(50.0, color="black", linewidth=0.8, linestyle=":")
     panel.set_yticks(range(len(clauses)), [clause.text for clause in clauses])
     panel.set_ylim(len(clauses) - 0.5, -0.5)

@@ -65,7 +65,7 @@ def _screened(settings: Sequence[Setting]) -> list[Block]:
         for each in sorted(settings, key=lambda each: -each.screened.worst)
     ]  # fmt: skip
     moved = multiverse.moved_by(settings, 100 * np.array([each.screened.worst for each in settings]))
-    said = f"{room} of {len(settings)} settings have headroom: Uniform's attacked rate is above {HEADROOM:.0%}"
+    said = f"{room} of {len(settings)} settings have headroom: Uniform's attacked rate is above {100 * HEADROOM:g} %"
     return [
         "## Screening", f"{said}, which is {'enough' if enough else 'too few: adjust the levels as the plan says'}.",
         "Most headroom, at a score of " + (f"{LEARNT} or more: {chosen.name}." if chosen else f"{LEARNT}: none."), rows,
@@ -137,7 +137,7 @@ def _confirmed(data: Data, new: str) -> list[Block]:
             blocks.append(f"There are too few policies of {new}, or of others, for a contrast.")
             continue
         blocks += [
-            f"{new} beside the others. Intervals are at {multiverse.CONFIDENCE:.1%}, and p-values are Holm's over the "
+            f"{new} beside the others. Intervals are at {100 * multiverse.CONFIDENCE:.1f} %, and p-values are Holm's over the "
             f"rivals, times the {len(NEW)} selectors that were tried.", lines, *_winner(found, new),
         ]  # fmt: skip
     return blocks

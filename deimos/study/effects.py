@@ -46,7 +46,9 @@ def factor_effects(levels: Array, outcome: Array, *, permutations: int | None = 
     residuals = (outcomes - outcomes @ hat.T) / room
     effects = 2.0 * outcomes @ inverse[1:].T  # (studies, k)
     errors = 2.0 * np.sqrt(residuals**2 @ (inverse[1:] ** 2).T)
-    ratios = np.abs(effects) / np.maximum(errors, 1e-12)
+    rounding = 1e-12 * max(float(np.abs(outcome).max()), 1e-300)
+    effects[np.abs(effects) < rounding] = 0.0
+    ratios = np.abs(effects) / np.maximum(errors, rounding)
     widest = np.quantile(ratios[1:].max(axis=1), LEVEL)
     return [Interval(float(x), float(x - widest * e), float(x + widest * e))
             for x, e in zip(effects[0], errors[0], strict=True)]  # fmt: skip
