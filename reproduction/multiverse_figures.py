@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 BLUE, RED, GREY = "#0072B2", "#D55E00", "#777777"
 CURVE = (
     "every column is a setting, ordered by how much less often the method crashes under the worst attacker than "
-    "Uniform, in points of interactions (up is safer); full dots have headroom. The line is the mean over settings with its "
-    "95 % interval. Below: the difference of the scores, and the levels of the factors, dark where it is the one named."
+    "Uniform, in points of interactions (up is safer); full dots have headroom. The line is the mean over settings with "
+    "its 95 % interval. Below: the difference of the scores, and the levels of the factors, dark where it is the named "
+    "one."
 )
 ROOM = (
     "By how much a method's policy crashes less than Uniform's, over how often that of another seed crashes. The line "
