@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 BLUE, RED, GREY = "#0072B2", "#D55E00", "#777777"
 CURVE = (
     "every column is a setting, ordered by how much less often the method crashes under the worst attacker than "
-    "Uniform, in points of interactions (up is safer); full dots have headroom. The line is the mean over settings with "
+    "Uniform, in points of interactions; full dots have headroom. The line is the mean over settings, with "
     "its 95 % interval. Below: the difference of the scores, and the levels of the factors, dark where it is the named "
     "one."
 )

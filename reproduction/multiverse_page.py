@@ -137,7 +137,7 @@ def _confirmed(data: Data, new: str) -> list[Block]:
             blocks.append(f"There are too few policies of {new}, or of others, for a contrast.")
             continue
         blocks += [
-            f"{new} beside the others. Intervals are at {100 * multiverse.CONFIDENCE:.1f} %, p-values are Holm's over the "
+            f"{new} beside the others. Intervals are at {100 * multiverse.CONFIDENCE:.1f} %, p-values Holm's over the "
             f"rivals, times the {len(NEW)} selectors that were tried.", lines, *_winner(found, new),
         ]  # fmt: skip
     return blocks
