@@ -4,6 +4,7 @@ The unit is a setting: one policy of each method, all with the same seed. Rates 
 those under the worst attacker.
 """
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -97,6 +98,8 @@ def _policies(rows: Sequence[Row]) -> dict[str, dict[str, Policy]]:
             own = found.setdefault(row["environment"], {})
             if row["method"] in own:
                 raise RunError(f"The map has one seed; {row['environment']} has several of {row['method']}.")
+            if math.isnan(row["worst"]):
+                raise RunError(f"No attacker has met all policies of {row['environment']}, so none is the worst.")
             own[row["method"]] = Policy(row["crash_rate"], row["worst"], row["score"])
     return found
 

@@ -122,6 +122,9 @@ def test_small_sobol_sample_may_hide_a_factor_behind_another():
     assert len(same) > 0
     assert set(lines) == same
     assert "\n" not in factors.describe(eight, design | {"points": 32})
+    share = {"low": 0.0, "high": 1.0}
+    apart = {"env.low": [1], "env.high": [2], "env.rate": share, "env.gain": share}
+    assert "\n" not in factors.describe(apart, design)  # one level each, and a value of its own for every point
 
 
 def test_multiples_are_of_what_the_environment_has(tmp_path):

@@ -263,6 +263,12 @@ def test_what_is_no_map_is_refused(folders, tmp_path):
     none = written(tmp_path / "none", [("map.00", "rnd", 1, Policy(0, 0, 1))], points())
     with pytest.raises(RunError, match=r"must hold a policy of uniform for every setting; map\.00 has none"):
         multiverse.read(none)
+    table = folders[0] / "results.csv"
+    kept = [line for line in table.read_text().splitlines(keepends=True) if ",naive," in line or "adversary" in line]
+    (tmp_path / "naive").mkdir()
+    (tmp_path / "naive" / "results.csv").write_text("".join(kept))
+    with pytest.raises(RunError, match=r"No attacker has met all policies of map\.00, so none is the worst"):
+        multiverse.read(tmp_path / "naive")
     with pytest.raises(RunError, match="one pNN and one penalty; it has: none"):
         multiverse.Roles.of(multiverse.read(folders[0]))
 

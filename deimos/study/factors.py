@@ -111,7 +111,8 @@ def describe(factors: Mapping[str, Any], design: Mapping[str, Any]) -> str:
 
 def _same_split(first: Sequence[str], second: Sequence[str]) -> bool:
     """Whether two columns of levels split the points in the same way."""
-    return len({*zip(first, second, strict=True)}) == len({*first}) == len({*second}) < len(first)
+    pairs = {*zip(first, second, strict=True)}
+    return len(pairs) == len({*first}) == len({*second}) and 1 < len(pairs) < len(first)
 
 
 def _flat(factors: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
