@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from deimos.checks import RunError
-from deimos.study import factors, plan, stats
+from deimos.study import stats
 from deimos.study.data import Data
 from deimos.study.effects import factor_effects, instrumented_slope
 from deimos.study.outcomes import settings_of
@@ -24,7 +24,6 @@ from deimos.study.stats import Array, Interval
 from reproduction.claims import LEAST, holm
 from reproduction.measures import PENALTIES, SAFE
 
-STUDY = Path(__file__).parent / "studies" / "multiverse_screening.toml"
 UNIFORM, RND = "uniform", "rnd"
 NEW = ("weighted", "fear-novelty", "q-fear")
 """The new selectors."""
@@ -168,8 +167,13 @@ def share_that_holds(settings: Sequence[Setting], clause: Headline) -> Interval 
 
 
 def coded(settings: Sequence[Setting]) -> tuple[dict[str, list[Any]], Array]:
-    """The two levels of every factor of the plan, and the level of each setting as -1 or 1, shape (n, k)."""
-    levels = factors.labels(plan.read(STUDY)["factors"])
+    """The two levels of every factor, numbers first, and that of each setting as -1 or 1, shape (n, k)."""
+    levels = {
+        name: sorted({each.levels[name] for each in settings}, key=lambda level: (isinstance(level, str), level))
+        for name in settings[0].levels
+    }
+    if other := [name for name, own in levels.items() if len(own) != 2]:
+        raise RunError(f"The factors of the map must have two levels; {', '.join(other)} has not, in these settings.")
     table = [[2.0 * own.index(each.levels[name]) - 1.0 for name, own in levels.items()] for each in settings]
     return levels, np.array(table)
 

@@ -42,7 +42,7 @@ SHARES = (
     "two methods holds in half of them where the two do not differ."
 )
 MOVES = (
-    "By how much a factor moves the margin of a clause, from its first level to its second, with 95 % intervals that "
+    "By how much a factor moves the margin of a clause, towards the level that is named, with 95 % intervals that "
     "hold for all factors of a clause at once; red where they exclude 0. Margins: points of crashes per interaction "
     "under the worst attacker; of the clause that p is free, hundredths of the score."
 )

@@ -17,6 +17,7 @@ from reproduction.multiverse import NEW, Policy, Setting, Standing
 from reproduction.multiverse_figures import level_named
 from reproduction.multiverse_page import MultiverseOptions, write
 
+STUDY = Path(__file__).parent.parent / "reproduction" / "studies" / "multiverse_screening.toml"
 METHODS = ("uniform", "p75", "penalty-30", "rnd", *NEW)
 HALF = 10_000  # interactions in worlds of even number, and as many in others
 EMPTY = {str: "v", int: 100, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
@@ -32,7 +33,7 @@ def few_resamples(monkeypatch):
 @cache
 def points():
     """The levels of the plan's settings by their names."""
-    return {cell.environment: cell.levels for cell in plan.expand(plan.read(multiverse.STUDY))}
+    return {cell.environment: cell.levels for cell in plan.expand(plan.read(STUDY))}
 
 
 def written(folder, policies, levels=None):
@@ -86,9 +87,11 @@ def test_a_planted_effect_is_found_and_a_planted_absence_is_not():
 
     settings = simulated(rate, noise=0.05)
     moved = multiverse.moved_by(settings, multiverse.margins(settings, clause(settings, "p is safer")))
+    levels, _ = multiverse.coded(settings)
+    assert levels["horizon"] == ["long", "short"]
     assert next(iter(moved)) == "horizon"
     assert [name for name, effect in moved.items() if excludes(effect)] == ["horizon"]
-    true = np.mean([0.8 * each.policies["uniform"].worst for each in settings])
+    true = np.mean([-0.8 * each.policies["uniform"].worst for each in settings])
     assert moved["horizon"].low <= true <= moved["horizon"].high
     moved = multiverse.moved_by(settings, multiverse.margins(settings, clause(settings, "weighted is safer")))
     assert len(moved) == 8
@@ -269,6 +272,8 @@ def test_what_is_no_map_is_refused(folders, tmp_path):
     (tmp_path / "naive" / "results.csv").write_text("".join(kept))
     with pytest.raises(RunError, match=r"No attacker has met all policies of map\.00, so none is the worst"):
         multiverse.read(tmp_path / "naive")
+    with pytest.raises(RunError, match=r"must have two levels; env\.variant has not, in these settings"):
+        multiverse.coded([each for each in multiverse.read(folders[0]) if each.levels["env.variant"] == "relative"])
     with pytest.raises(RunError, match="one pNN and one penalty; it has: none"):
         multiverse.Roles.of(multiverse.read(folders[0]))
 
@@ -285,6 +290,7 @@ def test_specification_curve_is_in_order(folders):
     order = sorted(safer, key=safer.__getitem__)
     assert [y for _, y in drawn] == pytest.approx([safer[name] for name in order])
     levels, design = multiverse.coded(settings)
+    assert {levels["env.max_force"][0], levels["env.variant"][1]} == {1.0, "relative"}
     at = {each.name: row for each, row in zip(settings, design, strict=True)}
     assert np.array_equal(matrix.images[0].get_array(), np.array([at[name] > 0 for name in order]).T)
     assert [text.get_text() for text in matrix.get_yticklabels()] == [

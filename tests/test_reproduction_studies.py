@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deimos.study import factors, plan
+from deimos.study import plan
 from deimos.study.results import check_comparable, identity
 from reproduction.thesis import DIRECTOR_METHODS, LEGGED_METHODS, PARTICLE_METHODS
 
@@ -64,10 +64,9 @@ def test_blocks_make_one_table(pools):
 
 def test_the_map_tells_its_factors_apart(pools):
     """All 32 settings differ, no factor's levels follow from others', nor from the product of any two."""
-    description = plan.read(FILES["multiverse"])
-    cells = plan.expand(description, methods=["uniform"])
+    cells = plan.expand(plan.read(FILES["multiverse"]), methods=["uniform"])
     assert len({cell.setting for cell in cells}) == len({cell.environment for cell in cells}) == 32
-    levels = factors.labels(description["factors"])
+    levels = {name: [*dict.fromkeys(cell.levels[name] for cell in cells)] for name in cells[0].levels}
     assert [len(own) for own in levels.values()] == [2] * 8
     columns = {name: np.array([2 * own.index(cell.levels[name]) - 1 for cell in cells]) for name, own in levels.items()}
     for name, column in columns.items():

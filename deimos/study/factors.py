@@ -63,12 +63,6 @@ def expand(factors: Mapping[str, Any], design: Mapping[str, Any]) -> list[Point]
     return [_point(levels) for levels in chosen]
 
 
-def labels(factors: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """The levels of every factor that is a list, in order, as ``Point.levels`` names them."""
-    flat = _flat(factors).items()
-    return {name: [_label(level) for level in levels] for name, levels in flat if isinstance(levels, list)}
-
-
 def aliases(generators: Mapping[str, Sequence[str]], factors: Sequence[str]) -> tuple[int, list[str]]:
     """What a fractional design cannot tell apart.
 
