@@ -74,7 +74,7 @@ def read(screening: Path, map_: Path | None = None) -> list[Setting]:
         map_: That of the map; settings that are not whole there are left out. ``None`` where it has not run.
 
     Raises:
-        RunError: If there are no results, or not one policy of Uniform for each setting.
+        RunError: If there are no results, not one policy of Uniform for each setting, or no setting that is whole.
     """
     data = Data.read(screening)
     levels, screened = settings_of(data), _policies(data.rows)
@@ -86,7 +86,10 @@ def read(screening: Path, map_: Path | None = None) -> list[Setting]:
     if lacking := [name for name, own in screened.items() if UNIFORM not in own]:
         raise RunError(f"{screening} must hold a policy of {UNIFORM} for every setting; {lacking[0]} has none.")
     settings = [Setting(name, levels[name], screened[name][UNIFORM], found.get(name, {})) for name in sorted(screened)]
-    return [each for each in settings if each.policies.keys() == {*methods}]
+    whole = [each for each in settings if each.policies.keys() == {*methods}]
+    if not whole:
+        raise RunError(f"{map_} has no setting yet in which all of {', '.join(methods)} have finished.")
+    return whole
 
 
 def _policies(rows: Sequence[Row]) -> dict[str, dict[str, Policy]]:

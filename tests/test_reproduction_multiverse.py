@@ -274,6 +274,10 @@ def test_what_is_no_map_is_refused(folders, tmp_path):
         multiverse.read(tmp_path / "naive")
     with pytest.raises(RunError, match=r"must have two levels; env\.variant has not, in these settings"):
         multiverse.coded([each for each in multiverse.read(folders[0]) if each.levels["env.variant"] == "relative"])
+    parts = [(name, method, 1, Policy(0, 0, 1)) for name, method in (("map.00", "rnd"), ("map.01", "p75"))]
+    halves = written(tmp_path / "halves", parts)
+    with pytest.raises(RunError, match=r"halves has no setting yet in which all of p75, rnd have finished"):
+        multiverse.read(folders[0], halves)
     with pytest.raises(RunError, match="one pNN and one penalty; it has: none"):
         multiverse.Roles.of(multiverse.read(folders[0]))
 
