@@ -170,21 +170,27 @@ def share_that_holds(settings: Sequence[Setting], clause: Headline) -> Interval 
 
 
 def coded(settings: Sequence[Setting]) -> tuple[dict[str, list[Any]], Array]:
-    """The two levels of every factor, numbers first, and that of each setting as -1 or 1, shape (n, k)."""
+    """The levels of every factor, numbers first, and that of each setting as -1 or 1, shape (n, k)."""
     levels = {
         name: sorted({each.levels[name] for each in settings}, key=lambda level: (isinstance(level, str), level))
         for name in settings[0].levels
     }
-    if other := [name for name, own in levels.items() if len(own) != 2]:
-        raise RunError(f"The factors of the map must have two levels; {', '.join(other)} has not, in these settings.")
+    if other := [name for name, own in levels.items() if len(own) > 2]:
+        raise RunError(f"The factors of the map must have two levels; {', '.join(other)} has more.")
     table = [[2.0 * own.index(each.levels[name]) - 1.0 for name, own in levels.items()] for each in settings]
     return levels, np.array(table)
 
 
 def moved_by(settings: Sequence[Setting], outcome: Array) -> dict[str, Interval]:
-    """By how much every factor moves an outcome of the settings, the strongest first; see ``factor_effects``."""
+    """By how much every factor moves an outcome of the settings, the strongest first; see ``factor_effects``.
+
+    None where there are too few settings to tell the factors apart, as before all of them have finished.
+    """
     levels, design = coded(settings)
-    found = dict(zip(levels, factor_effects(design, outcome), strict=True))
+    try:
+        found = dict(zip(levels, factor_effects(design, outcome), strict=True))
+    except ValueError:
+        return {}
     return dict(sorted(found.items(), key=lambda each: -abs(each[1].estimate)))
 
 

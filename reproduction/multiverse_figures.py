@@ -105,7 +105,7 @@ def _matrix(axes: "Axes", levels: dict[str, list[Any]], design: Array) -> None:
     axes.grid(which="minor", color="white", linewidth=1.5)
     axes.tick_params(which="both", length=0)
     axes.set_xticks([])
-    axes.set_yticks(range(len(levels)), [level_named(name, own[1]) for name, own in levels.items()])
+    axes.set_yticks(range(len(levels)), [level_named(name, own[-1]) for name, own in levels.items()])
     axes.set_xlabel("settings")
 
 
@@ -159,13 +159,14 @@ def shares(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure 
     return figure
 
 
-def moves(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure":
+def moves(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure | None":
     """What moves the margin of every clause."""
     columns = 4
     figure, axes = subplots(-(-len(clauses) // columns), columns, (WIDTH, 4.6), sharey=True)
     levels, _ = coded(settings)
     for panel, clause in zip(axes.flat, clauses, strict=False):
-        found = moved_by(settings, 100 * margins(settings, clause))
+        if not (found := moved_by(settings, 100 * margins(settings, clause))):
+            return None
         panel.axvline(0.0, color="black", linewidth=0.8)
         for i, name in enumerate(levels):
             effect = found[name]
@@ -175,7 +176,7 @@ def moves(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure":
         panel.set_title(clause.name)
         panel.grid(axis="x", alpha=0.3)
         panel.set_ylim(len(levels) - 0.5, -0.5)
-    texts = [f"{level_named(name, own[1])}" for name, own in levels.items()]
+    texts = [f"{level_named(name, own[-1])}" for name, own in levels.items()]
     axes[0, 0].set_yticks(range(len(levels)), texts)
     for panel in axes[-1]:
         panel.set_xlabel("points")

@@ -17,6 +17,7 @@ from reproduction.multiverse import AIM, AIM_SCORE, HEADROOM, LEARNT, LEAST_SCOR
 from reproduction.multiverse_figures import draw, level_named, named
 
 FIGURES = "figures"
+TOO_FEW = "These settings are too few to tell the factors apart."
 ENOUGH = 0.5  # of the settings with headroom: no other round of screening
 
 
@@ -69,7 +70,7 @@ def _screened(settings: Sequence[Setting]) -> list[Block]:
     return [
         "## Screening", f"{said}, which is {'enough' if enough else 'too few: adjust the levels as the plan says'}.",
         "Most headroom, at a score of " + (f"{LEARNT} or more: {chosen.name}." if chosen else f"{LEARNT}: none."), rows,
-        "What moves Uniform's attacked rate [points]:", _moves(settings, moved),
+        *(["What moves Uniform's attacked rate [points]:", _moves(settings, moved)] if moved else [TOO_FEW]),
     ]  # fmt: skip
 
 
@@ -79,6 +80,17 @@ def _moves(settings: Sequence[Setting], moved: dict[str, stats.Interval]) -> Blo
              "effect [95 %, of all factors at once]": f"{effect:.1f}"} for name, effect in moved.items()]  # fmt: skip
 
 
+def _moved_most(settings: Sequence[Setting], outcome: stats.Array) -> dict[str, str]:
+    """The factor that moves an outcome most, as the cells of a row."""
+    moved, (levels, _) = multiverse.moved_by(settings, outcome), multiverse.coded(settings)
+    if not moved:
+        return dict.fromkeys(("moved most by", "by", "beyond chance"), "-")
+    name, effect = next(iter(moved.items()))
+    beyond = effect.low > 0.0 or effect.high < 0.0
+    return {"moved most by": level_named(name, levels[name][1]), "by": f"{effect:.1f}",
+            "beyond chance": "yes" if beyond else "no"}  # fmt: skip
+
+
 def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
     """Headline clauses, standings and the selection."""
     room = [each for each in settings if each.has_headroom]
@@ -86,15 +98,11 @@ def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
     for clause in multiverse.headlines(Roles.of(settings)):
         share = multiverse.share_that_holds(settings, clause)
         margins = 100 * multiverse.margins(settings, clause)
-        moved = multiverse.moved_by(settings, margins)
-        levels, _ = multiverse.coded(settings)
-        name, effect = next(iter(moved.items()))
         rows.append({
             "clause": clause.text, f"holds in [%] of {len(room)} with headroom":
             "-" if share is None else f"{100 * share.estimate:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]",
             "mean margin": f"{stats.bootstrap([margins], lambda x: x.mean(axis=-1)):.2f}",
-            "moved most by": level_named(name, levels[name][1]), "by": f"{effect:.1f}",
-            "beyond chance": "yes" if effect.low > 0.0 or effect.high < 0.0 else "no",
+            **_moved_most(settings, margins),
         })  # fmt: skip
     standing = [
         {"method": each.method, "policies below 1 % [%]": f"{100 * each.safe.estimate:.0f}",

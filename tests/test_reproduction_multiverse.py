@@ -272,8 +272,9 @@ def test_what_is_no_map_is_refused(folders, tmp_path):
     (tmp_path / "naive" / "results.csv").write_text("".join(kept))
     with pytest.raises(RunError, match=r"No attacker has met all policies of map\.00, so none is the worst"):
         multiverse.read(tmp_path / "naive")
-    with pytest.raises(RunError, match=r"must have two levels; env\.variant has not, in these settings"):
-        multiverse.coded([each for each in multiverse.read(folders[0]) if each.levels["env.variant"] == "relative"])
+    three = [Setting(str(level), {"env.max_speed": level}, Policy(0, 0, 1)) for level in (5.0, 10.0, "inf")]
+    with pytest.raises(RunError, match=r"must have two levels; env\.max_speed has more"):
+        multiverse.coded(three)
     parts = [(name, method, 1, Policy(0, 0, 1)) for name, method in (("map.00", "rnd"), ("map.01", "p75"))]
     halves = written(tmp_path / "halves", parts)
     with pytest.raises(RunError, match=r"halves has no setting yet in which all of p75, rnd have finished"):
@@ -301,6 +302,21 @@ def test_specification_curve_is_in_order(folders):
         level_named(name, own[1]) for name, own in levels.items()
     ]
     assert "goal range x 1.5" in [text.get_text() for text in matrix.get_yticklabels()]
+
+
+def test_page_of_a_map_that_is_not_finished(folders, tmp_path):
+    """With settings that do not tell the factors apart the page says so, and has everything else."""
+    for folder in folders:
+        table = folder / "results.csv"
+        lines = table.read_text().splitlines(keepends=True)
+        table.write_text("".join([lines[0], *(line for line in lines if line[:6] in ("map.03", "map.15"))]))
+    assert multiverse.moved_by(multiverse.read(*folders), np.array([0.1, 0.2])) == {}
+    write(MultiverseOptions(out=tmp_path / "page", screening=folders[0], map=folders[1]))
+    text = (tmp_path / "page" / "multiverse.md").read_text()
+    assert "of 2 settings have headroom" in text
+    assert "These settings are too few to tell the factors apart." in text
+    assert "There are no data for this figure: By how much a factor moves" in text
+    assert (tmp_path / "page" / "figures" / "curve-p75.png").exists()
 
 
 def test_page_says_as_much_as_has_run(folders, tmp_path, capsys):
