@@ -1,5 +1,8 @@
 """Files for the attacker ``pooled``, one for every environment of a study, made by one command."""
 
+import subprocess
+import sys
+
 import pytest
 
 from deimos.checks import RunError
@@ -58,7 +61,7 @@ def test_a_pool_for_every_setting(screening, short_study, tmp_path, capsys):
     assert rows["directional.0"]["adversary_crashes"] == facts[0]["adversary_crashes"]
 
 
-def test_a_pool_that_is_there_stays(screening, tmp_path, capsys):
+def test_a_pool_that_is_there_stays(screening, tmp_path):
     """What was killed in the middle continues: files that are there keep their bytes, those that lack are made."""
     finish(screening)
     out = tmp_path / "pools"
@@ -67,9 +70,12 @@ def test_a_pool_that_is_there_stays(screening, tmp_path, capsys):
     first = slow.read_bytes()
     slow.unlink()
     fast.write_bytes(b"made before")
-    capsys.readouterr()
-    cli.PoolOptions(folder=screening.path, out=out).run()
-    assert capsys.readouterr().out.splitlines()[0] == f"{fast}: is there"
+    command = [sys.executable, "-m", "deimos", "study", "pool", str(screening.path), "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    first_line, second = done.stdout.splitlines()
+    assert first_line == f"{fast}: is there"
+    assert second.startswith(f"{slow}: no crashes")
     assert fast.read_bytes() == b"made before"
     assert slow.read_bytes() == first
 
