@@ -12,6 +12,8 @@ from rich.table import Table
 from deimos.checks import RunError, check_at_least
 from deimos.study.cli import ReportOptions
 from reproduction import coverage
+from reproduction.multiverse_page import MultiverseOptions
+from reproduction.multiverse_page import write as write_multiverse
 from reproduction.report import write
 
 
@@ -50,6 +52,11 @@ def report_claims(options: ClaimOptions) -> None:
     print(write(options.folder, options.out or options.folder, options.speeds))
 
 
+def report_multiverse(options: MultiverseOptions) -> None:
+    """Write the page of the map; for the errors see ``reproduction.multiverse_page.write``."""
+    print(write_multiverse(options))
+
+
 def print_coverage(options: CoverageOptions) -> None:
     """Print the table of coverages."""
     table = Table(title=f"Coverage of 95 % intervals, n = {options.seeds}", title_justify="left")
@@ -63,6 +70,7 @@ def print_coverage(options: CoverageOptions) -> None:
 
 COMMANDS: dict[str, tuple[type, Callable[..., None]]] = {
     "report": (ClaimOptions, report_claims),
+    "multiverse": (MultiverseOptions, report_multiverse),
     "coverage": (CoverageOptions, print_coverage),
 }
 """Options and function of every command."""

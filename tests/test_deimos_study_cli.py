@@ -123,7 +123,8 @@ def test_progress_counts_what_is_done():
 
 def test_every_command_explains_itself():
     """Every command has options that say in a sentence what it is for, and a documented way to run it."""
-    assert list(cli.COMMANDS) == ["run", "cell", "show", "attack", "pack", "unpack", "merge", "export", "report"]
+    assert list(cli.COMMANDS) == ["run", "cell", "show", "attack", "pool", "pack", "unpack", "merge", "export",
+                                  "report"]  # fmt: skip
     for options in cli.COMMANDS.values():
         assert options.__doc__.strip().endswith(".")
         assert options.run.__doc__

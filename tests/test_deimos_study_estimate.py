@@ -60,6 +60,28 @@ def test_estimate_is_of_finished_cells_where_there_are_any(tmp_path, monkeypatch
     assert said.endswith(f" = {3 * (transitions / 50_000.0 + steps / 1e6) / 3600:.2f} core-hours.")
 
 
+def test_a_large_design_is_estimated_by_a_sample(tmp_path, monkeypatch):
+    """Of many kinds of cells a few are measured, and the others take as long as these in the mean."""
+    study, measured = StudyFolder(tmp_path), []
+
+    def measure(cell):
+        measured.append(cell.config.env_steps)
+        return estimate.Speed(training=1000.0 if len(measured) % 2 else 3000.0, acting=1e6)
+
+    monkeypatch.setattr(estimate, "_measure", measure)
+    cells = [
+        dataclasses.replace(CELL, config=dataclasses.replace(CONFIG, env_steps=24 * 100 + i), audit_worlds=0)
+        for i in range(0, -160, -2)
+    ]
+    costs = [estimate.cost(study, cell) for cell in cells]
+    assert len({cell.setting for cell in cells}) == 80
+    said = estimate.estimate(study, cells)
+    assert len(measured) == len(set(measured)) == 16
+    assert "(FPS measured on a short run of 16 of 80 kinds)" in said
+    seconds = sum(trained / 1500.0 + acted / 1e6 for trained, acted in costs)  # the mean of 1/1000 and 1/3000 is 1/1500
+    assert float(said.split(" = ")[1].split()[0]) == pytest.approx(seconds / 3600, rel=0.02)
+
+
 def test_a_kind_of_cells_is_measured_by_a_short_run():
     """Both rates are positive, and neither takes longer than a period of goals."""
     small = dataclasses.replace(

@@ -107,6 +107,66 @@ def test_sobol_sample_fills_the_ranges():
     assert (rewards == "linear").sum() == 8
 
 
+def test_small_sobol_sample_may_hide_a_factor_behind_another():
+    """Of 16 points of 7 factors some split alike, and the line on the design says which; 32 points of 8 tell all."""
+    eight = {f"env.f{i}": [0, 1] for i in range(8)}
+    seven = {name: eight[name] for name in list(eight)[:7]}
+    design = {"kind": "sobol", "points": 16}
+    columns = {name: [point.levels[name] for point in factors.expand(seven, design)] for name in seven}
+    same = {
+        f"Aliased: {a} = {b}" for a, b in itertools.combinations(seven, 2)
+        if columns[a] in (columns[b], [1 - x for x in columns[b]])
+    }  # fmt: skip
+    head, *lines = factors.describe(seven, design).splitlines()
+    assert head.startswith("Design: sobol, 16 points of 7 factors (env.f0, ")
+    assert len(same) > 0
+    assert set(lines) == same
+    assert "\n" not in factors.describe(eight, design | {"points": 32})
+    share = {"low": 0.0, "high": 1.0}
+    apart = {"env.low": [1], "env.high": [2], "env.rate": share, "env.gain": share}
+    assert "\n" not in factors.describe(apart, design)  # one level each, and a value of its own for every point
+
+
+def test_multiples_are_of_what_the_environment_has(tmp_path):
+    """A multiple counts from the value of the preset, the environment or another factor, and from what None means."""
+    cells = expanded(tmp_path, """
+[[environment]]
+name = "relative"
+env = { kind = "particle", variant = "relative", max_speed = 4.0 }
+train = { ppo = { learning_rate = 2e-3 } }
+[factors]
+env.max_speed = [10.0, 5.0]
+times.env.goal_range = [1.0, 1.5]
+times.ppo.learning_rate = [0.5]
+[[factors.horizon]]
+name = "long"
+times = { env = { goal_period = 2 }, env_steps = 0.5 }
+""")  # fmt: skip
+    found = {
+        (cell.environment, cell.config.env.max_speed, cell.config.env.goal_range, cell.config.ppo.learning_rate)
+        for cell in cells
+    }
+    assert found == {
+        (f"{name}.{i}", speed, times * (speed if name == "directional" else 1250.0), rate)
+        for name, rate in (("directional", 5e-4), ("relative", 1e-3))
+        for i, (speed, times) in enumerate([(10.0, 1.0), (10.0, 1.5), (5.0, 1.0), (5.0, 1.5)])
+    }
+    assert {(cell.config.env.goal_period, cell.goal_periods, cell.config.env_steps) for cell in cells} == {
+        (200, (200,), 1000)
+    }
+    assert cells[0].levels == {
+        "env.max_speed": 10.0, "times.env.goal_range": 1.0, "times.ppo.learning_rate": 0.5, "horizon": "long"
+    }  # fmt: skip
+
+
+def test_a_design_of_multiples_may_be_a_sample_of_a_range(tmp_path):
+    """Multiples may come from a range, as levels of a field may."""
+    sample = '[design]\nkind = "sobol"\npoints = 4\n[factors]\ntimes.env.max_force = { low = 0.5, high = 2.0 }\n'
+    cells = expanded(tmp_path, sample)
+    assert len({cell.config.env.max_force for cell in cells}) == 4
+    assert {cell.config.env.max_force == cell.levels["times.env.max_force"] for cell in cells} == {True}
+
+
 MISTAKES = {
     "[factors]\nenv.max_force = []": r"\[factors\] env\.max_force must be a list of levels or a range, got \[\]",
     "[factors]\nenv.max_force = 3": r"\[factors\] env\.max_force must be a list of levels or a range, got 3",
@@ -116,6 +176,16 @@ MISTAKES = {
     "[factors]\nseed = [1, 2]": "seed cannot stand in 'train' or be a factor",
     "[factors]\nnum_envs = [0]": "num_envs must be at least 1, got 0",
     "[factors]\nhorizon = [{ env = { goal_period = 5 } }]": "levels must be values, or tables of fields each",
+    "[factors]\ntimes = [2]": r"\[factors\] times must be a table, got 2",
+    "[factors]\ntimes.env = [2]": r"\[factors\] times\.env must be a table, got 2",
+    "[factors]\ntimes.seed = [2]": "seed cannot stand in 'train' or be a factor",
+    "[factors]\ntimes.env.mass = [2.0]": "Environment 'directional': .*Config has no mass",
+    "[factors]\ntimes.env.variant = [2.0]": r"variant must be a number to be multiplied.*got directional x 2\.0",
+    "[factors]\ntimes.num_envs = ['much']": "num_envs must be a number to be multiplied.*got 2000 x much",
+    "[factors]\ntimes.ppo.clip_value = [2]": "clip_value must be a number to be multiplied.*got True x 2",
+    "[factors]\ntimes.env.goal_period = [0.333]": r"goal_period must stay a whole number, got 100 x 0\.333 = 33\.3",
+    "[factors]\ntimes.env_steps = [inf]": "env_steps must stay a whole number, got 2000 x inf = inf",
+    "[factors]\ntimes.env.max_force = [0.0]": "Environment 'directional': max_force must be positive",
     "[factors]\nppo.epochs = { low = 3, high = 1 }": r"ppo\.epochs must have low < high",
     "[factors]\nppo.epochs = { low = 1, high = 3 }": "must be a list of levels; only a sobol design takes a range",
     "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'half'": "kind must be one of full, .*, got 'half'",

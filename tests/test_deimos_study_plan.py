@@ -214,3 +214,47 @@ def test_unknown_environment_is_refused(tmp_path):
     """Asking for an environment that a study does not have lists those that it has."""
     with pytest.raises(RunError, match=re.escape("This study has no environment quad; it has: near, far.")):
         plan.expand(described(tmp_path, TOML), environments=["quad"])
+
+
+DESIGN = """
+[factors]
+env.max_speed = [5.0, 10.0, 20.0]
+"""
+
+
+def test_one_point_of_a_design_can_be_asked_for(tmp_path):
+    """An environment's name stands for all points of its design, and with a number for one of them."""
+    description = described(tmp_path, TOML + DESIGN)
+    cells = plan.expand(description, environments=["near.2", "far"], seeds="0")
+    names = [cell.environment for cell in cells]
+    assert names == ["near.2", "near.2", "far.0", "far.1", "far.2"]
+    assert cells[0] in plan.expand(description, seeds="0")
+    assert {cell.environment for cell in plan.expand(description, environments=["near.1"])} == {"near.1"}
+    message = "This study has no environment near.3; it has: near, far, and their points near.0 to far.2."
+    with pytest.raises(RunError, match=re.escape(message)):
+        plan.expand(description, environments=["near.3"])
+
+
+def test_every_environment_has_a_pool_of_its_own(tmp_path):
+    """A folder of pools, the study's or an environment's own, has a file for each; the training may name another."""
+    shared, own = tmp_path / "shared", tmp_path / "own"
+    for folder, names in ((shared, ("far.0", "far.1", "far.2", "other")), (own, ("own.0", "own.1", "own.2"))):
+        folder.mkdir()
+        for name in names:
+            (folder / f"{name}.pt").write_text(name)
+    text = TOML.replace("goal_periods", f"train = {{ eval = {{ pool = '{shared}/other.pt' }} }}\ngoal_periods")
+    more = f"[[environment]]\nname = 'own'\nenv = {{ kind = 'particle' }}\npools = '{own}'\n"
+
+    def cells():
+        return plan.expand(described(tmp_path, f"pools = '{shared}'\n" + text + more + DESIGN), seeds="0")
+
+    pools = {cell.environment: cell.config.eval.pool for cell in cells()}
+    assert pools == {
+        **{f"near.{i}": shared / "other.pt" for i in range(3)},
+        **{f"far.{i}": shared / f"far.{i}.pt" for i in range(3)},
+        **{f"own.{i}": own / f"own.{i}.pt" for i in range(3)},
+    }
+    before = [cell.digest for cell in cells()]
+    (own / "own.1.pt").write_text("made anew")
+    changed = {cell.environment for cell, digest in zip(cells(), before, strict=True) if cell.digest != digest}
+    assert changed == {"own.1"}

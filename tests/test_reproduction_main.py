@@ -41,4 +41,4 @@ def test_coverage_is_a_table(capsys, monkeypatch):
 def test_usage_names_the_commands(arguments, code, capsys):
     """Without a command, or with one that is not there, the commands are named."""
     assert reproduction.main(arguments) == code
-    assert "{report,coverage}" in capsys.readouterr().out
+    assert "{report,multiverse,coverage}" in capsys.readouterr().out

@@ -1,10 +1,12 @@
 """The studies of the thesis, as files: what is in them, and that their cells are still those of the committed rows."""
 
 import dataclasses
+import itertools
 import os
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -27,6 +29,9 @@ BLOCKS = {f"particle_{letter}": count for letter, count in zip("abcdef", (330, 9
 BRANCHES = {"legged": (25, (100, 500)), "legged_long": (4, (100, 500)), "legged_warp": (4, (100,)),
             "legged_arm": (12, (100,))}  # fmt: skip
 """The populations of robots that branch off bases, with their numbers of cells and the T of their evaluations."""
+MAP = {f"multiverse{part}": count for part, count in
+       {"": 160, "_screening": 32, "_headroom": 1280, "_ours": 90, "_long": 12}.items()}  # fmt: skip
+"""The studies of the map, with their numbers of cells before a command says which methods and setting they are for."""
 
 
 @pytest.fixture
@@ -36,6 +41,10 @@ def pools(tmp_path, monkeypatch, new_plugins):
     folder.mkdir(parents=True)
     for name in PARTICLE_VARIANTS:
         (folder / f"{name}.pt").write_text(name)
+    screened = tmp_path / "runs" / "multiverse_screening" / "pools"
+    screened.mkdir(parents=True)
+    for number in range(32):
+        (screened / f"map.{number:02}.pt").write_text(str(number))
     monkeypatch.chdir(tmp_path)
 
 
@@ -54,9 +63,9 @@ def bases(pools, tmp_path):
 
 
 def test_every_study_of_the_thesis_is_there():
-    """Particle Gym has its blocks and their base, each robot its study and its branches."""
+    """Particle Gym has its blocks and their base, the map its studies, each robot its study and its branches."""
     others = {"particle", "quad", "quad_arm", "population", "pilots", "study", "sweep"}
-    assert set(FILES) == {*BLOCKS, *BRANCHES} | others
+    assert set(FILES) == {*BLOCKS, *BRANCHES, *MAP} | others
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if not name.startswith(("quad", "legged"))])
@@ -64,7 +73,7 @@ def test_studies_of_particle_gym_expand(name, pools):
     """Every study of Particle Gym is a valid grid of different cells."""
     cells = plan.expand(plan.read(FILES[name]))
     assert len({cell.digest for cell in cells}) == len({cell.name for cell in cells}) == len(cells)
-    assert len(cells) == BLOCKS.get(name, len(cells))
+    assert len(cells) == (BLOCKS | MAP).get(name, len(cells))
 
 
 def test_blocks_make_one_table(pools):
@@ -112,6 +121,44 @@ def test_bases_are_not_needed_to_have_their_studies(pools):
     """A study of branches whose bases are not trained yet is refused in one line that names what is missing."""
     with pytest.raises(RunError, match="quad_base_1"):
         plan.expand(plan.read(FILES["legged"]))
+
+
+def test_the_map_tells_its_factors_apart(pools):
+    """All 32 settings differ, no factor's levels follow from others', nor from the product of any two."""
+    cells = plan.expand(plan.read(FILES["multiverse"]), methods=["uniform"])
+    assert len({cell.setting for cell in cells}) == len({cell.environment for cell in cells}) == 32
+    levels = {name: [*dict.fromkeys(cell.levels[name] for cell in cells)] for name in cells[0].levels}
+    assert [len(own) for own in levels.values()] == [2] * 8
+    columns = {name: np.array([2 * own.index(cell.levels[name]) - 1 for cell in cells]) for name, own in levels.items()}
+    for name, column in columns.items():
+        assert column.sum() == 0
+        others = [columns[other] for other in columns if other != name]
+        assert not any(column @ other for other in others)
+        assert not any(column @ (a * b) for a, b in itertools.combinations(others, 2))
+
+
+def test_the_map_is_what_its_plan_says(pools):
+    """Goals follow from variant and speed, pools from the setting; screening, map and confirmation differ in seeds."""
+    screening, cells = (plan.expand(plan.read(FILES[name])) for name in ("multiverse_screening", "multiverse"))
+    ranges = {(cell.config.env.variant, cell.config.env.max_speed, cell.config.env.goal_range) for cell in cells}
+    assert ranges == {
+        ("directional", 10.0, 10.0), ("directional", 10.0, 15.0), ("directional", 5.0, 5.0), ("directional", 5.0, 7.5),
+        *(("relative", speed, size) for speed in (5.0, 10.0) for size in (1250.0, 1875.0)),
+    }  # fmt: skip
+    assert {cell.config.eval.pool.stem == cell.environment for cell in cells} == {True}
+    assert {cell.config.eval.attackers for cell in cells} == {("argmax", "pooled", "scripted")}
+    assert {(cell.environment, cell.config.env, cell.config.ppo) for cell in screening} == {
+        (cell.environment, cell.config.env, cell.config.ppo) for cell in cells
+    }
+    chosen = plan.expand(plan.read(FILES["multiverse_headroom"]), environments=["map.07"], methods=["uniform", "p75"])
+    assert {cell.environment for cell in chosen} == {"map.07"}
+    assert {cell.config.env for cell in chosen} == {cell.config.env for cell in cells if cell.environment == "map.07"}
+    others = [plan.expand(plan.read(FILES[name])) for name in ("multiverse_ours", "multiverse_long", "particle_d")]
+    seeds = [{cell.config.seed for cell in own} for own in (screening, cells, *others)]
+    assert [len(own) for own in seeds] == [1, 1, 30, 3, 20]
+    assert sum(map(len, seeds)) == len(set.union(*seeds))
+    assert len({cell.config.seed for cell in chosen}) == 20
+    assert {cell.config.env_steps for cell in others[1]} == {48_000}
 
 
 def test_studies_are_the_thesis(pools):

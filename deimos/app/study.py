@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 from deimos.app import console
-from deimos.study.cli import COMMANDS, LONG
+from deimos.study.cli import COMMANDS, LONG, PoolOptions
 
 
 def main(arguments: list[str], program: str) -> None:
@@ -16,6 +16,8 @@ def main(arguments: list[str], program: str) -> None:
 
 def _run(options: Any, arguments: list[str], program: str) -> None:
     parsed = console.parse(options, arguments, program)
+    if isinstance(parsed, (*LONG, PoolOptions)):  # they simulate, be it to say how long it takes
+        console.quiet_warp()
     if isinstance(parsed, LONG):
         with console.stop_on_interrupt() as stopped, console.progress("study") as report:
             try:

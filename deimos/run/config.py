@@ -5,7 +5,7 @@ import math
 import numbers
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -88,12 +88,48 @@ def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
     if stored:
         data = {f.name: f.metadata["before"] for f in dataclasses.fields(cls) if "before" in f.metadata} | data
     hints = typing.get_type_hints(cls)
-    names = {field.name for field in dataclasses.fields(cls)}
-    if unknown := sorted(set(data) - names):
-        raise ValueError(
-            f"{cls.__module__}.{cls.__name__} has no {', '.join(unknown)}; it has: {', '.join(sorted(names))}."
-        )
+    _check_fields(cls, data)
     return cls(**{name: _typed(name, hints[name], value, stored) for name, value in data.items()})
+
+
+def _check_fields(cls: type, names: Iterable[str]) -> None:
+    known = {field.name for field in dataclasses.fields(cls)}
+    if unknown := sorted(set(names) - known):
+        raise ValueError(
+            f"{cls.__module__}.{cls.__name__} has no {', '.join(unknown)}; it has: {', '.join(sorted(known))}."
+        )
+
+
+def multiplied(config: Any, factors: Mapping[str, Any]) -> Any:
+    """A configuration with some of its numbers multiplied.
+
+    Args:
+        config: A dataclass.
+        factors: Numbers by the names of fields, or such tables where a field is a configuration. A field of an
+            environment that is ``None`` counts as what it stands for there, see ``EnvConfig.implied``.
+
+    Raises:
+        ValueError: If there is no such field, it holds no number, or a whole one would no longer be whole.
+    """
+    _check_fields(type(config), factors)
+    return dataclasses.replace(config, **{name: _product(config, name, factor) for name, factor in factors.items()})
+
+
+def _product(config: Any, name: str, factor: Any) -> Any:
+    value = getattr(config, name)
+    if value is None and isinstance(config, EnvConfig):
+        value = config.implied(name)
+    if isinstance(factor, Mapping) and dataclasses.is_dataclass(value):
+        return multiplied(value, factor)
+    numbers_only = all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in (value, factor))
+    if not numbers_only:
+        raise ValueError(f"{name} must be a number to be multiplied, and so must its factor, got {value} x {factor}.")
+    product = value * factor
+    if isinstance(value, numbers.Integral):
+        if product % 1 != 0:  # neither is an infinity
+            raise ValueError(f"{name} must stay a whole number, got {value} x {factor} = {product:g}.")
+        return round(product)
+    return product
 
 
 def _typed(name: str, hint: Any, value: Any, stored: bool) -> Any:

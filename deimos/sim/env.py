@@ -25,7 +25,6 @@ from deimos.nn.ranks import gather_rows, own_rows
 if TYPE_CHECKING:
     import mujoco
 
-
 DRAW_COUNTS = ("episode_count", "goal_count")  # the addresses of a world's draws, among ``Env.tensors``
 
 
@@ -115,6 +114,10 @@ class EnvConfig(abc.ABC):
     def largest_reward(self) -> float:
         """Largest reward of one step for matching the goal: the unit of ``crash_penalty``."""
         return 1.0
+
+    def implied(self, name: str) -> float | None:
+        """What a field that is ``None`` stands for; ``None`` where that is no number."""
+        return None
 
     @final
     def with_goal_period(self, goal_period: int) -> Self:

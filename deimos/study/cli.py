@@ -16,6 +16,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from deimos.checks import RunError, check_at_least
+from deimos.run import training
 from deimos.study import archive, factors, plan
 from deimos.study import cell as worker
 from deimos.study.engine import Engine, LocalProcesses
@@ -95,7 +96,8 @@ class RunOptions(_WorkOptions):
     methods: list[str] | None = None
     """Methods in place of the file's."""
     environments: list[str] | None = None
-    """Those of the file's environments that are wanted. By default all."""
+    """Those of the file's environments that are wanted, each with all points of its design, or with one (fast.3). By
+    default all."""
     num_envs: int | None = None
     """Parallel worlds of the training, in place of the file's."""
     env_steps: int | None = None
@@ -277,6 +279,33 @@ class CellOptions(_FolderOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PoolOptions(_FolderOptions):
+    """Make a file for the attacker pooled for every environment, from the policies of a finished study.
+
+    A file that is there stays as it is, so what was killed continues when the command is given again.
+    """
+
+    out: Path | None = None
+    """Folder of the files NAME.pt, the ``pools`` of another study's file. By default ``pools`` in the study's."""
+    device: str = "cpu"
+    """Where to simulate: cpu, cuda or cuda:N."""
+
+    def run(self) -> None:
+        """Write them, and a line for each; for the errors see ``deimos.study.pools.write_pools``."""
+        from deimos.study.pools import POOLS, write_pools
+
+        out, device = self.out or self.folder / POOLS, training.resolve_device(self.device)
+        for path, facts in write_pools(StudyFolder(self.folder), out, device):
+            if facts is None:
+                said = "is there"
+            elif facts["uninformed"]:
+                said = "no crashes, or nothing else: the attacker's goals are uniform"
+            else:
+                said = f"{facts['adversary_interactions']:,} goals, {facts['adversary_crashes']:,} crashes"
+            print(f"{path}: {said}", flush=True)
+
+
+@dataclass(frozen=True, kw_only=True)
 class PackOptions(_FolderOptions):
     """Put the policies of the finished cells into policies.zip, beside those that are in it."""
 
@@ -384,8 +413,9 @@ class ReportOptions:
 
 
 COMMANDS: dict[str, Any] = {
-    "run": RunOptions, "cell": CellOptions, "show": ShowOptions, "attack": AttackOptions, "pack": PackOptions,
-    "unpack": UnpackOptions, "merge": MergeOptions, "export": ExportOptions, "report": ReportOptions,
+    "run": RunOptions, "cell": CellOptions, "show": ShowOptions, "attack": AttackOptions, "pool": PoolOptions,
+    "pack": PackOptions, "unpack": UnpackOptions, "merge": MergeOptions, "export": ExportOptions,
+    "report": ReportOptions,
 }  # fmt: skip
 """The options of every command, whose ``run`` does it; those of ``LONG`` take what says when to stop and what shows
 progress."""

@@ -1,10 +1,11 @@
 """What the open cells of a study take, told before they start."""
 
+import random
 import time
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from statistics import median
+from statistics import harmonic_mean, median
 
 import torch
 
@@ -21,6 +22,7 @@ from deimos.study.plan import Cell
 
 SECONDS = 10.0  # of training that a kind of cells is measured for, at most; a period of goals if that is less
 PLAYED = 50  # steps of a policy that evaluations are measured by
+MOST_KINDS = 16  # that are measured; others are as fast as these in the mean
 OF_ORACLE = 100  # candidates that an attacker tries in clones
 
 
@@ -35,9 +37,10 @@ class Speed:
 
 
 def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
-    """A line on what the cells of a study that are not finished take; it measures each kind of cells for some seconds.
+    """A line on what the cells of a study that are not finished take; it measures kinds of cells for some seconds each.
 
-    Training is as fast as the finished cells of a kind were where there are any, and acting as measured.
+    Of more than ``MOST_KINDS``, as a design over many settings has, a random sample is measured. Training is as fast as
+    the finished cells of a kind were where there are any, and acting as measured.
     """
     cells = list(cells)
     kinds: dict[tuple[str, str], list[Cell]] = defaultdict(list)
@@ -46,17 +49,21 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
     ran: dict[tuple[str, str], list[float]] = defaultdict(list)
     for row in study.results().rows:
         ran[row["setting"], row["method"]].append(row["fps"])
+    sample = random.Random(0).sample([*kinds], min(MOST_KINDS, len(kinds)))
+    measures = {name: _measure(kinds[name][0]) for name in sample}
+    mean = Speed(*(harmonic_mean([getattr(x, rate) for x in measures.values()]) for rate in ("training", "acting")))
     trained = acted = hours = 0.0
     measured = False
-    for own in kinds.values():
-        speed = _measure(own[0])
+    for name, own in kinds.items():
+        speed = measures.get(name, mean)
         for cell in own:
             known = [fps for fps in ran[cell.setting, cell.config.label] if fps > 0]
             measured |= not known
             transitions, steps = cost(study, cell)
             trained, acted = trained + transitions, acted + steps
             hours += (transitions / (median(known) if known else speed.training) + steps / speed.acting) / 3600
-    source = "measured on a short run of each kind" if measured else "of the finished cells"
+    each = "each kind" if len(sample) == len(kinds) else f"{len(sample)} of {len(kinds)} kinds"
+    source = f"measured on a short run of {each}" if measured else "of the finished cells"
     return (
         f"{len(cells)} run(s): {trained / 1e6:,.1f} M transitions (FPS {source}) + {acted / 1e6:,.1f} M world-steps of "
         f"attacks, evaluations and audits = {hours:.2f} core-hours."

@@ -1,7 +1,8 @@
 """Studies over factors: which settings of the training a design tries.
 
 A factor is a field of the training with levels, such as ``env.max_force``, or a name whose levels are tables of such
-fields, each with a ``name``. A sweep is a design with one factor.
+fields, each with a ``name``. Fields under ``times``, such as ``times.env.goal_range``, are multiplied by their levels:
+what they are otherwise may differ between environments, and with other factors. A sweep is a design with one factor.
 """
 
 import itertools
@@ -15,6 +16,8 @@ from deimos.study.tables import check_keys, check_kind
 
 KINDS = ("full", "fractional", "sobol")
 MOST_POINTS = 10_000  # of a design
+TIMES = "times"
+"""What the name of a factor begins with that multiplies a field."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Point:
     levels: dict[str, Any]
     """Level of every factor, by its name, in JSON types; a level that is a table is its name."""
     fields: dict[str, Any]
-    """What they change of the training."""
+    """What they change of the training; under ``TIMES``, what numbers of it are multiplied by."""
 
 
 def expand(factors: Mapping[str, Any], design: Mapping[str, Any]) -> list[Point]:
@@ -85,14 +88,25 @@ def aliases(generators: Mapping[str, Sequence[str]], factors: Sequence[str]) -> 
 
 
 def describe(factors: Mapping[str, Any], design: Mapping[str, Any]) -> str:
-    """A line on the design and, where it is fractional, one for each set of effects that it cannot tell apart."""
+    """A line on the design, and one for each set of effects that it cannot tell apart.
+
+    Of a fractional design these are main effects and interactions of two, of others main effects.
+    """
     flat = _flat(factors)
-    kind, points = design.get("kind", "full"), len(expand(factors, design))
-    text = f"Design: {kind}, {points} points of {len(flat)} factors ({', '.join(flat)})."
+    kind, points = design.get("kind", "full"), expand(factors, design)
+    text = f"Design: {kind}, {len(points)} points of {len(flat)} factors ({', '.join(flat)})."
     if kind != "fractional":
-        return text
+        columns = {name: [str(point.levels[name]) for point in points] for name in flat}
+        same = [pair for pair in itertools.combinations(flat, 2) if _same_split(*(columns[name] for name in pair))]
+        return "\n".join([text, *(f"Aliased: {a} = {b}" for a, b in same)])
     resolution, lines = aliases(design["generators"], list(flat))
     return "\n".join([f"{text} Resolution {resolution}.", *(f"Aliased: {line}" for line in lines)])
+
+
+def _same_split(first: Sequence[str], second: Sequence[str]) -> bool:
+    """Whether two columns of levels split the points in the same way."""
+    pairs = {*zip(first, second, strict=True)}
+    return len(pairs) == len({*first}) == len({*second}) and 1 < len(pairs) < len(first)
 
 
 def _flat(factors: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

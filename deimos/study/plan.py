@@ -20,7 +20,7 @@ from deimos.goals.selector import SelectorConfig
 from deimos.run import presets, training
 from deimos.run.attack import attacker
 from deimos.run.branch import branch_config, check_branch
-from deimos.run.config import from_dict, to_dict
+from deimos.run.config import from_dict, multiplied, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.sim.env import EnvConfig
@@ -33,6 +33,7 @@ SCHEMA = 2  # of cell.json
 MOST_SEEDS = 100_000
 _OWN: dict[str, tuple[type, type | None]] = {
     "methods": (list, str), "train": (dict, None), "audit_worlds": (int, None), "branch_from": (str, None),
+    "pools": (str, None),
 }  # fmt: skip
 _KEYS: dict[str, tuple[type, type | None]] = _OWN | {
     "base": (str, None), "plugins": (list, str), "environment": (list, dict), "factors": (dict, None),
@@ -176,6 +177,8 @@ def read(path: Path) -> dict:
     * ``environment``: for each environment or variant its ``name``, ``env`` (``kind`` and fields) and, if they differ
       there, ``methods``, ``train``, ``audit_worlds`` and ``goal_periods``; its ``preset`` is one of
       ``deimos.run.presets``, where its environment and settings come from that are not said;
+    * ``pools``: folder with a file NAME.pt for every environment, or those of an environment, which the attacker
+      ``pooled`` attacks with (``deimos study pool`` makes it);
     * ``branch_from``: folder of a run that all cells branch off, or those of an environment (``deimos.run.branch``);
       what is not said is as it was there, and critics learn first;
     * ``{seed}`` in the name of a file or of a run stands for the number of the seed: each seed branches off a run of
@@ -216,7 +219,8 @@ def expand(
         description: See ``read``.
         seeds: See ``parse_seeds``; in place of its own, as ``methods`` are, in every environment.
         methods: Names.
-        environments: Names of those to take; ``None`` for all.
+        environments: Names of those to take, with all points of a design or with one (``directional.3``); ``None`` for
+            all.
         train: Fields of ``TrainConfig`` that come before its own.
 
     Raises:
@@ -230,9 +234,6 @@ def expand(
         _check_table("An [[environment]]", table, _ENVIRONMENT_KEYS)
     names = [table.get("name", "") for table in tables]
     _check_unique("environment", names)
-    if unknown := [name for name in environments or () if name not in names]:
-        raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}.")
-    wanted = names if environments is None else environments
     numbers = parse_seeds(description.get("seeds", 10) if seeds is None else seeds)
     import_plugins(description.get("plugins", ()))
     said: dict | None = None
@@ -241,7 +242,7 @@ def expand(
         for seed in numbers:
             own = _with_seed(description, seed)
             if own != said:  # most studies say the same for every seed
-                said, grid = own, _grid(description, own, wanted, methods, train or {})
+                said, grid = own, _grid(description, own, environments, methods, train or {})
             cells += [replace(cell, config=replace(cell.config, seed=seed)) for cell in grid]
     except (AttributeError, RecursionError, TypeError, ValueError) as error:  # of from_dict and the configurations
         raise RunError(one_line(error)) from error
@@ -261,24 +262,27 @@ def _with_seed(value: Any, seed: int) -> Any:
 
 
 def _grid(
-    pattern: dict, study: dict, wanted: Collection[str], methods: Sequence[str] | None, train: dict
+    pattern: dict, study: dict, wanted: Sequence[str] | None, methods: Sequence[str] | None, train: dict
 ) -> list[Cell]:
     """The cells of one seed, without its number.
 
     Args:
         pattern: The description as the file has it.
         study: The same with the number of the seed in its texts.
-        wanted: Names of environments.
+        wanted: Names of environments or of their points; ``None`` for all.
         methods: See ``expand``.
         train: See ``expand``.
     """
     points, made_by = factors.expand(study.get("factors", {}), study.get("design", {})), {"code": code().name}
+    places = [_place(index, len(points)) for index in range(len(points))]
+    names = [table.get("name", "") for table in study["environment"]]
+    _check_known(wanted or (), names, places)
     grid = [
         replace(cell, by_seed=_by_seed(raw, pattern))
-        for raw, table in zip(pattern["environment"], study["environment"], strict=True)
-        if raw.get("name", "") in wanted
-        for index, point in enumerate(points)
-        for cell in _environment(table, study, methods, train, point, _place(index, len(points)))
+        for name, raw, table in zip(names, pattern["environment"], study["environment"], strict=True)
+        for place, point in zip(places, points, strict=True)
+        if wanted is None or {name, name + place} & {*wanted}
+        for cell in _environment(table, study, methods, train, point, place)
     ]
     return [replace(cell, sources=made_by | hashes(cell.plugins, cell.files)) for cell in grid]
 
@@ -286,9 +290,18 @@ def _grid(
 def _by_seed(table: dict, study: dict) -> tuple[str, ...]:
     """Names of the files of an environment's cells that are another one for each seed."""
     train = merged(study.get("train", {}), table.get("train", {}))
-    origin, pool = table.get("branch_from", study.get("branch_from")), train.get("eval", {}).get("pool")
+    origin, pools = (table.get(name, study.get(name)) for name in ("branch_from", "pools"))
+    pool = train.get("eval", {}).get("pool", pools)
     texts = {**table.get("env", {}), "pool": pool, "branch_from": origin}
     return tuple(name for name, text in texts.items() if _SEED in str(text))
+
+
+def _check_known(wanted: Sequence[str], names: Sequence[str], places: Sequence[str]) -> None:
+    """Raise ``RunError`` for a wanted environment that is neither one of these names nor a point of one."""
+    points = [name + place for name in names for place in places if place]
+    if unknown := [name for name in wanted if name not in {*names, *points}]:
+        ends = f", and their points {points[0]} to {points[-1]}" if points else ""
+        raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}{ends}.")
 
 
 def _place(index: int, count: int) -> str:
@@ -304,7 +317,9 @@ def _environment(
     if not name.replace("_", "").replace(".", "").isalnum():
         raise RunError(f"An [[environment]] must have a name of letters, digits, '.' and '_', got {shown(name)}.")
     shared, own = study.get("train", {}), table.get("train", {})
-    if taken := sorted((set(shared) | set(own)) & _GRID | set(point.fields) & (_GRID - {"env"})):
+    tried = {key: value for key, value in point.fields.items() if key != factors.TIMES}
+    times = check_kind("[factors] times", point.fields.get(factors.TIMES, {}), dict)
+    if taken := sorted((set(shared) | set(own)) & _GRID | (set(tried) | set(times)) & (_GRID - {"env"})):
         raise RunError(f"{', '.join(taken)} cannot stand in 'train' or be a factor: the grid of the study says it.")
     methods = list(table.get("methods", study.get("methods")) or [] if methods is None else methods)
     if not methods:
@@ -314,12 +329,15 @@ def _environment(
     stored = None if origin is None else training.read_config(RunFolder.open(Path(origin)))
     try:
         ready = _training_preset(table) if stored is None else _branch(table, stored)
-        tried = point.fields.get("env", {})
-        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried)))
+        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried.get("env", {}))))
+        env = multiplied(env, check_kind("[factors] times.env", times.get("env", {}), dict))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error
-    fields = reduce(merged, (ready, {"threads": 1}, shared, own, train, point.fields, {"env": to_dict(env)}))
-    configs = [from_dict(TrainConfig, fields | {"method": each}) for each in methods]
+    pools = table.get("pools", study.get("pools"))
+    pool = {} if pools is None else {"eval": {"pool": str(Path(pools, f"{name}{place}.pt"))}}
+    fields = reduce(merged, (ready, {"threads": 1}, pool, shared, own, train, tried, {"env": to_dict(env)}))
+    others = {key: value for key, value in times.items() if key != "env"}
+    configs = [multiplied(from_dict(TrainConfig, fields | {"method": each}), others) for each in methods]
     if stored is not None:
         try:
             for config in configs:

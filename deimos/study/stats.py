@@ -1,7 +1,8 @@
 """Statistics of populations of runs. The unit is one trained policy; robots and episodes are no replicates.
 
 Samples are float arrays of shape (n,), one value per policy, n at least 2, without NaN; ``ValueError`` otherwise. Every
-interval is two-sided, at ``LEVEL``; every bootstrap draws ``resamples`` (``None``: ``RESAMPLES``) by its ``seed``.
+interval is two-sided, at ``LEVEL`` unless said; every bootstrap draws ``resamples`` (``None``: ``RESAMPLES``) by its
+``seed``.
 """
 
 import math
@@ -87,11 +88,12 @@ def distribution(
 
 
 def bootstrap(
-    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0, paired: bool = False
-) -> Interval:
-    """Percentile interval of a statistic by the stratified bootstrap; see ``distribution``."""
+    samples: Sequence[Array], statistic: Statistic, *, resamples: int | None = None, seed: int = 0,
+    paired: bool = False, level: float = LEVEL,
+) -> Interval:  # fmt: skip
+    """Percentile interval of a statistic by the stratified bootstrap, at ``level``; see ``distribution``."""
     values = distribution(samples, statistic, resamples=resamples, seed=seed, paired=paired)
-    return Interval(float(statistic(*map(_checked, samples))), *_ends(values))
+    return Interval(float(statistic(*map(_checked, samples))), *_ends(values, level))
 
 
 def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Interval:
@@ -221,9 +223,10 @@ def detectable_mean(x: Array) -> float:
     return optimize.brentq(lacking, 0.0, 20.0) * float(x.std(ddof=1))
 
 
-def _ends(values: Array) -> tuple[float, float]:
+def _ends(values: Array, level: float = LEVEL) -> tuple[float, float]:
     """Ends of the percentile interval; infinite values count, and there is nothing between two of them."""
-    low, high = np.quantile(values, ENDS, method="linear" if np.isfinite(values).all() else "nearest")
+    ends = (1 - level) / 2, (1 + level) / 2
+    low, high = np.quantile(values, ends, method="linear" if np.isfinite(values).all() else "nearest")
     return float(low), float(high)
 
 

@@ -41,11 +41,12 @@ class Config(AttackerConfig):
             fear.network.load_state_dict(found["network"])
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise RunError(f"{target.pool} is broken: {one_line(error)}") from error
-        fear.fitted = True
-        return Attack(lambda env: argmax_director(env, fear), found["facts"] | {"uninformed": False})
+        facts = {"uninformed": False} | found["facts"]
+        fear.fitted = not facts["uninformed"]
+        return Attack(lambda env: argmax_director(env, fear), facts)
 
 
-def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
+def make_pool(targets: Sequence[Target], path: Path, *, may_be_uninformed: bool = False) -> dict[str, Any]:
     """Train a fear network on the interactions of many policies, each with the same number of steps.
 
     Half of the goals are the network's own, one network's for all policies: so it learns what crashes most of them,
@@ -54,6 +55,8 @@ def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
     Args:
         targets: The policies, at least 1, of one environment.
         path: The file to write.
+        may_be_uninformed: Whether a file is written too where crashes or survivals are missing. Its network has learnt
+            nothing then, and the attacker's goals are uniform.
 
     Returns:
         The facts that rows of the attacker have: see ``learn_fear``.
@@ -65,7 +68,7 @@ def make_pool(targets: Sequence[Target], path: Path) -> dict[str, Any]:
     if len({str(env.layout) for env in envs}) > 1:
         raise RunError("The policies observe different things, so they have no fear in common.")
     fear, facts = fear_of(targets, targets[0].steps, own_goals=True)
-    if facts["uninformed"]:
+    if facts["uninformed"] and not may_be_uninformed:
         raise RunError("These policies never crashed, or always, so there is nothing to learn; pool others.")
     save_fear(path, fear, envs[0], facts)
     return facts

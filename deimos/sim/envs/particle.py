@@ -76,6 +76,17 @@ class Config(EnvConfig):
             return self.goal_range
         return self.max_speed if self.has_velocity_goals else 1250.0
 
+    @property
+    def reward_distance(self) -> float:
+        """Distance [u] or [u/step] at which the reciprocal reward is 1/2 and the exponential 1/e."""
+        if self.reward_length is not None:
+            return self.reward_length
+        return 2.5 if self.has_velocity_goals else 250.0
+
+    def implied(self, name: str) -> float | None:
+        """See ``EnvConfig.implied``."""
+        return {"goal_range": self.goal_half_side, "reward_length": self.reward_distance}.get(name)
+
     def build(self, num_envs: int, device: torch.device, seed: int, env_offset: int = 0) -> "Particle":
         """See ``EnvConfig.build``."""
         return Particle(self, num_envs, device, seed, env_offset)
@@ -97,7 +108,7 @@ class Config(EnvConfig):
         params.velocity_scale = 1.0 / self.max_speed if unit else 1.0
         params.force_scale = 1.0 / self.max_force if unit and math.isfinite(self.max_force) else 1.0
         params.reward_shape = int(RewardShape[self.reward.upper()])
-        params.reward_length = self.reward_length or (2.5 if self.has_velocity_goals else 250.0)
+        params.reward_length = self.reward_distance
         # A crashing particle is at most one step outside the cube.
         reach = self.max_speed if self.has_velocity_goals else HALF_SIDE + self.max_speed
         params.largest_distance = math.sqrt(3.0) * (reach + self.goal_half_side)

@@ -1,0 +1,58 @@
+"""A file for the attacker ``pooled`` for every environment of a study, made from the policies of that environment."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from deimos.checks import RunError
+from deimos.learn.policy import load_policy
+from deimos.nn.threads import torch_on_one
+from deimos.run.attackers.pooled import make_pool
+from deimos.run.evaluation import make_target
+from deimos.sim.shared import one_stream
+from deimos.study.folder import StudyFolder
+from deimos.study.plan import Cell
+
+POOLS = "pools"
+"""Name of the folder in a study's that they are in."""
+
+
+def write_pools(study: StudyFolder, out: Path, device: torch.device) -> Iterator[tuple[Path, dict[str, Any] | None]]:
+    """Write OUT/ENVIRONMENT.pt for every environment of a study; a file that is there stays as it is.
+
+    Each network learns from all policies of its environment, with the sizes of their evaluation. Where they never
+    crashed, or always, the file says that it has learnt nothing.
+
+    Yields:
+        The files, each once it is there, with the facts of ``deimos.run.attackers.pooled.make_pool``; ``None`` of one
+        that was there.
+
+    Raises:
+        RunError: If the study has no cells, one of them is not finished, or a file cannot be read or written.
+    """
+    cells = study.cells()
+    if not cells:
+        raise RunError(f"{study.path} holds no policies.")
+    if left := [cell for cell in cells if not (study.cell_path(cell) / "result.json").exists()]:
+        raise RunError(
+            f"{len(left)} of {len(cells)} cells are not finished; finish them first: deimos study run {study.path}"
+        )
+    environments: dict[str, list[Cell]] = defaultdict(list)
+    for cell in cells:
+        environments[cell.environment].append(cell)
+    out.mkdir(parents=True, exist_ok=True)
+    for name in sorted(environments):
+        path = out / f"{name}.pt"
+        yield path, None if path.exists() else _write(study, environments[name], path, device)
+
+
+def _write(study: StudyFolder, cells: Sequence[Cell], path: Path, device: torch.device) -> dict[str, Any]:
+    with one_stream(device), torch_on_one():
+        targets = []
+        for cell in cells:
+            policy = load_policy(study.cell_path(cell) / "run", str(device))
+            targets.append(make_target(policy.scaled, cell.config.env, cell.config.eval, device))
+        return make_pool(targets, path, may_be_uninformed=True)

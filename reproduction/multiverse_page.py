@@ -1,0 +1,160 @@
+"""The page of the map: what screening, map and confirmation say, as far as they have run. multiverse.md is the plan."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from deimos.files import write_bytes
+from deimos.study import figures, stats
+from deimos.study.data import Data
+from deimos.study.document import Block, to_html, to_markdown
+from reproduction import multiverse
+from reproduction.measures import SAFE
+from reproduction.multiverse import AIM, AIM_SCORE, HEADROOM, LEARNT, LEAST_SCORE, NEW, UNIFORM, Roles, Setting
+from reproduction.multiverse_figures import draw, level_named, named
+
+FIGURES = "figures"
+TOO_FEW = "These settings are too few to tell the factors apart."
+ENOUGH = 0.5  # of the settings with headroom: no other round of screening
+
+
+@dataclass(frozen=True, kw_only=True)
+class MultiverseOptions:
+    """Write the page of the map over what the thesis leaves open, as far as its studies have run."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder of multiverse.html, multiverse.md and figures; made if it is not there."""
+    screening: Path = Path("runs/multiverse_screening")
+    """Folder of the screening."""
+    map: Path | None = None
+    """Folder of the map."""
+    confirmations: tuple[Path, ...] = ()
+    """Folders of confirmations."""
+
+
+def write(options: MultiverseOptions) -> Path:
+    """Write the page; returns the path of its HTML. Raises ``RunError`` if results are missing or do not fit."""
+    settings = multiverse.read(options.screening, options.map)
+    (options.out / FIGURES).mkdir(parents=True, exist_ok=True)
+    blocks: list[Block] = ["# The map", *_screened(settings)]
+    if options.map is not None:
+        new = multiverse.best_new(multiverse.standings(settings))
+        with figures.print_size():
+            pictures = figures.write(draw(settings), options.out / FIGURES)
+        blocks += [*_mapped(settings, new), "## Figures", *pictures]
+        for folder in options.confirmations:
+            blocks += _confirmed(Data.read(folder), new)
+    for name, text in (
+        ("multiverse.md", to_markdown(blocks, FIGURES)), ("multiverse.html", to_html(blocks, options.out / FIGURES))
+    ):  # fmt: skip
+        write_bytes(options.out / name, text.encode())
+    return options.out / "multiverse.html"
+
+
+def _screened(settings: Sequence[Setting]) -> list[Block]:
+    """Which settings have headroom, and what moves it."""
+    room = sum(each.has_headroom for each in settings)
+    enough = room >= ENOUGH * len(settings)
+    chosen = multiverse.most_headroom(settings)
+    rows = [
+        {"setting": each.name, **{named(name): str(level) for name, level in each.levels.items()},
+         "Naive [%]": f"{100 * each.screened.naive:.2f}", "attacked [%]": f"{100 * each.screened.worst:.1f}",
+         "score": f"{each.screened.score:.2f}", "headroom": "yes" if each.has_headroom else "no"}
+        for each in sorted(settings, key=lambda each: -each.screened.worst)
+    ]  # fmt: skip
+    moved = multiverse.moved_by(settings, 100 * np.array([each.screened.worst for each in settings]))
+    said = f"{room} of {len(settings)} settings have headroom: Uniform's attacked rate is above {100 * HEADROOM:g} %"
+    return [
+        "## Screening", f"{said}, which is {'enough' if enough else 'too few: adjust the levels as the plan says'}.",
+        "Most headroom, at a score of " + (f"{LEARNT} or more: {chosen.name}." if chosen else f"{LEARNT}: none."), rows,
+        *(["What moves Uniform's attacked rate [points]:", _moves(settings, moved)] if moved else [TOO_FEW]),
+    ]  # fmt: skip
+
+
+def _moves(settings: Sequence[Setting], moved: dict[str, stats.Interval]) -> Block:
+    levels, _ = multiverse.coded(settings)
+    return [{"factor": f"{level_named(name, levels[name][1])} (not {levels[name][0]})",
+             "effect [95 %, of all factors at once]": f"{effect:.1f}"} for name, effect in moved.items()]  # fmt: skip
+
+
+def _moved_most(settings: Sequence[Setting], outcome: stats.Array) -> dict[str, str]:
+    """The factor that moves an outcome most, as the cells of a row."""
+    moved, (levels, _) = multiverse.moved_by(settings, outcome), multiverse.coded(settings)
+    if not moved:
+        return dict.fromkeys(("moved most by", "by", "beyond chance"), "-")
+    name, effect = next(iter(moved.items()))
+    beyond = effect.low > 0.0 or effect.high < 0.0
+    return {"moved most by": level_named(name, levels[name][1]), "by": f"{effect:.1f}",
+            "beyond chance": "yes" if beyond else "no"}  # fmt: skip
+
+
+def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
+    """Headline clauses, standings and the selection."""
+    room = [each for each in settings if each.has_headroom]
+    rows = []
+    for clause in multiverse.headlines(Roles.of(settings)):
+        share = multiverse.share_that_holds(settings, clause)
+        margins = 100 * multiverse.margins(settings, clause)
+        rows.append({
+            "clause": clause.text, f"holds in [%] of {len(room)} with headroom":
+            "-" if share is None else f"{100 * share.estimate:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]",
+            "mean margin": f"{stats.bootstrap([margins], lambda x: x.mean(axis=-1)):.2f}",
+            **_moved_most(settings, margins),
+        })  # fmt: skip
+    standing = [
+        {"method": each.method, "policies below 1 % [%]": f"{100 * each.safe.estimate:.0f}",
+         "95 %": f"[{100 * each.safe.low:.0f}, {100 * each.safe.high:.0f}]",
+         "mean attacked rate": f"{each.worst:.3f}", "score / Uniform's": f"{each.score:.3f}",
+         "part of the headroom that it removes":
+         "-" if each.method == UNIFORM else f"{multiverse.removed(settings, each.method):.2f}"}
+        for each in multiverse.standings(settings)
+    ]  # fmt: skip
+    chosen = multiverse.most_headroom(settings)
+    return [
+        "## Headline clauses", rows, "## Methods", standing,
+        f"The best new selector is {new}: the most policies below 1 % at {LEAST_SCORE} of Uniform's score or more. "
+        f"Confirmation: --methods with {new}" + (f", and --environments {chosen.name}." if chosen else "."),
+    ]  # fmt: skip
+
+
+def _confirmed(data: Data, new: str) -> list[Block]:
+    """Means of the methods of a confirmation, and the best new selector beside each of the others."""
+    blocks: list[Block] = []
+    for environment in data.environments:
+        own = [row for row in data.rows if (row["environment"], row["goals"]) == (environment, "naive")]
+        rows = []
+        for name in data.methods(environment):
+            worst, score = (
+                np.array([row[key] for row in own if row["method"] == name]) for key in ("worst", "score")
+            )  # fmt: skip
+            rows.append({
+                "method": name, "n": str(len(worst)), "mean attacked rate": f"{worst.mean():.4f}",
+                "below 1 %": f"{(worst < SAFE).mean():.2f}", "mean score": f"{score.mean():.3f}",
+            })  # fmt: skip
+        found = multiverse.contrasts(data, environment, new)
+        lines = [
+            {"beside": each.rival, "n": f"{each.n[0]} + {each.n[1]}", "attacked rate lower by": f"{each.lower:.4f}",
+             "its rate / the new one's": f"{each.ratio:.2f}", "score / its": f"{each.score:.3f}", "p": f"{each.p:.3g}"}
+            for each in found
+        ]  # fmt: skip
+        blocks += [f"## Confirmation: {environment}", rows]
+        if not lines:
+            blocks.append(f"There are too few policies of {new}, or of others, for a contrast.")
+            continue
+        blocks += [
+            f"{new} beside the others. Intervals are at {100 * multiverse.CONFIDENCE:.1f} %, p-values Holm's over the "
+            f"rivals, times the {len(NEW)} selectors that were tried.", lines, *_winner(found, new),
+        ]  # fmt: skip
+    return blocks
+
+
+def _winner(found: Sequence[multiverse.Contrast], new: str) -> list[Block]:
+    """Whether the aim is met, where Uniform is among the rivals."""
+    uniform = next((each for each in found if each.rival == UNIFORM), None)
+    if uniform is None:
+        return []
+    aim = f"a rate lower than Uniform's by a factor of {AIM:g} or more at {AIM_SCORE} of its score or more"
+    return [f"{new} is {'a winner' if uniform.is_winner else 'no winner'} here; the aim was {aim}."]

@@ -1,0 +1,86 @@
+"""Files for the attacker ``pooled``, one for every environment of a study, made by one command."""
+
+import subprocess
+import sys
+
+import pytest
+
+from deimos.checks import RunError
+from deimos.files import load_tensors
+from deimos.run.attackers.pooled import SCHEMA
+from deimos.study import cell as worker
+from deimos.study import cli, plan
+from deimos.study.folder import StudyFolder
+
+FACTORS = """
+[factors]
+env.max_speed = [200.0, 1.0]
+"""  # the slow particles are never at a wall within an evaluation
+
+
+@pytest.fixture(scope="module")
+def screening(short_study, tmp_path_factory):
+    """A finished study of two settings, of which one has no crashes."""
+    home = tmp_path_factory.mktemp("screening")
+    text = short_study(96, methods=["uniform"]).replace("adversary_steps = 40", "adversary_steps = 200")
+    (home / "study.toml").write_text(text + FACTORS)
+    study = StudyFolder(home / "study")
+    study.add(plan.expand(plan.read(home / "study.toml")))
+    return study
+
+
+def finish(study):
+    """Finish its cells."""
+    assert all([worker.run(study, cell) for cell in study.cells()])
+
+
+def test_a_pool_for_every_setting(screening, short_study, tmp_path, capsys):
+    """Each network has learnt from its own setting, or says that it could not; another study attacks with them all."""
+    with pytest.raises(RunError, match="2 of 2 cells are not finished; finish them first: deimos study run"):
+        cli.PoolOptions(folder=screening.path).run()
+    finish(screening)
+    cli.PoolOptions(folder=screening.path).run()
+    fast, slow = (screening.path / "pools" / f"directional.{i}.pt" for i in (0, 1))
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith(f"{fast}: ")
+    assert said[0].endswith(" crashes")
+    assert said[1] == f"{slow}: no crashes, or nothing else: the attacker's goals are uniform"
+    facts = [load_tensors(path, "pool", SCHEMA)["facts"] for path in (fast, slow)]
+    assert [each["uninformed"] for each in facts] == [False, True]
+    assert facts[0]["adversary_crashes"] > 0 == facts[1]["adversary_crashes"]
+
+    file = tmp_path / "attacked.toml"
+    head = f"pools = '{screening.path / 'pools'}'\n"
+    text = short_study(96, methods=["uniform"], head=head).replace("steps = 40,", 'steps = 40, attackers = ["pooled"],')
+    file.write_text(text + FACTORS)
+    study = StudyFolder(tmp_path / "study")
+    study.add(plan.expand(plan.read(file), seeds="7"))
+    finish(study)
+    rows = {row["environment"]: row for row in study.results().rows if row["goals"] == "pooled"}
+    assert [rows[f"directional.{i}"]["uninformed"] for i in (0, 1)] == [False, True]
+    assert rows["directional.0"]["adversary_crashes"] == facts[0]["adversary_crashes"]
+
+
+def test_a_pool_that_is_there_stays(screening, tmp_path):
+    """What was killed in the middle continues: files that are there keep their bytes, those that lack are made."""
+    finish(screening)
+    out = tmp_path / "pools"
+    cli.PoolOptions(folder=screening.path, out=out).run()
+    fast, slow = sorted(out.iterdir())
+    first = slow.read_bytes()
+    slow.unlink()
+    fast.write_bytes(b"made before")
+    command = [sys.executable, "-m", "deimos", "study", "pool", str(screening.path), "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    first_line, second = done.stdout.splitlines()
+    assert first_line == f"{fast}: is there"
+    assert second.startswith(f"{slow}: no crashes")
+    assert fast.read_bytes() == b"made before"
+    assert slow.read_bytes() == first
+
+
+def test_a_study_without_policies_has_no_pools(tmp_path):
+    """A folder without cells is refused."""
+    with pytest.raises(RunError, match="holds no policies"):
+        cli.PoolOptions(folder=tmp_path).run()
