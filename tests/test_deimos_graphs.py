@@ -10,12 +10,15 @@ import torch
 import warp as wp
 from replay import Replay, replay_on_cpu
 
+from deimos.app import console
+from deimos.app.train import ResumeOptions
 from deimos.checks import RunError
 from deimos.goals import methods
 from deimos.goals.interactions import Interactions, assign
 from deimos.goals.selector import Delegate
-from deimos.goals.selectors import boltzmann, learnability, mix, plr, swapped, uniform
+from deimos.goals.selectors import boltzmann, learnability, mix, plr, swapped, uniform, vds
 from deimos.learn.ppo import PPO, PPOConfig
+from deimos.run import training
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import graphs
 from deimos.sim.envs import particle, quad
@@ -30,7 +33,10 @@ CONFIG = TrainConfig(
     ppo=PPOConfig(num_steps=12, epochs=2, minibatches=3, hidden=(8,), init_std=80.0, normalize_observations=True),
     num_envs=64, env_steps=12 * 7, evaluation=False,
 )  # fmt: skip
-SELECTORS = {name: methods.method(name) for name in methods.METHODS} | {
+SELECTORS = {
+    name: replace(selector, epochs=1) if isinstance(selector, vds.Config) else selector  # which learns at length
+    for name, selector in zip(methods.METHODS, map(methods.method, methods.METHODS), strict=True)
+} | {
     "probing": replace(methods.method("p75"), probe=0.3, gate=True), "some uniform": mix.Config(base="p75"),
     "plr that replays": plr.Config(capacity=20), "boltzmann": boltzmann.Config(), "swapped": swapped.Config(),
     "learnability": learnability.Config(), "vds, then p75": methods.method("vds+p75"),
@@ -144,7 +150,7 @@ def test_what_python_freezes_is_found(plant, monkeypatch):
 
 
 def test_a_recording_that_waits_fails(monkeypatch):
-    """Work that reads a number of the device cannot be recorded, and says so."""
+    """Work that reads a number of the device cannot be recorded, which is said in one line with the way out."""
     replay_on_cpu(monkeypatch)
     propose = uniform.Uniform.propose
     monkeypatch.setattr(
@@ -152,7 +158,7 @@ def test_a_recording_that_waits_fails(monkeypatch):
     )
     trainer = Trainer(replace(CONFIG, method="uniform"), CPU)
     trainer.iterate()
-    with pytest.raises(RuntimeError, match=r"_local_scalar_dense.* waits for the device"):
+    with pytest.raises(RunError, match=r"recorded on cpu; use --graph off: aten._local_scalar_dense.* waits"):
         trainer.iterate()
 
 
@@ -249,6 +255,17 @@ def test_a_state_is_loaded_into_what_is_replayed(monkeypatch):
         rows = [trainer.iterate() for _ in range(2)]
         ends.append(dict(leaves({"row": rows, "state": trainer.state_dict()})))
     assert not list(differences(*ends))
+
+
+def test_a_resumed_run_may_do_without_graphs(tmp_path):
+    """A run that is resumed keeps its way with graphs, or takes another one, which its folder then holds."""
+    config = replace(CONFIG, method="uniform", env_steps=24, log=(), threads=1)
+    training.train(*training.start(config, tmp_path / "run"))
+    for graph, expected in ((None, "auto"), ("off", "off"), (None, "off")):
+        trainer, folder = training.resume(tmp_path / "run", 36, graph=graph)
+        assert trainer.config.graph == training.read_config(folder).graph == expected
+    options = console.parse(ResumeOptions, ["--resume", str(tmp_path / "run"), "--graph", "off"], "train")
+    assert options.graph == "off"
 
 
 def test_robots_are_replayed_too(monkeypatch):

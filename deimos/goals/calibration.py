@@ -29,9 +29,9 @@ class Calibration(Stateful):
     """
 
     saved = ("prior", "temperature")
-    prior = Mirrored[float]("_prior")
+    prior = Mirrored("_prior")
     """log(pi / (1 - pi))."""
-    temperature = Mirrored[float]("_temperature")
+    temperature = Mirrored("_temperature")
     """What corrected logits are divided by, in ``TEMPERATURES``."""
 
     def __init__(self, device: torch.device | str = "cpu") -> None:

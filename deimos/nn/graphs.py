@@ -11,13 +11,12 @@ from typing import Any, Generic, Protocol, TypeVar
 from torch import Tensor
 
 T = TypeVar("T")
-Result = TypeVar("Result", covariant=True)
 
 
-class Recording(Protocol[Result]):
+class Recording(Protocol[T]):
     """Calls that were recorded."""
 
-    result: Result
+    result: T
     """What the work returned while it was recorded: tensors that every replay overwrites."""
 
     def replay(self) -> None:
@@ -64,7 +63,7 @@ class Recorded(Generic[T]):
         return self._recording.result
 
 
-class Mirrored(Generic[T]):
+class Mirrored:
     """A number of an object's that Python sets, and recorded work reads as a tensor on the device; a descriptor.
 
     Args:
@@ -77,10 +76,10 @@ class Mirrored(Generic[T]):
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    def __get__(self, instance: Any, owner: type | None = None) -> T:
+    def __get__(self, instance: Any, owner: type | None = None) -> float:
         return vars(instance)[self._name]
 
-    def __set__(self, instance: Any, value: T) -> None:
+    def __set__(self, instance: Any, value: float) -> None:
         vars(instance)[self._name] = value
         tensor: Tensor = getattr(instance, self._tensor)
-        tensor.fill_(value)  # type: ignore[arg-type]  # a number; on CUDA an argument of a kernel, no copy
+        tensor.fill_(value)  # on CUDA an argument of a kernel, and no copy

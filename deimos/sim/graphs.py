@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 import warp as wp
 
-from deimos.checks import RunError
+from deimos.checks import RunError, one_line
 from deimos.nn.graphs import Recorder, Recording
 from deimos.sim.shared import warp_device
 
@@ -49,7 +49,7 @@ RECORDERS: dict[str, Callable[[Callable[[], Any], torch.device], Recording[Any]]
 
 
 def recorder(mode: Mode, device: torch.device) -> Recorder | None:
-    """Who records work on a device; ``None`` for nobody.
+    """Who records work on a device, and raises ``RunError`` if that fails; ``None`` for nobody.
 
     Raises:
         RunError: If work is to be recorded where nothing can.
@@ -59,7 +59,14 @@ def recorder(mode: Mode, device: torch.device) -> Recorder | None:
         raise RunError(f"graph must be auto or off on {device}, where there are no CUDA graphs, got on.")
     if mode == "off" or found is None:
         return None
-    return lambda work: found(work, device)
+
+    def record(work: Callable[[], Any]) -> Recording[Any]:
+        try:
+            return found(work, device)
+        except RuntimeError as error:
+            raise RunError(f"No CUDA graph can be recorded on {device}; use --graph off: {one_line(error)}") from error
+
+    return record
 
 
 @contextmanager

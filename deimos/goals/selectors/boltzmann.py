@@ -43,7 +43,7 @@ class Boltzmann(FearSelector):
     config: Config
     # A run that is resumed with a larger budget keeps the schedule that it began with.
     saved = (*FearSelector.saved, "beta", "_steps")
-    beta = Mirrored[float]("_beta")
+    beta = Mirrored("_beta")
     """Rationality now."""
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
