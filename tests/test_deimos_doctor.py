@@ -4,17 +4,20 @@ import json
 import re
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import replay
 import torch
 
 from deimos.app import cli, console, doctor, gpu_stages
 from deimos.app.train import FolderOptions
 from deimos.checks import RunError
+from deimos.run.trainer import Trainer
 
 CPU = torch.device("cpu")
-NEEDS_CUDA = ("tests", "waits")
+NEEDS_CUDA = ("tests", "waits", "graphs")
 
 
 def test_says_what_there_is_and_what_works(capfd, monkeypatch):
@@ -56,6 +59,24 @@ def test_stages_run_on_a_cpu(name, tmp_path):
     report = json.loads((tmp_path / "found.json").read_text())
     assert report["found"].get("passed", True), report
     assert report["sizes"]["worlds"] == gpu_stages.SMALL.worlds
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_graphs_are_compared_with_calls(frozen, monkeypatch):
+    """The stage on graphs finds the same numbers, with a stand-in for CUDA's, and a number that does not change."""
+    replay.replay_on_cpu(monkeypatch)
+    monkeypatch.setattr(gpu_stages, "GRAPH_ITERATIONS", 5)
+    make = Trainer._make_steps
+
+    def make_frozen(self):
+        self._first_step.fill_(self.iteration * self.rollout.num_steps)
+        make(self)
+
+    if frozen:
+        monkeypatch.setattr(Trainer, "_make_steps", make_frozen)
+    found = gpu_stages.graphs(CPU, replace(gpu_stages.SMALL, robots=2))
+    assert [part["passed"] for part in found.values()] == [not frozen] * 3
+    assert all((part["equal iterations"] == 5) is not frozen for part in found.values())
 
 
 @pytest.mark.parametrize("broken", ["draws", "obs"])

@@ -23,9 +23,10 @@ from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import shared
 from deimos.sim.envs import particle, quad, quad_arm
+from deimos.sim.graphs import no_garbage_collected
 from deimos.sim.legged import engines
 from deimos.sim.legged.engines import PhysicsConfig
-from deimos.sim.legged.engines.captured import Captured, _no_garbage_collected
+from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.robots import go1
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
@@ -202,9 +203,9 @@ def test_no_garbage_is_collected_during_a_capture(monkeypatch):
 
     collected = []
     monkeypatch.setattr(gc, "collect", lambda: collected.append(gc.isenabled()))
-    with _no_garbage_collected(GPU):
+    with no_garbage_collected(GPU):
         assert (collected, gc.isenabled()) == ([True], False)
-    with _no_garbage_collected(CPU):
+    with no_garbage_collected(CPU):
         assert len(collected) == 1
 
 

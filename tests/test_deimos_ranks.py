@@ -26,7 +26,7 @@ from deimos.nn import ranks
 from deimos.run import training
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
-from deimos.sim.envs import particle
+from deimos.sim.envs import particle, quad
 
 HOME = Path(deimos.__file__).resolve().parent.parent
 RANKS, WORLDS = 2, 128
@@ -34,6 +34,7 @@ METHODS = (
     "uniform", "p25", "p25-literal", "vds", "vds-auxiliary", "rnd", "cl", "plr", "grid", "q-fear", "weighted",
     "swapped", "fear-novelty", "vds+p75",
 )  # fmt: skip
+CASES = (*METHODS, "robots")
 ITERATIONS = 3
 PATIENCE = 120.0  # [s] for processes on a machine that does other things
 
@@ -43,12 +44,14 @@ CONFIG = TrainConfig(
     ppo=PPOConfig(hidden=(16, 16), num_steps=16, minibatches=3, epochs=2),
     evaluation=False, seed=3, num_envs=WORLDS, env_steps=16 * ITERATIONS, device="cpu", threads=1, log=(),
 )  # fmt: skip
+ROBOTS = replace(CONFIG, env=quad.Config(engine="native", goal_period=8), num_envs=16, method="p25")
 
 
-def learn(method):
+def learn(case):
     """A few iterations: the first rollout, the first gradient and its minibatches, all rows, and the last state."""
-    ppo = replace(CONFIG.ppo, normalize_observations=method == "uniform")
-    config = replace(CONFIG, method=method, ppo=ppo, critic_warmup=int(method == "cl"))
+    ppo = replace(CONFIG.ppo, normalize_observations=case == "uniform")
+    of_particles = replace(CONFIG, method=case, ppo=ppo, critic_warmup=int(case == "cl")) if case in METHODS else None
+    config = of_particles or ROBOTS
     trainer = Trainer(config, torch.device("cpu"))
     ppo, found = trainer.ppo, {"rows": []}
     minibatches, step = ppo._minibatches, ppo.optimizer.step
@@ -119,7 +122,7 @@ def _work(out):
         training.train(trainer, folder)
     except (ArithmeticError, RunError) as error:
         found["broken"] = str(error)
-    torch.save(found | {method: learn(method) for method in METHODS}, out / f"{place.rank}.pt")
+    torch.save(found | {case: learn(case) for case in CASES}, out / f"{place.rank}.pt")
 
 
 def environment(**more):
@@ -150,57 +153,59 @@ def both(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def one(both):
-    """What one process comes to, by the method."""
-    return {method: learn(method) for method in METHODS}
+    """What one process comes to, by the case."""
+    return {case: learn(case) for case in CASES}
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_the_first_rollout_is_that_of_one_process(both, one, method):
+@pytest.mark.parametrize("case", CASES)
+def test_the_first_rollout_is_that_of_one_process(both, one, case):
     """Worlds draw by their global numbers: the halves of the first rollout are the whole, bit for bit."""
-    for name, whole in one[method]["rollout"].items():
-        halves = [found[method]["rollout"][name] for found in both[0]]
+    for name, whole in one[case]["rollout"].items():
+        halves = [found[case]["rollout"][name] for found in both[0]]
         assert torch.equal(torch.cat(halves, dim=1), whole), name
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_the_first_update_is_that_of_one_process(both, one, method):
+@pytest.mark.parametrize("case", CASES)
+def test_the_first_update_is_that_of_one_process(both, one, case):
     """The same order is drawn, each minibatch holds the same transitions, and the gradients differ by rounding."""
-    first, second = (found[method] for found in both[0])
-    whole = one[method]
+    first, second = (found[case] for found in both[0])
+    whole = one[case]
     for found in (first, second):
         assert torch.equal(found["order"], whole["order"])
         torch.testing.assert_close(found["gradient"], whole["gradient"], rtol=1e-5, atol=1e-6)
     for left, right, expected in zip(first["minibatches"], second["minibatches"], whole["minibatches"], strict=True):
-        together, size = torch.cat([left, right], dim=1), len(CONFIG.env.build(1, torch.device("cpu"), 0).obs[0])
+        together, size = torch.cat([left, right], dim=1), whole["rollout"]["obs"].shape[2]
         assert left.shape[1] != right.shape[1]  # of a random part, no rank has exactly the half
         rows = [sorted(part[: size + 3].t().tolist()) for part in (together, expected)]  # observation and action
         assert rows[0] == rows[1]
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_ranks_hold_the_same_networks(both, method):
+@pytest.mark.parametrize("case", CASES)
+def test_ranks_hold_the_same_networks(both, case):
     """After some iterations both have the same state, of learner and selector, and have seen the same numbers."""
-    first, second = (found[method] for found in both[0])
+    first, second = (found[case] for found in both[0])
     assert_same(first["state"], second["state"])
     assert_same(first["rows"], second["rows"])
-    assert len(first["state"]["loop"]["env"]["goal_count"]) == WORLDS
+    worlds = {"robots": ROBOTS.num_envs}.get(case, WORLDS)
+    assert len(first["state"]["loop"]["env"]["goal_count"]) == worlds
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_the_first_row_is_that_of_one_process(both, one, method):
+@pytest.mark.parametrize("case", CASES)
+def test_the_first_row_is_that_of_one_process(both, one, case):
     """What is logged of the first iteration, forecasts and what selectors learn included, is of all worlds."""
-    row, expected = both[0][0][method]["rows"][0], one[method]["rows"][0]
+    row, expected = both[0][0][case]["rows"][0], one[case]["rows"][0]
     assert row.keys() == expected.keys()
     # Every rank draws the minibatches of VDS from its own worlds, and the parts of these that critics share.
     drawn = {"vds": {"vds/loss"}, "vds+p75": {"vds/loss"}, "vds-auxiliary": {"vds/loss", "vds/value", "vds/deviation"}}
-    for name in row.keys() - drawn.get(method, set()):
+    for name in row.keys() - drawn.get(case, set()):
         assert row[name] == pytest.approx(expected[name], rel=2e-4, abs=1e-6, nan_ok=True), name
 
 
 def test_something_was_learnt(one):
     """The rows that were compared are of runs in which crashes are seen and selectors learn from the start."""
     rows = {method: found["rows"] for method, found in one.items()}
-    assert all(found[0]["crashes"] for found in rows.values())
+    assert all(rows[method][0]["crashes"] for method in METHODS)
+    assert rows["robots"][0]["reward"] > 0
     for method in ("p25", "p25-literal", "q-fear", "weighted", "swapped", "fear-novelty"):
         assert rows[method][0]["fear/loss"] > 0
         assert rows[method][-1]["fear/auroc"] > 0
@@ -253,6 +258,30 @@ def test_a_fault_on_one_rank_ends_both(both):
     assert report["rank"] == 1
     (rows,) = [entry for entry in report["not_finite"] if entry["name"] == "rollout.obs"]
     assert rows["worlds"] == [5]
+
+
+def test_a_program_of_torchruns_trains_on_all_ranks(tmp_path):
+    """``deimos.train`` joins the ranks as the command does: each has its share, and the first one evaluates."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import sys\nimport deimos\n"
+        "from deimos.learn.ppo import PPOConfig\nfrom deimos.run.evaluation import EvalConfig\n"
+        "config = deimos.TrainConfig(\n"
+        "    num_envs=16, env_steps=48, device='cpu', threads=1, log=(), ppo=PPOConfig(hidden=(8,)),\n"
+        "    eval=EvalConfig(worlds=8, steps=200, adversary_steps=200),\n"
+        ")\n"
+        "sys.stdout.write(f'{deimos.train(config, out=sys.argv[1])}\\n')\n"
+    )
+    run = tmp_path / "run"
+    done = subprocess.run(
+        torchrun(program, run), env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines().count(str(run)) == RANKS  # Warp speaks too
+    state = training.load_checkpoint(RunFolder.open(run))
+    assert (state["iteration"], state["ranks"], len(rows(run))) == (2, RANKS, 2)
+    assert len(state["loop"]["env"]["goal_count"]) == 16
+    assert json.loads((run / "evaluation.json").read_text())
 
 
 def test_a_signal_stops_all_ranks(tmp_path):

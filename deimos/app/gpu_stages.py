@@ -8,6 +8,7 @@ all, each in such a process, since a kernel that fails takes its process with it
 import gc
 import importlib.metadata
 import importlib.util
+import math
 import shutil
 import statistics
 import subprocess
@@ -32,6 +33,7 @@ from deimos.run.presets import preset
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.env import Env
 from deimos.sim.envs import particle
+from deimos.sim.graphs import RECORDERS
 from deimos.sim.legged import engines
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.engines.captured import Captured
@@ -43,6 +45,7 @@ TESTS = ("test_kernels_*.py", "test_deimos_env_particle.py", "test_deimos_intera
 TOLERANCE = 1e-3  # of observations, CPU against GPU, after the steps below; products and sums round differently
 STEPS = 50
 EAGER_STEPS = 5
+GRAPH_ITERATIONS = 8  # fear learns in the first one; the second runs as it is, the third is recorded
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,7 @@ def waits(device: torch.device, sizes: Sizes) -> dict[str, Any]:
     """Where rollouts under the Director wait for the GPU, which they must not, and where whole iterations do."""
     if device.type != "cuda":
         raise Skipped("only CUDA says where it waits")
-    trainer = _particles(device, sizes.worlds)
+    trainer = Trainer(replace(_config(sizes.worlds), graph="off"), device)  # a graph that waits cannot be recorded
     for _ in range(5):
         trainer.iterate()
     in_rollouts, in_iterations = (_waits_in(part) for part in (trainer.collect, trainer.iterate))
@@ -199,6 +202,40 @@ def learning(device: torch.device, sizes: Sizes) -> dict[str, Any]:
         trainer.iterate()
     calls = sorted(profile.key_averages(), key=lambda each: each.count, reverse=True)[:20]
     return found | {"most frequent calls of an iteration": {each.key: each.count for each in calls}}
+
+
+def graphs(device: torch.device, sizes: Sizes) -> dict[str, Any]:
+    """Training by CUDA graphs against the same training call by call: the same numbers, and how fast each is."""
+    if device.type not in RECORDERS:
+        raise Skipped("a CPU has no CUDA graphs")
+    found: dict[str, Any] = {}
+    tasks = {name: _config(sizes.worlds, name) for name in ("uniform", "p25")}
+    env, ppo = preset("quad").env, preset("quad").ppo
+    assert isinstance(env, LocomotionConfig)
+    env = replace(env, engine="warp", physics=replace(env.physics, deterministic=True))
+    ppo = replace(ppo, num_steps=min(ppo.num_steps, sizes.steps))
+    tasks["robots"] = replace(_config(sizes.robots, "uniform"), env=env, ppo=ppo)
+    for name, config in tasks.items():
+        rows: dict[str, list[dict[str, float]]] = {}
+        fps = {}
+        for mode in ("off", "on"):
+            trainer = Trainer(replace(config, graph=mode), device)
+            rows[mode], seconds = [], []
+            for _ in range(GRAPH_ITERATIONS):
+                begin = time.perf_counter()
+                rows[mode].append(trainer.iterate())
+                seconds.append(_since(begin, device))
+            fps[mode] = trainer.rollout.reward.numel() / statistics.median(seconds[-3:])
+            del trainer
+        same = [one == other for one, other in zip(*map(_without_nan, rows.values()), strict=True)]
+        found[name] = {"equal iterations": sum(same), "FPS": {"by call": fps["off"], "by graph": fps["on"]}}
+        found[name]["passed"] = all(same)
+    return found
+
+
+def _without_nan(rows: list[dict[str, float]]) -> list[dict[str, float | None]]:
+    """Rows that can be compared: NaN equals nothing."""
+    return [{name: None if math.isnan(value) else value for name, value in row.items()} for row in rows]
 
 
 def scales(device: torch.device, sizes: Sizes) -> dict[str, Any]:
@@ -345,8 +382,8 @@ def _memory(device: torch.device) -> dict[str, int]:
 
 STAGES: dict[str, tuple[Callable[[torch.device, Sizes], dict[str, Any]], float]] = {
     "versions": (versions, 30.0), "tests": (tests, 120.0), "waits": (waits, 30.0), "agreement": (agreement, 30.0),
-    "learning": (learning, 40.0), "scales": (scales, 40.0), "resuming": (resuming, 30.0), "flat": (flat, 180.0),
-    "rebuilding": (rebuilding, 60.0), "rough": (rough, 60.0),
+    "learning": (learning, 40.0), "graphs": (graphs, 90.0), "scales": (scales, 40.0), "resuming": (resuming, 30.0),
+    "flat": (flat, 180.0), "rebuilding": (rebuilding, 60.0), "rough": (rough, 60.0),
 }  # fmt: skip
 """By name, in their order: each stage, and how long it may take [s]. Kernels that it compiled are there next time."""
 

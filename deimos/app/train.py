@@ -23,6 +23,7 @@ from deimos.run.evaluation import weights_hash
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
+from deimos.sim.graphs import Mode
 from deimos.sim.shared import one_stream
 
 
@@ -36,6 +37,8 @@ class ResumeOptions:
     """A larger budget: steps of every world in all. By default the one that the run had."""
     device: str | None = None
     """Where to continue. By default where it was."""
+    graph: Mode | None = None
+    """Whether a GPU replays CUDA graphs. By default as it did."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +48,7 @@ class FirstOptions:
     preset: str | None = None
     """Name of a ready configuration to start from; the others change it."""
     resume: Path | None = None
-    """Resume the run in this folder from its last checkpoint; takes only --env-steps and --device."""
+    """Resume the run in this folder from its last checkpoint; takes only --env-steps, --device and --graph."""
     branch_from: Path | None = None
     """Start with networks, optimiser, worlds and levels of the run in this folder, and with its settings: method,
     env.crash-penalty, env.goal-period, env.engine, seed and budget may differ."""
@@ -80,7 +83,7 @@ def _train(options: Any) -> None:
 
 def _resume(options: ResumeOptions) -> None:
     device = options.device or training.read_config(RunFolder.open(options.resume)).device
-    _run(device, lambda: training.resume(options.resume, options.env_steps, options.device))
+    _run(device, lambda: training.resume(options.resume, options.env_steps, options.device, options.graph))
 
 
 def _run(device: str, begin: Callable[[], tuple[Trainer, RunFolder]]) -> None:

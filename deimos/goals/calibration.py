@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from deimos.nn.graphs import Mirrored
 from deimos.nn.stateful import Stateful
 
 TEMPERATURES = (0.1, 10.0)  # range of a temperature; outside, the scores are not logits of anything
@@ -19,9 +20,8 @@ class Calibration(Stateful):
     true ones, with pi the share of crashes; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What
     is left is a matter of over- and underconfidence, which one temperature on held-out data corrects [2]_.
 
-    Attributes:
-        prior: log(pi / (1 - pi)).
-        temperature: What corrected logits are divided by, in ``TEMPERATURES``.
+    Args:
+        device: Where the logits are.
 
     References:
         .. [1] Elkan, *The Foundations of Cost-Sensitive Learning*, IJCAI 2001, theorem 2.
@@ -29,18 +29,26 @@ class Calibration(Stateful):
     """
 
     saved = ("prior", "temperature")
+    prior = Mirrored("_prior")
+    """log(pi / (1 - pi))."""
+    temperature = Mirrored("_temperature")
+    """What corrected logits are divided by, in ``TEMPERATURES``."""
 
-    def __init__(self) -> None:
-        self.prior = 0.0
-        self.temperature = 1.0
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self._prior, self._temperature = torch.zeros(2, dtype=torch.float64, device=device)
+        self.prior, self.temperature = 0.0, 1.0
+
+    def log_odds(self, score: Tensor) -> Tensor:
+        """Log odds of a crash before the temperature, of logits of the class-balanced classifier."""
+        return score + self._prior
 
     def probability(self, score: Tensor) -> Tensor:
         """Probability of a crash, in (0, 1), of logits of the class-balanced classifier."""
-        return self.of_log_odds(score + self.prior)
+        return self.of_log_odds(self.log_odds(score))
 
     def of_log_odds(self, log_odds: Tensor) -> Tensor:
         """Probability of a crash where the prior, perhaps an earlier one, has been added already."""
-        return torch.sigmoid(log_odds / self.temperature)
+        return torch.sigmoid(log_odds / self._temperature)
 
     def set_share(self, share: float) -> None:
         """Set the share of crashes in the world, in (0, 1)."""

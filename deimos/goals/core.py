@@ -109,6 +109,11 @@ class GoalCore(Stateful):
         assign(self.percentile, changes.done, 50.0)
         return changes
 
+    def passed(self, steps: int) -> None:
+        """Count steps that a CUDA graph has replayed, in which ``advance`` was not called."""
+        self.interactions.now += steps
+        self._steps += steps
+
     @torch.no_grad()
     def choose(
         self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor,

@@ -3,6 +3,7 @@
 import abc
 import logging
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -88,7 +89,7 @@ class FearSelector(GoalSelector):
         self.num_candidates = config.candidates
         self._learnt_at = 0  # step of the last call of learn
         self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
-        self.calibration = Calibration()
+        self.calibration = Calibration(spaces.device)
         self.memory: CrashMemory | None = None
         """Where the crashes are kept that fear is learnt from; ``None`` for the last 2 T steps alone."""
         if config.memory:
@@ -97,13 +98,18 @@ class FearSelector(GoalSelector):
             self.memory = CrashMemory(config.memory, spaces.goal_period, inputs, spaces.device, seed, extra)
         self._age = -1  # rollouts since the last fit, -1 before the first
         self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
-        self._issued: int | Tensor = 0  # goals since the last call of learn; of every world where the device counts
+        # Goals since the last call of learn.
+        self._issued = torch.zeros((), dtype=torch.int64, device=spaces.device)
         self._said = False  # that there is no fear yet
 
     @property
     def afraid(self) -> bool:
         """Whether fear chooses: the network has learnt something and, behind a gate, ranks better than chance."""
         return self.fear.fitted and not (self.config.gate and self._auroc <= 0.5)
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return self.afraid, self.fear.fitted
 
     @abc.abstractmethod
     def choose(self, score: Tensor, draw: Tensor) -> Tensor:
@@ -128,7 +134,7 @@ class FearSelector(GoalSelector):
             pick = torch.where(probe, picks.uniformly(draws[:, 0], candidates.shape[1]), pick)
         # As a forecast it keeps the prior at issue time, whatever the crash rate is when it is evaluated.
         picked = picks.take(score, pick)
-        forecast, percentile = picked + self.calibration.prior, picks.percentile(score, picked)
+        forecast, percentile = self.calibration.log_odds(picked), picks.percentile(score, picked)
         return Proposal(picks.take(candidates, pick), forecast, probe=probe, percentile=percentile)
 
     def issued(
@@ -136,7 +142,7 @@ class FearSelector(GoalSelector):
         where: Tensor | None = None,
     ) -> None:  # fmt: skip
         """See ``GoalSelector.issued``."""
-        self._issued = self._issued + (len(rows) if where is None else where)
+        self._issued += len(rows) if where is None else where.sum()
 
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
         """What ``choose`` goes by, shape (B, N): the logits of fear, ``score``, unless somebody knows better.
@@ -151,9 +157,8 @@ class FearSelector(GoalSelector):
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
-        counted = self._issued
-        (issued,) = largest(int(counted.any()) if isinstance(counted, Tensor) else counted)
-        self._issued = 0
+        (issued,) = largest(int(self._issued))
+        self._issued.zero_()
         chosen = float(self.afraid) if issued else math.nan  # it has not changed since the last time
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at

@@ -110,8 +110,7 @@ class Interactions(Stateful):
         groups: int = 0,
     ) -> None:  # fmt: skip
         self.window = window
-        self.now = 0
-        """Steps so far."""
+        self._now, self._clock = 0, torch.zeros((), dtype=torch.int64, device=device)
         self._scored = True
         self.active = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """True where an interaction is pending, shape (num_envs,)."""
@@ -130,6 +129,16 @@ class Interactions(Stateful):
         self._marks = torch.zeros(num_envs, capacity, 4, dtype=torch.int64, device=device)
         """Crashed, issued, resolved, horizon; steps count from 1, so a resolved step of 0 marks a free slot."""
 
+    @property
+    def now(self) -> int:
+        """Steps so far. The device counts them too, for whoever sets a CUDA graph to replay them."""
+        return self._now
+
+    @now.setter
+    def now(self, steps: int) -> None:
+        self._now = steps
+        self._clock.fill_(steps)
+
     @torch.no_grad()
     def advance(self, reward: Tensor, terminated: Tensor, tracking: Tensor | None = None) -> None:
         """Count a step and its rewards. Call it once per step, before ``resolve``.
@@ -139,7 +148,8 @@ class Interactions(Stateful):
             terminated: True where the world crashed, bool, shape (num_envs,).
             tracking: How well each group of goal components was met, in [0, 1], shape (num_envs, groups).
         """
-        self.now += 1
+        self._now += 1
+        self._clock += 1
         gain = reward.unsqueeze(1)
         gain = gain if tracking is None else torch.cat([gain, tracking], dim=1)
         self._gained.add_(gain.masked_fill(terminated.unsqueeze(1), 0.0))
@@ -161,7 +171,7 @@ class Interactions(Stateful):
         )
         decided = active & (crashed | survived)
         slot = cursor % self._capacity
-        marks = torch.stack([crashed, issued_at, torch.full_like(slot, self.now), horizon], dim=1)
+        marks = torch.stack([crashed, issued_at, self._clock.expand_as(slot), horizon], dim=1)
         keep = decided.unsqueeze(1)
         self._ring[rows, slot] = torch.where(keep, pending, self._ring[rows, slot])
         self._marks[rows, slot] = torch.where(keep, marks, self._marks[rows, slot])
@@ -183,7 +193,7 @@ class Interactions(Stateful):
         columns = [gained[:, :1] if values is None else values.unsqueeze(1) for values in (score, probe, note)]
         pending = torch.cat([state, goal, next_goal, *columns, gained], dim=1).float()
         assign(self._pending, rows, pending, where)
-        assign(self.issued_at, rows, self.now, where)
+        assign(self.issued_at, rows, self._clock.expand(len(rows)), where)
         assign(self._horizon, rows, horizon, where)
         assign(self.active, rows, True, where)
 

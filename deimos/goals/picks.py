@@ -24,7 +24,7 @@ def take(values: Tensor, pick: Tensor) -> Tensor:
     return values.gather(1, pick.view(-1, 1, 1).expand(-1, 1, values.shape[2])).squeeze(1)
 
 
-def uniformly(draw: Tensor, count: int) -> Tensor:
+def uniformly(draw: Tensor, count: int | Tensor) -> Tensor:
     """Any of ``count`` candidates, shape (B,); ``draw`` holds uniform numbers in [0, 1), shape (B,)."""
     return (draw * count).long().clamp(max=count - 1)
 

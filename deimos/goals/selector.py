@@ -1,7 +1,7 @@
 """What every goal selector promises. A selector sees tensors only, never an environment or a learner."""
 
 import abc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -132,6 +132,15 @@ class GoalSelector(Stateful, abc.ABC):
     how many are due. It must then change nothing of the selector, since most of its answers are dropped; what was
     issued is noted by ``issued``."""
 
+    def graph_key(self) -> Hashable:
+        """What Python decides by in ``propose`` and ``issued``, such as whether a network has learnt yet.
+
+        A GPU records a whole rollout as a CUDA graph, and replays it as long as this stays the same. So everything else
+        that they depend on and that changes must be tensors, which others write in place; ``None`` where that is not
+        so. See ``deimos.nn.graphs``.
+        """
+        return None
+
     def goal_range(self) -> Tensor | None:
         """Share of the goal range to draw candidates from, shape (goal_dim,), in (0, 1]; ``None`` for all of it."""
         return None
@@ -206,6 +215,11 @@ class Delegate(GoalSelector):
     num_candidates = property(lambda self: self.current.num_candidates)
     first_goals_scaled = property(lambda self: self.current.first_goals_scaled)
     crash_penalty = property(lambda self: self.current.crash_penalty)
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        key = self.current.graph_key()
+        return None if key is None else (self.parts.index(self.current), key)
 
     def goal_range(self) -> Tensor | None:
         """See ``GoalSelector.goal_range``."""

@@ -8,7 +8,7 @@ uses the value of the one before.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from torch import Tensor
 from deimos.checks import SimulationError, check_at_least, check_choice, check_hidden, check_positive, check_range
 from deimos.learn.rollout import Rollout
 from deimos.nn.adam import Adam
+from deimos.nn.graphs import Recorded, Recorder
 from deimos.nn.layout import ALL, Seen, count
 from deimos.nn.losses import Loss, Surrogate, ValueLoss, log_prob
 from deimos.nn.mlps import MLPs, gradients
@@ -123,6 +124,7 @@ class PPO(Stateful):
         seed: Seed of the weights, the exploration and the order of the minibatches, in [0, 2^32).
         actor_sees: What the actor sees of an observation.
         critic_sees: What the critic sees of it.
+        record: Who records what is learnt from all minibatches of a rollout, to replay it; ``None`` for nobody.
 
     Raises:
         ValueError: If there are more minibatches than transitions in a rollout.
@@ -132,7 +134,7 @@ class PPO(Stateful):
 
     def __init__(
         self, config: PPOConfig, num_envs: int, obs_dim: int, action_dim: int, device: torch.device, seed: int, *,
-        actor_sees: Seen = ALL, critic_sees: Seen = ALL,
+        actor_sees: Seen = ALL, critic_sees: Seen = ALL, record: Recorder | None = None,
     ) -> None:  # fmt: skip
         rows = config.num_steps * num_envs
         self._rows = rows * place().size  # transitions of all ranks
@@ -164,9 +166,12 @@ class PPO(Stateful):
         self._batch, self._shuffled = (
             Batch(torch.zeros(shape, dtype=torch.float32, device=device), obs_dim) for _ in range(2)
         )
+        self._order = torch.zeros(self._rows, dtype=torch.int64, device=device)
+        self._fit = Recorded[Tensor](record)
         self._normalized = torch.zeros(num_envs, obs_dim, dtype=torch.float32, device=device)
         self._sizes = num_envs, obs_dim, action_dim, device
-        self._seed, self._worlds = seed, torch.arange(num_envs, device=device)
+        self._seed = seed
+        self._worlds, self._steps = (torch.arange(size, device=device) for size in (num_envs, config.num_steps))
 
     def new_rollout(self) -> Rollout:
         """Memory for what ``update`` learns from."""
@@ -176,18 +181,19 @@ class PPO(Stateful):
             reward_scale=config.reward_scale,
         )  # fmt: skip
 
-    def draw_noise(self, noise: Tensor, first_step: int, env_offset: int = 0) -> None:
+    def draw_noise(self, noise: Tensor, first_step: int | Tensor, env_offset: int = 0) -> None:
         """Draw the exploration of a whole rollout; a world's number depends on the seed, the world and the step alone.
 
         Args:
             noise: Standard normal draws, shape (num_steps, num_envs, action_dim). Written.
-            first_step: Steps that every world has taken before, below 2^32 - num_steps.
+            first_step: Steps that every world has taken before, below 2^32 - num_steps; a tensor of no axes, int64,
+                where it is to be read on the device.
             env_offset: Global number of world 0.
         """
         size = max(1, 2**17 // len(self._worlds))  # steps at a time whose words stay within a core's caches
         for start in range(0, len(noise), size):
             part = noise[start : start + size]
-            steps = torch.arange(first_step + start, first_step + start + len(part), device=noise.device).unsqueeze(1)
+            steps = (self._steps[start : start + size] + first_step).unsqueeze(1)
             part.copy_(normals(self._seed, Purpose.EXPLORATION, self._worlds + env_offset, steps, noise.shape[2]))
 
     @torch.no_grad()
@@ -234,28 +240,22 @@ class PPO(Stateful):
             update, ``entropy``, ``learning_rate``, ``action_std``, ``explained_variance``. Where fewer transitions
             count than a minibatch has, nothing is learnt and the first three are NaN.
         """
-        batch, explained = self.batch(rollout, critic)
+        explained = self.batch(rollout, critic)[1]
         if order is None:
-            order = torch.randperm(self._rows, generator=self.generator, device=batch.table.device)
-        std = self.actor.std.clone()
+            torch.randperm(self._rows, generator=self.generator, out=self._order)
+        else:
+            self._order.copy_(order)
         value_loss = surrogate_loss = kl = math.nan
         learns = learn_policy or critic is None
         if learns and bool(sum_over_ranks(rollout.weight.sum()) >= self._size):
-            minibatches = self._minibatches(batch, order)
-            totals = torch.zeros(3, dtype=torch.float32, device=order.device)
-            self._grad.zero_()
-            for _ in range(self.config.epochs):
-                for minibatch in minibatches:
-                    totals += (
-                        self._learn(minibatch, std, learn_value=critic is None)
-                        if learn_policy else self._learn_value(minibatch)
-                    )  # fmt: skip
-            value_loss, surrogate_loss, kl = (totals / (self.config.epochs * self.config.minibatches)).tolist()
+            options = {"policy": learn_policy, "value": critic is None}
+            key = tuple(options.values()) if place().size == 1 else None  # what ranks send each other is not recorded
+            value_loss, surrogate_loss, kl = self._fit(partial(self._fit_batch, **options), key).tolist()
         if learn_policy and self.actor.normalizer is not None:
             # Only now: the policy that acted is the one that learning starts from.
             for obs, weight in zip(rollout.obs[:-1], rollout.weight, strict=True):
                 self.actor.normalizer.update(obs, (weight > 0).float())
-        entropy = self.actor.std.log().sum() + len(std) * 0.5 * math.log(2 * math.pi * math.e)
+        entropy = self.actor.std.log().sum() + len(self.actor.std) * 0.5 * math.log(2 * math.pi * math.e)
         after = {
             "entropy": entropy, "learning_rate": self.learning_rate, "action_std": self.actor.std.mean(),
             "explained_variance": explained,
@@ -293,6 +293,20 @@ class PPO(Stateful):
         for row, source in zip(rows, (density, advantage, weight, value, returns), strict=True):
             row.copy_(source.flatten())
         return self._batch, explained
+
+    def _fit_batch(self, *, policy: bool, value: bool) -> Tensor:
+        """Learn from the last batch in the last order; returns means of ``_learn`` over all minibatches.
+
+        It reads and writes what stays where it is, and waits for nothing: see ``deimos.nn.graphs``.
+        """
+        std = self.actor.std.clone()
+        minibatches = self._minibatches(self._batch, self._order)
+        totals = torch.zeros(3, dtype=torch.float32, device=std.device)
+        self._grad.zero_()
+        for _ in range(self.config.epochs):
+            for minibatch in minibatches:
+                totals += self._learn(minibatch, std, learn_value=value) if policy else self._learn_value(minibatch)
+        return totals / (self.config.epochs * self.config.minibatches)
 
     def _minibatches(self, batch: Batch, order: Tensor) -> list[Batch]:
         """Parts of a batch in another order, each with weights that add up to 1 over all ranks."""

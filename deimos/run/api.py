@@ -1,5 +1,6 @@
 """Training and evaluation as two functions, for programs."""
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import torch
 
 from deimos.checks import RunError
+from deimos.nn import ranks
 from deimos.nn.threads import on_threads
 from deimos.run import training
 from deimos.run.branch import branch_config
@@ -26,6 +28,9 @@ def train(
     The environment of the process is left alone. Where other programs use the cores too, set OMP_WAIT_POLICY=passive
     before torch is loaded, as the ``deimos`` command does: threads that spin while they wait are slow there.
 
+    Processes that ``torchrun`` starts train one policy, each in its share of the worlds; all must call this, once, and
+    the first one evaluates.
+
     Args:
         config: What to train; ``None`` for the main job, Particle Gym under the Director.
         out: Folder of the run, which must not exist; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
@@ -36,17 +41,22 @@ def train(
         The run's folder, for ``evaluate`` and ``load_policy``.
 
     Raises:
-        RunError: If the folder exists, the worlds do not fit into memory, or a file cannot be written.
+        RunError: If the folder exists, the worlds do not fit into memory, a file cannot be written, or the other
+            processes of torchrun cannot be reached.
         SimulationError: If a number is not finite; the last checkpoint is intact.
     """
     if config is None and branch_from is not None:
         config = branch_config(training.read_config(RunFolder.open(Path(branch_from))))
     config = config or TrainConfig()
-    device = training.resolve_device(config.device)
-    with on_threads(torch.get_num_threads()), one_stream(device):  # a run sets the number; the host gets its own back
-        trainer, folder = training.start(config, _path(out), branch_from=_path(branch_from))
-        training.train(trainer, folder)
-        if config.evaluation:
+    with on_threads(torch.get_num_threads()), ExitStack() as stack:  # a run sets the number; the host gets its own back
+        with ranks.joined():
+            with ranks.together():
+                device = training.resolve_device(config.device)
+                stack.enter_context(one_stream(device))
+            trainer, folder = training.start(config, _path(out), branch_from=_path(branch_from))
+            training.train(trainer, folder)
+            first = ranks.place().first
+        if first and config.evaluation:
             evaluate_run(folder, config.env, config.eval, device)
     return folder.path
 

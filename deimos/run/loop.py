@@ -1,6 +1,6 @@
 """What happens between two steps: interactions resolve, goals are chosen, episodes begin."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 import torch
 from torch import Tensor
@@ -73,11 +73,30 @@ class GoalLoop:
         nothing to do, and scores the candidates of all worlds in less time; unless the selector, or a guard, wants to
         be asked about those alone.
         """
-        on_gpu = AS_ON_GPU or self.env.device.type == "cuda"
         return self.core.advance(
-            step.terminated, step.truncated, step.goal_due, step.reward, step.tracking,
-            dense=on_gpu and self.selector.dense and self._guard is None,
-        )  # fmt: skip
+            step.terminated, step.truncated, step.goal_due, step.reward, step.tracking, dense=self._dense
+        )
+
+    @property
+    def _dense(self) -> bool:
+        on_gpu = AS_ON_GPU or self.env.device.type == "cuda"
+        return on_gpu and self.selector.dense and self._guard is None
+
+    def graph_key(self) -> Hashable:
+        """What Python decides by in ``advance``; ``None`` where a CUDA graph cannot replay it, see ``why_eager``."""
+        return self.selector.graph_key() if self.env.records and self._dense else None
+
+    def why_eager(self) -> str:
+        """Who keeps a CUDA graph from replaying steps, in a few words."""
+        if not self.env.records:
+            return f"{type(self.env).__name__} does not say that its steps can be (Env.records)"
+        who = type(self.selector).__name__ if self._guard is None else "a guard of goals"
+        return f"{who} does not say that its choices can be (GoalSelector.dense and graph_key)"
+
+    def passed(self, steps: int) -> None:
+        """Count steps that a CUDA graph has replayed, in which Python did not run."""
+        self.env.steps += steps
+        self.core.passed(steps)
 
     def renew(self, step: Step, changes: Changes) -> None:
         """The second half of ``advance``: new goals where they are due, new episodes where one has ended."""

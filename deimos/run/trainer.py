@@ -1,8 +1,11 @@
 """A run in memory: what is trained, and one iteration of it."""
 
+import logging
 import math
 import time
+from collections.abc import Hashable
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,6 +15,7 @@ from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
 from deimos.nn import ranks
+from deimos.nn.graphs import Recorded
 from deimos.nn.host import own_settings
 from deimos.nn.layout import seen_by
 from deimos.nn.threads import tf32_products, torch_on_one
@@ -22,8 +26,11 @@ from deimos.run.loop import GoalLoop, spaces
 from deimos.run.oracle import Clones, SeesWorlds
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
+from deimos.sim.graphs import MODES, Mode, recorder
 
 MOST_THREADS = 4096  # far more than that, and libraries of threads crash
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +62,9 @@ class TrainConfig:
     tf32: bool = False
     """Whether a GPU may round the factors of float32 matrix products to 10 bits of mantissa (TF32), which is faster
     for large networks. CPUs never do."""
+    graph: Mode = "auto"
+    """Whether a GPU replays rollouts and updates as CUDA graphs: auto does so where it can, on refuses to train where
+    it cannot, off launches every operation by itself."""
     threads: int = 0
     """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
     log: tuple[str, ...] = ("tensorboard",)
@@ -72,6 +82,7 @@ class TrainConfig:
             check_at_least(name, getattr(self, name), 0)
         check_range("threads", self.threads, 0, MOST_THREADS)
         check_device("device", self.device)
+        check_choice("graph", self.graph, MODES)
         for name in self.log:
             check_choice("log", name, LOGS)
         if not 0 <= self.seed < 2**32:
@@ -116,10 +127,11 @@ class Trainer:
         self.env = config.env.build(num_envs, device, config.seed, self._first_world)
         total_steps = config.iterations * config.ppo.num_steps
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
+        record = recorder(config.graph, device)
         actor_sees, critic_sees = (seen_by(who, self.env.layout, device) for who in ("actor", "critic"))
         self.ppo = PPO(
             config.ppo, num_envs, self.env.obs_dim, self.env.action_dim, device, config.seed,
-            actor_sees=actor_sees, critic_sees=critic_sees,
+            actor_sees=actor_sees, critic_sees=critic_sees, record=record,
         )  # fmt: skip
         self.rollout = self.ppo.new_rollout()
         clones = Clones(lambda count: config.env.build(count, device, config.seed), self.ppo.actor)
@@ -131,15 +143,36 @@ class Trainer:
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
         """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""
         self.synchronise = False
-        """Whether to wait for the device at the end of every part, to tell their times apart; for benchmarks."""
+        """Whether to wait for the device at the end of every part, to tell their times apart; for benchmarks. Rollouts
+        are not replayed as graphs then."""
+        self._first_step = torch.zeros((), dtype=torch.int64, device=device)  # of the rollout
+        self._clock = _Clock(self)
+        self._steps = Recorded[None](record)
+        self._says_why = record is not None
+        if config.graph == "on" and self.loop.graph_key() is None:
+            raise RunError(f"graph must be auto or off here, since {self.loop.why_eager()}; got on.")
 
     @own_settings()
     @torch.no_grad()
     def collect(self) -> None:
         """Let the policy act for one rollout."""
-        env, loop, ppo, rollout = self.env, self.loop, self.ppo, self.rollout
-        clock = _Clock(self)
-        ppo.draw_noise(rollout.noise, self.iteration * rollout.num_steps, self._first_world)
+        self._first_step.fill_(self.iteration * self.rollout.num_steps)
+        self._clock = _Clock(self)
+        self._steps(self._make_steps, self._graph_key(), replayed=partial(self.loop.passed, self.rollout.num_steps))
+        self._clock.lap("env")  # all of a rollout that was replayed
+
+    def _graph_key(self) -> Hashable:
+        """What Python decides by in a rollout; ``None`` where it is not replayed, which is said once."""
+        key = None if self.synchronise else self.loop.graph_key()
+        if key is None and self._says_why and not self.synchronise:
+            self._says_why = False
+            _log.info("Rollouts are not replayed as CUDA graphs: %s.", self.loop.why_eager())
+        return key
+
+    def _make_steps(self) -> None:
+        """The steps of a rollout, in place and without a wait for the device: see ``deimos.nn.graphs``."""
+        env, loop, ppo, rollout, clock = self.env, self.loop, self.ppo, self.rollout, self._clock
+        ppo.draw_noise(rollout.noise, self._first_step, self._first_world)
         steps = zip(rollout.obs[:-1], rollout.noise, rollout.action, rollout.mean, strict=True)
         for t, (obs, noise, action, mean) in enumerate(steps):
             obs.copy_(env.obs)

@@ -28,6 +28,7 @@ from deimos.run.failure import check_finite, dumped
 from deimos.run.folder import RunFolder
 from deimos.run.logs import Logs, open_logs
 from deimos.run.trainer import TrainConfig, Trainer
+from deimos.sim.graphs import Mode
 from deimos.sim.shared import find_cuda
 
 SCHEMA = 1  # of config.json
@@ -229,12 +230,14 @@ def _rebuild(state: dict, config: TrainConfig) -> Trainer:
     return trainer
 
 
-def resume(path: Path, env_steps: int | None = None, device: str | None = None) -> tuple[Trainer, RunFolder]:
-    """Resume a run from its last checkpoint, with a larger budget ``env_steps`` or on another device if they are given.
+def resume(
+    path: Path, env_steps: int | None = None, device: str | None = None, graph: Mode | None = None
+) -> tuple[Trainer, RunFolder]:
+    """Resume a run from its last checkpoint, with another budget, device or use of CUDA graphs if they are given.
 
     Raises:
-        RunError: If it is not a run folder, its checkpoint is broken, the budget is smaller, or another number of ranks
-            has trained it: sums would be rounded otherwise.
+        RunError: If it is not a run folder, its checkpoint is broken, the budget ``env_steps`` is smaller, or another
+            number of ranks has trained it: sums would be rounded otherwise.
     """
     folder = RunFolder.open(path)
     with _held(folder), ranks.together():
@@ -245,12 +248,14 @@ def resume(path: Path, env_steps: int | None = None, device: str | None = None) 
             config = replace(config, env_steps=env_steps)
         if device is not None:
             config = replace(config, device=_stored_name(resolve_device(device)))
+        if graph is not None:
+            config = replace(config, graph=graph)
         state = _load_current(folder)
         _check_ranks(folder, state.get("ranks", 1))
         trainer = _rebuild(state, config)
         if ranks.place().first:
             stored = folder.read_json("config.json")  # whose files keep the names that they were given by
-            stored["config"] |= {"env_steps": config.env_steps, "device": config.device}
+            stored["config"] |= {"env_steps": config.env_steps, "device": config.device, "graph": config.graph}
             folder.write_json("config.json", stored)
     return trainer, folder
 

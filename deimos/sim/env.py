@@ -159,6 +159,10 @@ class Env(abc.ABC):
     """What was subtracted from the reward of a step that ended in a crash: add it to report rewards."""
     obs: Tensor
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
+    steps: int = 0
+    """Steps since it was built."""
+    records: bool = False
+    """Whether a CUDA graph may replay steps, resets and draws: work on the device alone, but for counting ``steps``."""
     may_go_on_invalid: bool = False
     """Whether the run continues where a world becomes invalid; else ``check`` stops it."""
     goal_groups: tuple[slice, ...] = (slice(None),)
@@ -175,9 +179,8 @@ class Env(abc.ABC):
     episode_step: Tensor
     """Steps since the last reset, int32, shape (num_envs,); a view."""
     tensors: dict[str, Tensor]
-    """Everything that a bit-exact resume needs, by name; views, worlds along the first axis. ``episode_count`` and
-    ``goal_count`` are how many episodes each world has begun and how many goals it was given since: its draws'
-    addresses."""
+    """Everything that a bit-exact resume needs, by name; views, worlds along the first axis. The addresses of draws are
+    ``episode_count``, a world's episodes so far, and ``goal_count``, its goals since the last one began."""
 
     @abc.abstractmethod
     def step(self, action: Tensor) -> Step:

@@ -103,7 +103,7 @@ class WarpEnv(Env):
         self.invalid_steps = 0
         """Invalid world-steps that ``check`` has found."""
         self._no_fault = views["fault"].clone()
-        self._steps_in_window = self._faults_known = 0
+        self._window_began = self._faults_known = 0
 
     @final
     def allocate(self, table: StructTable, *, resume: bool = True, **sizes: int) -> Any:
@@ -168,7 +168,7 @@ class WarpEnv(Env):
         check_stream(self.device)
         self.action.tensor.copy_(action.detach())
         self.launch_step()
-        self._steps_in_window += 1
+        self.steps += 1
         return self._step
 
     @final
@@ -237,7 +237,7 @@ class WarpEnv(Env):
         faults, world, actor = self._views["fault"].tolist()
         self.invalid_steps += faults - self._faults_known
         self._faults_known = faults
-        window = self._steps_in_window * self.num_envs
+        window = (self.steps - self._window_began) * self.num_envs
         message = None
         if actor < self.num_envs:
             message = f"World {actor}: its action is not finite."
@@ -261,7 +261,7 @@ class WarpEnv(Env):
     def _clear_faults(self) -> None:
         """Begin a new window."""
         self._views["fault"].copy_(self._no_fault)
-        self._steps_in_window = self._faults_known = 0
+        self._window_began, self._faults_known = self.steps, 0
 
     def _record_candidates(self, count: int) -> tuple[Shared, list[wp.Launch]]:
         candidates = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device)

@@ -11,6 +11,7 @@ from deimos.goals import picks
 from deimos.goals.fear_selector import FearSelector, FearSelectorConfig
 from deimos.goals.interactions import Interactions
 from deimos.goals.selector import Spaces, Transitions
+from deimos.nn.graphs import Mirrored
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,16 +43,18 @@ class Boltzmann(FearSelector):
     config: Config
     # A run that is resumed with a larger budget keeps the schedule that it began with.
     saved = (*FearSelector.saved, "beta", "_steps")
+    beta = Mirrored("_beta")
+    """Rationality now."""
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         super().__init__(config, spaces, seed)
         self._steps = config.anneal * spaces.require_total_steps("boltzmann") if config.anneal else 0.0
+        self._beta = torch.zeros((), dtype=torch.float64, device=spaces.device)
         self.beta = config.beta_start if self._steps else config.beta
-        """Rationality now."""
 
     def choose(self, score: Tensor, draw: Tensor) -> Tensor:
         """See ``FearSelector.choose``."""
-        return picks.in_proportion(torch.softmax(self.beta * score, dim=1), draw)
+        return picks.in_proportion(torch.softmax(self._beta * score, dim=1), draw)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``."""

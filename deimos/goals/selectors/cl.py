@@ -1,5 +1,6 @@
 """The hand-made curriculum: uniform goals whose range grows as they are met (Legged Gym; thesis, 4.1.2)."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import torch
@@ -57,6 +58,10 @@ class Curriculum(GoalSelector):
     def goal_range(self) -> Tensor:
         """See ``GoalSelector.goal_range``."""
         return self._range
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return ()
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""

@@ -1,5 +1,6 @@
 """The grid-adaptive curriculum (Margolis et al., *Rapid Locomotion*, RSS 2022, arXiv:2205.02824, section III-B)."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import torch
@@ -79,6 +80,10 @@ class Grid(GoalSelector):
         for _ in range(dims):
             weights = weights.unsqueeze(-1) * inside
         return weights
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return (self.fitted,)
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are weights."""

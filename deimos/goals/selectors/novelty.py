@@ -5,6 +5,7 @@ arXiv:1810.12894); drawing one of several networks for every decision samples fr
 Exploration via Bootstrapped DQN*, NeurIPS 2016). Hypothesis: the safety of RND at the performance of learnability.
 """
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import torch
@@ -52,6 +53,10 @@ class Novelty(FearSelector):
         """The networks but for the first, which is ``fear``."""
         self.rnd = rnd.Config(candidates=config.candidates).build(spaces, seed)
         """Who knows what is novel."""
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return super().graph_key(), self.rnd.graph_key()
 
     def issued(
         self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, chosen: Proposal,

@@ -5,7 +5,7 @@ Director this tests whether it matters. A level's score is its positive value lo
 interaction of max(advantage, 0).
 """
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -76,6 +76,10 @@ class PLR(GoalSelector):
         self._learnt_at = 0  # step of the last call of learn
         self.replaying = False
         """Whether the buffer holds enough."""
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return (self.replaying,)
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are those of the replayed levels."""
@@ -164,4 +168,4 @@ class PLR(GoalSelector):
         mix = self.config.staleness if float(by_age.sum()) > 0 else 0.0
         weight = (1 - mix) * by_score / by_score.sum().clamp(min=1e-300)
         weight += mix * by_age / by_age.sum().clamp(min=1.0)
-        self._upto = weight.cumsum(0).float()
+        self._upto.copy_(weight.cumsum(0))

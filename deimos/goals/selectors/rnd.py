@@ -1,6 +1,7 @@
 """Random network distillation over goals (Burda et al., ICLR 2019, arXiv:1810.12894; a rival in the thesis, 4.3)."""
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -106,6 +107,10 @@ class RND(GoalSelector):
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
         """Whether it has seen anything yet; before, nothing can be whitened."""
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return (self.fitted,)
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are surprises."""

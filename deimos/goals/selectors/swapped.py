@@ -43,11 +43,11 @@ class Swapped(director.Director):
         self._state, self._goal = (
             torch.zeros(worlds, size, dtype=torch.float32, device=spaces.device) for size in sizes
         )
-        self._count = 0  # decisions seen so far
+        self._count = torch.zeros((), dtype=torch.int64, device=spaces.device)  # decisions seen so far
 
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
         """See ``FearSelector.ranking``."""
-        other = picks.uniformly(draws[:, 3], min(self._count, len(self._state)))
+        other = picks.uniformly(draws[:, 3], self._count.clamp(max=len(self._state)))
         return self.score(self._state[other], self._goal[other], candidates)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Uniform goals: the baseline, and what Naive means in evaluation."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -31,6 +32,10 @@ class Uniform(GoalSelector):
 
     def __init__(self, config: Config) -> None:
         self.num_candidates = config.candidates
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return ()
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""

@@ -4,7 +4,7 @@ Where critics that saw the same task disagree about a goal, there is something t
 its own, bootstrapped from its own values: regressed on one shared target they would soon agree.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -103,6 +103,10 @@ class VDS(GoalSelector):
         self.optimizer = Adam(self._parameters, self.nets.grad, rate)
         self.generator = generator(seed, "vds minibatches", device)
         self._known: tuple[Tensor, Tensor] | None = None  # a whole rollout's observations and their values
+
+    def graph_key(self) -> Hashable:
+        """See ``GoalSelector.graph_key``."""
+        return ()
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are deviations of values in units of scaled rewards."""

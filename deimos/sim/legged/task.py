@@ -105,6 +105,7 @@ class Locomotion(WarpEnv):
             _require_room(ground)
         self.terrain = ground or terrain.flat()
         self.physics = self._build_physics(ground)
+        self.records = self.physics.records
         self.tensors = self.physics.tensors | self.tensors
         self.legged = self._join(ground)
         """All that the kernels work on."""
@@ -113,7 +114,7 @@ class Locomotion(WarpEnv):
         self._launches = [part.bind(self.legged) for part in parts]
         self.errors = {name: error for part in self._launches for name, error in part.errors.items()}
         self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=device)
-        self._steps_reported = 0
+        self._reported_at = 0  # step of the last call of report
         self._begin()
 
     def _build_physics(self, ground: Terrain | None) -> Physics:
@@ -195,7 +196,6 @@ class Locomotion(WarpEnv):
             run_step()
             gather_faults()
             self._sums += self.term.sum(0)
-            self._steps_reported += 1
 
         validations = [part.validate for part in self._launches if part.validate]
         if len(validations) > 1:
@@ -252,7 +252,7 @@ class Locomotion(WarpEnv):
 
         The terms add up to the mean reward; the errors are means over the worlds at this moment.
         """
-        steps, self._steps_reported = max(self._steps_reported, 1), 0
+        steps, self._reported_at = max(self.steps - self._reported_at, 1), self.steps
         means = mean_over_ranks(self._sums / (steps * self.num_envs)).tolist()
         self._sums.zero_()
         invalid, self.invalid_steps = self.invalid_steps, 0

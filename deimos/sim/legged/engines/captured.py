@@ -1,6 +1,5 @@
 """Launches that are recorded once and replayed as one graph."""
 
-import gc
 import os
 import sys
 import threading
@@ -11,6 +10,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from deimos.sim.graphs import no_garbage_collected
 from deimos.sim.shared import warp_device
 
 PATIENCE = 3.0  # [s] of silence before the first step says what it waits for
@@ -26,30 +26,23 @@ class Captured:
     """
 
     def __init__(self, launch: Callable[[], None], device: torch.device) -> None:
-        with wp.ScopedDevice(warp_device(device)):
+        self._launch, self._device = launch, wp.get_device(warp_device(device))
+        with wp.ScopedDevice(self._device):
             with _say_what_it_waits_for():
                 launch()
-            with _no_garbage_collected(device), wp.ScopedCapture() as capture:
+            with no_garbage_collected(device), wp.ScopedCapture() as capture:
                 launch()
         self._graph = capture.graph
 
     def __call__(self) -> None:
-        """Replay the launches."""
-        wp.capture_launch(self._graph)
+        """Replay the launches; within a larger graph that is being recorded, make them.
 
-
-@contextmanager
-def _no_garbage_collected(device: torch.device) -> Iterator[None]:
-    """Keep Python from finalising what is left of earlier graphs: on CUDA, freeing their memory would be recorded."""
-    if device.type == "cuda":
-        gc.collect()  # it takes a tenth of a second
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
+        CUDA takes no graph into another one that has loops whose end the device decides.
+        """
+        if self._device.is_cuda and self._device.is_capturing:
+            self._launch()
+        else:
+            wp.capture_launch(self._graph)
 
 
 @contextmanager

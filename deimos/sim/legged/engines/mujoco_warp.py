@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 class Engine(Physics):
     """See ``Physics`` and ``build``."""
 
+    records = True
+
     def __init__(
         self, robot: Robot, terrain: Terrain | None, num_envs: int, device: torch.device, config: PhysicsConfig, *,
         friction: np.ndarray | None, payload: np.ndarray | None,
