@@ -49,13 +49,14 @@ class Kernel:
         self._operations = 2 * count * sum(a * b for a, b in itertools.pairwise(units))
         columns = 2 * units[-1] + 3  # of the largest loss
         self._block_rows = max(STEP, min(BLOCK_ROWS, BLOCK_SIZE // (sum(units) + columns)) // STEP * STEP)
-        self._memory = torch.zeros(self._threads, (sum(units) + columns) * self._block_rows, dtype=torch.float32)
+        stride = 16 * (self._block_rows // 16 | 1)  # an odd number of cache lines: units then use all sets of a cache
+        self._memory = torch.zeros(self._threads, (sum(units) + columns) * stride, dtype=torch.float32)
         self._gradient = torch.zeros(0, dtype=torch.float32)
         self._counter = ctypes.c_int32()
         jobs = wp.zeros(1, dtype=Job, device="cpu")
         self._job: Any = jobs.numpy()
         self._fill(
-            count=count, block_rows=self._block_rows, counter=ctypes.addressof(self._counter),
+            count=count, block_rows=self._block_rows, stride=stride, counter=ctypes.addressof(self._counter),
             memory=self._memory.data_ptr(), memory_size=self._memory.shape[1], parameters=parameters.data_ptr(),
         )  # fmt: skip
         self._launches = [record(shape, jobs, thread) for thread in range(self._threads)]
