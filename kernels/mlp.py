@@ -44,7 +44,7 @@ class Shape:
     free: int  # where the parameters that belong to no layer start
     units: wp.array[int]  # inputs, and outputs of every layer
     weight: wp.array[int]  # where a layer's weights start among the parameters; its biases follow them
-    unit: wp.array[int]  # where the inputs, a layer's outputs and the loss's data start among the units of a block
+    unit: wp.array[int]  # where the inputs and a layer's outputs start among the units of a block
 
 
 @wp.struct
@@ -68,10 +68,11 @@ class Job:
     x_row: wp.int64
     x_unit: wp.int64
     inputs: int  # that ``x`` has
-    y: wp.uint64  # outputs, or the gradients by them, shape (count, rows, outputs)
-    data: wp.uint64  # of the loss, shape (count, columns, rows)
+    y: wp.uint64  # outputs, shape (count, rows, outputs)
+    data: wp.uint64  # of the loss, or gradients by outputs, shape (count, columns, rows)
     data_net: wp.int64
     data_column: wp.int64
+    data_row: wp.int64
     columns: int
     clip: float
     start: wp.uint64  # if not 0, what the first layer's sums start from, shape (count, rows / shared, units)
@@ -390,7 +391,6 @@ def _backward(shape: Shape, b: Block):
 def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
     """Take some rows through a network, and back."""
     outs, end = shape.units[shape.layers], shape.unit[shape.layers]
-    y = _offset(job.y, net, wp.int64(job.rows) * wp.int64(outs), first, wp.int64(outs))
     if job.start != wp.uint64(0):
         start = _offset(job.start, net, wp.int64(job.rows // job.shared) * wp.int64(shape.units[1]), 0, wp.int64(0))
         _broadcast(b, shape.unit[1], shape.units[1], first, rows, start, job.shared)
@@ -400,21 +400,20 @@ def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
         if shape.activation > 0 and layer + 1 < shape.layers:
             _apply_activation(shape, b, layer)
     if job.mode == wp.static(int(Mode.FORWARD)):
-        _write(b, end, outs, rows, y)
+        _write(b, end, outs, rows, _offset(job.y, net, wp.int64(job.rows) * wp.int64(outs), first, wp.int64(outs)))
         return
-    if job.mode == wp.static(int(Mode.BACKWARD)):
-        _read(b, end, outs, rows, y, wp.int64(outs), wp.int64(1))
-        for unit in range(end, end + outs):
-            _clear(_offset(b.memory, unit, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)
-    else:
-        data, column = _offset(job.data, net, job.data_net, first, wp.int64(1)), shape.unit[shape.layers + 1]
-        _read(b, column, job.columns, rows, data, wp.int64(1), job.data_column)
-        weight = column if job.mode == wp.static(int(Mode.VALUE)) else column + job.columns - 1
-        _clear(_offset(b.memory, weight, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)  # they add nothing
-        if job.mode == wp.static(int(Mode.VALUE)):
-            _value_loss(shape, b, job.clip)
-        else:
-            _surrogate(shape, b, job.clip)
+    given = job.mode == wp.static(int(Mode.BACKWARD))
+    place = wp.where(given, end, end + outs)  # the loss's data come behind the outputs
+    data = _offset(job.data, net, job.data_net, first, job.data_row)
+    _read(b, place, job.columns, rows, data, job.data_row, job.data_column)
+    # What is behind the last row adds nothing: its gradients, or its weight, are 0.
+    zero = wp.where(job.mode == wp.static(int(Mode.SURROGATE)), place + job.columns - 1, place)
+    for unit in range(zero, zero + wp.where(given, outs, 1)):
+        _clear(_offset(b.memory, unit, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)
+    if job.mode == wp.static(int(Mode.VALUE)):
+        _value_loss(shape, b, job.clip)
+    elif job.mode == wp.static(int(Mode.SURROGATE)):
+        _surrogate(shape, b, job.clip)
     _backward(shape, b)
 
 

@@ -199,7 +199,7 @@ class MLPs:
                 f"data of {type(loss).__name__} must have the shape {shape} on {device}, got {tuple(data.shape)} on "
                 f"{data.device}."
             )
-        return replace(loss, data=data.float())
+        return loss if data.dtype == torch.float32 else replace(loss, data=data.float())
 
 
 def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
