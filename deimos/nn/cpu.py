@@ -97,12 +97,7 @@ class Kernel:
     def prepare_gradient(self, mode: Mode, x: Tensor, data: Tensor, sums: int = 0, clip: float = 0.0) -> float:
         """Fill in a job that adds up gradients; gives its operations.
 
-        Args:
-            mode: Of the job.
-            x: Inputs, as ``forward`` takes them.
-            data: The loss's, or gradients by outputs, shape (K, columns, n).
-            sums: How many the loss has.
-            clip: The loss's.
+        ``data`` are the loss's, or gradients by outputs, shape (K, columns, n); ``sums`` says how many the loss has.
         """
         rows, count = x.shape[-2], len(self._parameters)
         parts = max(1, min(-(-rows // self._block_rows), max(4, PARTS // count)))
