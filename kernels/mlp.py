@@ -44,7 +44,7 @@ class Shape:
     free: int  # where the parameters that belong to no layer start
     units: wp.array[int]  # inputs, and outputs of every layer
     weight: wp.array[int]  # where a layer's weights start among the parameters; its biases follow them
-    unit: wp.array[int]  # where the inputs, a layer's outputs and the loss's data start among the units of a block
+    unit: wp.array[int]  # where the inputs and a layer's outputs start among the units of a block
 
 
 @wp.struct
@@ -56,6 +56,7 @@ class Job:
     rows: int
     parts: int  # of the rows: what a thread takes at a time
     block_rows: int  # of a whole block
+    stride: int  # numbers from a unit of a block to the next one
     counter: wp.uint64  # parts that have been taken, int32
     memory: wp.uint64  # of a block for every thread
     memory_size: int
@@ -67,10 +68,11 @@ class Job:
     x_row: wp.int64
     x_unit: wp.int64
     inputs: int  # that ``x`` has
-    y: wp.uint64  # outputs, or the gradients by them, shape (count, rows, outputs)
-    data: wp.uint64  # of the loss, shape (count, columns, rows)
+    y: wp.uint64  # outputs, shape (count, rows, outputs)
+    data: wp.uint64  # of the loss, or gradients by outputs, shape (count, columns, rows)
     data_net: wp.int64
     data_column: wp.int64
+    data_row: wp.int64
     columns: int
     clip: float
     start: wp.uint64  # if not 0, what the first layer's sums start from, shape (count, rows / shared, units)
@@ -89,17 +91,32 @@ class Block:
     inputs: int  # of the first layer, without those whose share it starts from
 
 
-# Vectors of the compiler: of a vector that is wider than a register it makes several.
-_VECTORS = """
-typedef float Vector __attribute__((vector_size(64)));
-typedef int Whole __attribute__((vector_size(64)));
+def _vectors(size: str) -> str:
+    """Vectors of so many bytes: of one that is wider than a register Clang makes several."""
+    return f"""
+typedef float Vector __attribute__((vector_size({size})));
+typedef int Whole __attribute__((vector_size({size})));
 typedef Vector Unaligned __attribute__((aligned(4), may_alias));
-auto at = [](const float* p) __attribute__((always_inline)) -> Unaligned& { return *(Unaligned*)p; };
-auto total = [](Vector v) __attribute__((always_inline)) {
-    typedef float Eight __attribute__((vector_size(32)));
+auto at = [](const float* p) __attribute__((always_inline)) -> Unaligned& {{ return *(Unaligned*)p; }};
+"""
+
+
+_REGISTERS = """
+#if defined(__AVX512F__)
+constexpr int lanes = 16, most = 8;  // 24 sums, 3 vectors and a factor in 32 registers
+#elif defined(__AVX__)
+constexpr int lanes = 8, most = 4;  // 12 sums in 16
+#else
+constexpr int lanes = 4, most = 8;
+#endif
+""" + _vectors("4 * lanes")
+
+# Of 16 numbers, by halves.
+_TOTAL = """
+auto total = [](const float* p) __attribute__((always_inline)) {
+    typedef float Eight __attribute__((vector_size(32), aligned(4), may_alias));
     typedef float Four __attribute__((vector_size(16)));
-    const Eight e = __builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7)
-                  + __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
+    const Eight e = *(const Eight*)p + *(const Eight*)(p + 8);
     const Four f = __builtin_shufflevector(e, e, 0, 1, 2, 3) + __builtin_shufflevector(e, e, 4, 5, 6, 7);
     return (f[0] + f[2]) + (f[1] + f[3]);
 };
@@ -120,23 +137,18 @@ auto expm1 = [](Vector x) __attribute__((always_inline)) {
 """
 
 
-def _by_height(line: str) -> str:
-    """A switch over the heights of a tile, which the compiler must know."""
-    cases = (f"case {n}: {line.replace('N', str(n))} break;" for n in range(1, 9))
-    return "\n".join(["switch (height) {", *cases, "}"])
+def _in_tiles(count: str, tile: str) -> str:
+    """A loop over so many units, N at a time: the compiler must know how many sums it is to keep in registers."""
+    cases = (f"case {n}: {{ {tile.replace('N', str(n))} break; }}" for n in range(1, 9))
+    return "\n".join([
+        f"for (int unit = 0, height; unit < {count}; unit += height) {{",
+        f"const int tiles = ({count} - unit + most - 1) / most;",
+        f"height = ({count} - unit + tiles - 1) / tiles;",
+        "switch (height) {", *cases, "}}",
+    ])  # fmt: skip
 
 
-_PRODUCT = """
-#if defined(__AVX512F__)
-constexpr int lanes = 16, most = 8;  // 24 sums, 3 vectors and a factor in 32 registers
-#elif defined(__AVX__)
-constexpr int lanes = 8, most = 4;  // 12 sums in 16
-#else
-constexpr int lanes = 4, most = 8;
-#endif
-typedef float Vector __attribute__((vector_size(4 * lanes)));
-typedef Vector Unaligned __attribute__((aligned(4), may_alias));
-auto at = [](const float* p) __attribute__((always_inline)) -> Unaligned& { return *(Unaligned*)p; };
+_PRODUCT = _REGISTERS + """
 const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], stride = b.stride;
 const int skipped = layer == 0 ? ins - b.inputs : 0;
 const bool relu = shape.activation == 0, elu = shape.activation == 1, linear = layer + 1 == shape.layers;
@@ -177,12 +189,7 @@ auto tile = [&](auto& sum, int row, int unit) __attribute__((always_inline)) {
     }
 };
 for (int row = 0; row < b.rows; row += 3 * lanes)
-    for (int unit = 0, height; unit < width; unit += height) {
-        const int tiles = (width - unit + most - 1) / most;
-        height = (width - unit + tiles - 1) / tiles;
-        """ + _by_height("{ Vector sum[N][3]; tile(sum, row, unit); }") + """
-    }
-"""  # fmt: skip
+""" + _in_tiles("width", "Vector sum[N][3]; tile(sum, row, unit);")  # fmt: skip
 
 
 @wp.func_native(_PRODUCT)
@@ -190,51 +197,43 @@ def _product(shape: Shape, b: Block, layer: int, back: bool):
     """A layer's outputs; or the gradients by its inputs times the activation's slope, which take the inputs' place."""
 
 
-_GRADIENT = _VECTORS + """
-#if defined(__AVX512F__)
-constexpr int most = 8;
-#else
-constexpr int most = 2;
-#endif
+_GRADIENT = _REGISTERS + _TOTAL + """
 const int ins = shape.units.data[layer], outs = shape.units.data[layer + 1], stride = b.stride;
 float* gradient = (float*)b.gradient + shape.weight.data[layer];
 const float* x = (const float*)b.memory + shape.unit.data[layer] * stride;
 const float* delta = (const float*)b.memory + shape.unit.data[layer + 1] * stride;
-auto tile = [&](auto& sum, int unit, int in) __attribute__((always_inline)) {
-    constexpr int height = sizeof(sum) / sizeof(sum[0]);
+auto tile = [&](auto& units, int unit, int in) __attribute__((always_inline)) {
+    constexpr int height = sizeof(units);
     const int left = ins - in;  // less than three: some sums are made twice, and dropped
-    const float* d = delta + unit * stride;
-    const float* v = x + in * stride;
     const int one = left > 1 ? stride : 0, two = left > 2 ? 2 * stride : 0;
-    for (int row = 0; row < b.rows; row += 16, d += 16, v += 16) {
-        const Vector v0 = at(v), v1 = at(v + one), v2 = at(v + two);
-        #pragma unroll
-        for (int i = 0; i < height; ++i) {
-            const Vector u = at(d + i * stride);
-            sum[i][0] += u * v0;
-            sum[i][1] += u * v1;
-            sum[i][2] += u * v2;
+    float sums[3 * height][16];
+    for (int set = 0; set < 16; set += lanes) {  // as many of the sets of rows as a register takes
+        Vector sum[height][3] = {};
+        const float* d = delta + unit * stride + set;
+        const float* v = x + in * stride + set;
+        for (int row = 0; row < b.rows; row += 16, d += 16, v += 16) {
+            const Vector v0 = at(v), v1 = at(v + one), v2 = at(v + two);
+            #pragma unroll
+            for (int i = 0; i < height; ++i) {
+                const Vector u = at(d + i * stride);
+                sum[i][0] += u * v0;
+                sum[i][1] += u * v1;
+                sum[i][2] += u * v2;
+            }
         }
+        #pragma unroll
+        for (int n = 0; n < 3 * height; ++n) at(sums[n] + set) = sum[n / 3][n % 3];
     }
     #pragma unroll
-    for (int i = 0; i < height; ++i) {
-        float* to = gradient + (unit + i) * ins + in;
-        to[0] += total(sum[i][0]);
-        if (left > 1) to[1] += total(sum[i][1]);
-        if (left > 2) to[2] += total(sum[i][2]);
-    }
+    for (int n = 0; n < 3 * height; ++n)
+        if (n % 3 < left) gradient[(unit + n / 3) * ins + in + n % 3] += total(sums[n]);
 };
-for (int unit = 0, height; unit < outs; unit += height) {
-    const int tiles = (outs - unit + most - 1) / most;
-    height = (outs - unit + tiles - 1) / tiles;
-    for (int in = 0; in < ins; in += 3) {
-        """ + _by_height("{ Vector sum[N][3] = {}; tile(sum, unit, in); }") + """
-    }
-}
+""" + _in_tiles("outs", "char units[N]; for (int in = 0; in < ins; in += 3) tile(units, unit, in);") + """
 for (int unit = 0; unit < outs; ++unit) {
-    Vector sum = {};
-    for (int row = 0; row < b.rows; row += 16) sum += at(delta + unit * stride + row);
-    gradient[ins * outs + unit] += total(sum);
+    float sums[16] = {};
+    for (int row = 0; row < b.rows; row += 16)
+        for (int i = 0; i < 16; ++i) sums[i] += delta[unit * stride + row + i];
+    gradient[ins * outs + unit] += total(sums);
 }
 """  # fmt: skip
 
@@ -244,7 +243,7 @@ def _add_gradient(shape: Shape, b: Block, layer: int):
     """Add the gradient by a layer's weights and biases."""
 
 
-_ACTIVATION = _VECTORS + _EXP + """
+_ACTIVATION = _vectors("64") + _EXP + """
 float* y = (float*)b.memory + shape.unit.data[layer + 1] * b.stride;
 for (int unit = 0; unit < shape.units.data[layer + 1]; ++unit, y += b.stride)
     for (int row = 0; row < b.rows; row += 16) {
@@ -264,7 +263,7 @@ def _apply_activation(shape: Shape, b: Block, layer: int):
 
 
 # The data of a loss lie behind the outputs, column by column as ``losses`` has them.
-_VALUE = _VECTORS + """
+_VALUE = _vectors("64") + _TOTAL + """
 float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.stride;
 const float *weight = value + b.stride, *old = weight + b.stride, *target = old + b.stride;
 Vector loss = {};
@@ -276,7 +275,7 @@ for (int row = 0; row < b.rows; row += 16) {
     loss += w * (plain >= clipped ? plain : clipped);
     at(value + row) = ((step == held) | (plain >= clipped)) ? slope : slope * 0.0f;  // 0 times NaN is NaN
 }
-((float*)b.gradient)[shape.parameters] += total(loss);
+((float*)b.gradient)[shape.parameters] += total((float*)&loss);
 """  # fmt: skip
 
 
@@ -285,7 +284,7 @@ def _value_loss(shape: Shape, b: Block, clip: float):
     """Replace the outputs by the gradients of ``losses.ValueLoss`` by them, and add its sum."""
 
 
-_SURROGATE = _VECTORS + _EXP + """
+_SURROGATE = _vectors("64") + _TOTAL + _EXP + """
 const int stride = b.stride, actions = shape.units.data[shape.layers];
 float* mean = (float*)b.memory + shape.unit.data[shape.layers] * stride;
 float *action = mean + actions * stride, *old_mean = action + actions * stride, *log_prob = old_mean + actions * stride;
@@ -308,7 +307,7 @@ for (int row = 0; row < b.rows; row += 16) {
     loss += at(weight + row) * (plain >= clipped ? plain : clipped);
     at(slope + row) = plain >= clipped ? by_ratio : by_ratio * 0.0f;
 }
-sums[0] += total(loss);
+sums[0] += total((float*)&loss);
 for (int a = 0; a < actions; ++a) {
     Vector by_std = {}, moved = {};
     for (int row = 0; row < b.rows; row += 16) {
@@ -318,8 +317,8 @@ for (int a = 0; a < actions; ++a) {
         moved += at(weight + row) * step * step;
         m = z / std[a] * at(slope + row);
     }
-    std_gradient[a] += total(by_std) / std[a];
-    sums[1 + a] += total(moved);
+    std_gradient[a] += total((float*)&by_std) / std[a];
+    sums[1 + a] += total((float*)&moved);
 }
 """  # fmt: skip
 
@@ -392,7 +391,6 @@ def _backward(shape: Shape, b: Block):
 def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
     """Take some rows through a network, and back."""
     outs, end = shape.units[shape.layers], shape.unit[shape.layers]
-    y = _offset(job.y, net, wp.int64(job.rows) * wp.int64(outs), first, wp.int64(outs))
     if job.start != wp.uint64(0):
         start = _offset(job.start, net, wp.int64(job.rows // job.shared) * wp.int64(shape.units[1]), 0, wp.int64(0))
         _broadcast(b, shape.unit[1], shape.units[1], first, rows, start, job.shared)
@@ -402,21 +400,20 @@ def _work_on(shape: Shape, job: Job, b: Block, net: int, first: int, rows: int):
         if shape.activation > 0 and layer + 1 < shape.layers:
             _apply_activation(shape, b, layer)
     if job.mode == wp.static(int(Mode.FORWARD)):
-        _write(b, end, outs, rows, y)
+        _write(b, end, outs, rows, _offset(job.y, net, wp.int64(job.rows) * wp.int64(outs), first, wp.int64(outs)))
         return
-    if job.mode == wp.static(int(Mode.BACKWARD)):
-        _read(b, end, outs, rows, y, wp.int64(outs), wp.int64(1))
-        for unit in range(end, end + outs):
-            _clear(_offset(b.memory, unit, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)
-    else:
-        data, column = _offset(job.data, net, job.data_net, first, wp.int64(1)), shape.unit[shape.layers + 1]
-        _read(b, column, job.columns, rows, data, wp.int64(1), job.data_column)
-        weight = column if job.mode == wp.static(int(Mode.VALUE)) else column + job.columns - 1
-        _clear(_offset(b.memory, weight, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)  # they add nothing
-        if job.mode == wp.static(int(Mode.VALUE)):
-            _value_loss(shape, b, job.clip)
-        else:
-            _surrogate(shape, b, job.clip)
+    given = job.mode == wp.static(int(Mode.BACKWARD))
+    place = wp.where(given, end, end + outs)  # the loss's data come behind the outputs
+    data = _offset(job.data, net, job.data_net, first, job.data_row)
+    _read(b, place, job.columns, rows, data, job.data_row, job.data_column)
+    # What is behind the last row adds nothing: its gradients, or its weight, are 0.
+    zero = wp.where(job.mode == wp.static(int(Mode.SURROGATE)), place + job.columns - 1, place)
+    for unit in range(zero, zero + wp.where(given, outs, 1)):
+        _clear(_offset(b.memory, unit, wp.int64(b.stride), rows, wp.int64(1)), b.rows - rows)
+    if job.mode == wp.static(int(Mode.VALUE)):
+        _value_loss(shape, b, job.clip)
+    elif job.mode == wp.static(int(Mode.SURROGATE)):
+        _surrogate(shape, b, job.clip)
     _backward(shape, b)
 
 
@@ -426,7 +423,7 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
     job = jobs[0]
     b = Block()
     b.memory = _offset(job.memory, thread, wp.int64(job.memory_size), 0, wp.int64(0))
-    b.stride = job.block_rows
+    b.stride = job.stride
     b.inputs = job.inputs
     blocks = (job.rows + job.block_rows - 1) // job.block_rows
     size = shape.parameters + job.sums

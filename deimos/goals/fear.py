@@ -10,7 +10,7 @@ from deimos.goals.interactions import Resolved
 from deimos.nn.adam import Adam
 from deimos.nn.losses import cross_entropy
 from deimos.nn.mlps import MLPs
-from deimos.nn.networks import Activation, mlp
+from deimos.nn.networks import ACTIVATIONS, Activation, mlp
 from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
@@ -37,7 +37,7 @@ class FearConfig:
 
     def __post_init__(self) -> None:
         check_hidden("hidden", self.hidden)
-        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_choice("activation", self.activation, ACTIVATIONS)
         check_positive("learning_rate", self.learning_rate, finite=True)
         for name in ("epochs", "minibatches", "min_per_class", "workspace"):
             check_at_least(name, getattr(self, name), 1)

@@ -20,7 +20,7 @@ from deimos.nn.graphs import Recorded, Recorder
 from deimos.nn.layout import ALL, Seen, count
 from deimos.nn.losses import Loss, Surrogate, ValueLoss, log_prob
 from deimos.nn.mlps import MLPs, gradients
-from deimos.nn.networks import Activation, Actor, mlp
+from deimos.nn.networks import ACTIVATIONS, Activation, Actor, mlp
 from deimos.nn.random import Purpose, normals
 from deimos.nn.ranks import gather_rows, own_transitions, place, sum_over_ranks
 from deimos.nn.seeds import generator
@@ -82,7 +82,7 @@ class PPOConfig:
             check_range(name, getattr(self, name), 0.0, math.inf)
         for name in ("discount", "gae_lambda"):
             check_range(name, getattr(self, name), 0.0, 1.0)
-        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_choice("activation", self.activation, ACTIVATIONS)
         check_hidden("hidden", self.hidden)
 
 

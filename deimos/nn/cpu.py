@@ -3,8 +3,9 @@
 import ctypes
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -49,20 +50,22 @@ class Kernel:
         self._operations = 2 * count * sum(a * b for a, b in itertools.pairwise(units))
         columns = 2 * units[-1] + 3  # of the largest loss
         self._block_rows = max(STEP, min(BLOCK_ROWS, BLOCK_SIZE // (sum(units) + columns)) // STEP * STEP)
-        self._memory = torch.zeros(self._threads, (sum(units) + columns) * self._block_rows, dtype=torch.float32)
+        stride = 16 * (self._block_rows // 16 | 1)  # an odd number of cache lines: units then use all sets of a cache
+        self._memory = torch.zeros(self._threads, (sum(units) + columns) * stride, dtype=torch.float32)
         self._gradient = torch.zeros(0, dtype=torch.float32)
         self._counter = ctypes.c_int32()
-        jobs = wp.zeros(1, dtype=Job, device="cpu")
-        self._job: Any = jobs.numpy()
+        self._jobs = jobs = wp.zeros(1, dtype=Job, device="cpu")
+        # Of what reaches the same memory, ctypes costs least: every minibatch fills in 30 fields.
+        self._job = np.ctypeslib.as_ctypes_type(Job.numpy_dtype()).from_address(jobs.ptr)
         self._fill(
-            count=count, block_rows=self._block_rows, counter=ctypes.addressof(self._counter),
+            count=count, block_rows=self._block_rows, stride=stride, counter=ctypes.addressof(self._counter),
             memory=self._memory.data_ptr(), memory_size=self._memory.shape[1], parameters=parameters.data_ptr(),
         )  # fmt: skip
         self._launches = [record(shape, jobs, thread) for thread in range(self._threads)]
 
     def _fill(self, **fields: float) -> None:
         for name, value in fields.items():
-            self._job[name] = value
+            setattr(self._job, name, value)
 
     def forward(self, x: Tensor, start: Tensor | None = None, shared: int = 1, out: Tensor | None = None) -> Tensor:
         """Outputs of all networks, shape (K, n, outputs).
@@ -77,69 +80,62 @@ class Kernel:
         y = torch.empty(len(self._parameters), rows, self._outputs, dtype=torch.float32) if out is None else out
         start = None if start is None else start.contiguous()
         with POOL.lock:
-            self._prepare(Mode.FORWARD, x, y)
-            address = 0 if start is None else start.data_ptr()
-            self._fill(parts=-(-rows // self._block_rows), shared=shared, start=address)
+            self._prepare(Mode.FORWARD, x, -(-rows // self._block_rows))
+            self._fill(y=y.data_ptr(), start=0 if start is None else start.data_ptr(), shared=shared)
             _run([self], rows * self._operations)
         return y
 
-    def _prepare(self, mode: Mode, x: Tensor, y: Tensor | None) -> None:
+    def _prepare(self, mode: Mode, x: Tensor, parts: int) -> None:
         """Fill in what every job has."""
         self._counter.value = 0
         net = x.stride(0) if x.dim() == 3 and len(x) > 1 else 0
         self._fill(
-            mode=mode, rows=x.shape[-2], x=x.data_ptr(), x_net=net, x_row=x.stride(-2), x_unit=x.stride(-1),
-            inputs=x.shape[-1], y=0 if y is None else y.data_ptr(), start=0,
+            mode=mode, rows=x.shape[-2], parts=parts, x=x.data_ptr(), x_net=net, x_row=x.stride(-2),
+            x_unit=x.stride(-1), inputs=x.shape[-1],
         )  # fmt: skip
 
-    def prepare_gradient(self, mode: Mode, x: Tensor, sums: int, data: Tensor, clip: float = 0.0) -> float:
-        """Fill in a job that adds up gradients; ``data`` are the loss's, or gradients by outputs. Gives operations."""
+    def prepare_gradient(self, mode: Mode, x: Tensor, data: Tensor, sums: int = 0, clip: float = 0.0) -> float:
+        """Fill in a job that adds up gradients; gives its operations.
+
+        ``data`` are the loss's, or gradients by outputs, shape (K, columns, n); ``sums`` says how many the loss has.
+        """
         rows, count = x.shape[-2], len(self._parameters)
         parts = max(1, min(-(-rows // self._block_rows), max(4, PARTS // count)))
         shape = count, parts, self._size + sums
         if self._gradient.shape != shape:
             with torch.inference_mode(False):
                 self._gradient = torch.zeros(shape, dtype=torch.float32)
-        self._prepare(mode, x, data if mode == Mode.BACKWARD else None)
-        self._fill(parts=parts, gradient=self._gradient.data_ptr(), sums=sums)
-        if mode != Mode.BACKWARD:
-            self._fill(
-                data=data.data_ptr(), data_net=data.stride(0), data_column=data.stride(1), columns=data.shape[1],
-                clip=clip,
-            )  # fmt: skip
+        self._prepare(mode, x, parts)
+        self._fill(
+            start=0, gradient=self._gradient.data_ptr(), sums=sums, data=data.data_ptr(), data_net=data.stride(0),
+            data_column=data.stride(1), data_row=data.stride(2), columns=data.shape[1], clip=clip,
+        )  # fmt: skip
         return 3.0 * rows * self._operations
 
     def collect(self) -> Tensor:
         """Write the gradient of what has been run, added up in the order of the parts; gives the loss's sums."""
-        total = self._gradient.sum(1)
-        self._grad.copy_(total[:, : self._size])
-        return total[:, self._size :]
+        torch.sum(self._gradient[..., : self._size], 1, out=self._grad)
+        return self._gradient[..., self._size :].sum(1)
 
 
 def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
     """See ``mlps.gradients``."""
-    if not all(isinstance(loss, ValueLoss | Surrogate) for _, _, loss in work):
-        return [_by_outputs(*item) for item in work]
-    kernels, operations, kept = [kernel for kernel, _, _ in work], 0.0, []
-    with POOL.lock:
-        for kernel, x, loss in work:
-            assert isinstance(loss, ValueLoss | Surrogate)
+    kernels, jobs = [kernel for kernel, _, _ in work], []
+    known: dict[Kernel, tuple[Tensor, Tensor]] = {}
+    for kernel, x, loss in work:
+        if isinstance(loss, ValueLoss | Surrogate):
             mode = Mode.VALUE if isinstance(loss, ValueLoss) else Mode.SURROGATE
-            kept.append(loss.data if loss.data.stride(-1) == 1 else loss.data.contiguous())
-            operations += kernel.prepare_gradient(mode, x, loss.sums, kept[-1], loss.clip)
-        _run(kernels, operations)
-        return [kernel.collect() for kernel in kernels]
-
-
-def _by_outputs(kernel: Kernel, x: Tensor, loss: Loss) -> Tensor:
-    """The gradient of a loss that torch computes between two passes."""
-    sums, delta, free = by_outputs(loss, kernel.forward(x), kernel._parameters[:, kernel._free])
-    delta = delta.contiguous()
+            jobs.append(partial(kernel.prepare_gradient, mode, x, loss.data, loss.sums, loss.clip))
+        else:  # torch computes it between two passes
+            sums, slopes, free = by_outputs(loss, kernel.forward(x), kernel._parameters[:, kernel._free])
+            jobs.append(partial(kernel.prepare_gradient, Mode.BACKWARD, x, slopes.mT))
+            known[kernel] = sums, free
     with POOL.lock:
-        _run([kernel], kernel.prepare_gradient(Mode.BACKWARD, x, 0, delta))
-        kernel.collect()
-    kernel._grad[:, kernel._free] = free
-    return sums
+        _run(kernels, sum(prepare() for prepare in jobs))
+        found = {kernel: kernel.collect() for kernel in kernels}
+    for kernel, (sums, free) in known.items():
+        found[kernel], kernel._grad[:, kernel._free] = sums, free
+    return list(found.values())
 
 
 def _run(kernels: list[Kernel], operations: float) -> None:

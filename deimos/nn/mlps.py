@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from deimos.nn.losses import Loss, Surrogate, ValueLoss, by_outputs
+from deimos.nn.networks import ACTIVATIONS
 from deimos.nn.normalizer import Normalizer
 from deimos.nn.threads import torch_on_one
 
 if TYPE_CHECKING:
     from deimos.nn.cpu import Kernel
 
-ACTIVATIONS: dict[type[nn.Module], str] = {nn.ReLU: "relu", nn.ELU: "elu", nn.Tanh: "tanh"}
+_NAMES = {module: name for name, module in ACTIVATIONS.items()}
 
 
 class MLPs:
@@ -199,7 +200,7 @@ class MLPs:
                 f"data of {type(loss).__name__} must have the shape {shape} on {device}, got {tuple(data.shape)} on "
                 f"{data.device}."
             )
-        return replace(loss, data=data.float())
+        return loss if data.dtype == torch.float32 else replace(loss, data=data.float())
 
 
 def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
@@ -218,10 +219,10 @@ def _layout(module: nn.Module) -> tuple[tuple[int, ...], str, list[int], slice]:
     leaves = [part for part in module.modules() if not list(part.children()) and not isinstance(part, Normalizer)]
     linears = [layer for layer in leaves[::2] if isinstance(layer, nn.Linear) and layer.bias is not None]
     between = {type(layer) for layer in leaves[1::2]}
-    if len(linears) != len(leaves) // 2 + 1 or len(between) > 1 or not between <= ACTIVATIONS.keys():
+    if len(linears) != len(leaves) // 2 + 1 or len(between) > 1 or not between <= _NAMES.keys():
         names = ", ".join(type(layer).__name__ for layer in leaves)
         raise ValueError(
-            f"A network must be linear layers with biases and one of {', '.join(ACTIVATIONS.values())} between them, "
+            f"A network must be linear layers with biases and one of {', '.join(ACTIVATIONS)} between them, "
             f"got {names}."
         )
     offsets: dict[Tensor, int] = {}
@@ -235,7 +236,7 @@ def _layout(module: nn.Module) -> tuple[tuple[int, ...], str, list[int], slice]:
     free_end = start + sum(parameter.numel() for parameter in free)
     if free and offsets[free[-1]] + free[-1].numel() != free_end:
         raise ValueError("A network's parameters that belong to no layer must follow each other.")
-    activation = ACTIVATIONS[between.pop()] if between else "relu"  # a single layer has none
+    activation = _NAMES[between.pop()] if between else "relu"  # a single layer has none
     units = linears[0].in_features, *(layer.out_features for layer in linears)
     return units, activation, [offsets[layer.weight] for layer in linears], slice(start, free_end)
 

@@ -13,7 +13,7 @@ from deimos.nn.normalizer import Normalizer
 
 Activation = Literal["relu", "elu", "tanh"]
 
-_MODULES: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU, "tanh": nn.Tanh}
+ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "elu": nn.ELU, "tanh": nn.Tanh}
 
 
 def mlp(
@@ -32,7 +32,7 @@ def mlp(
     sizes = [inputs, *hidden]
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
-        layers += [_linear(size_in, size_out, generator), _MODULES[activation]()]
+        layers += [_linear(size_in, size_out, generator), ACTIVATIONS[activation]()]
     return nn.Sequential(*layers, _linear(sizes[-1], outputs, generator))
 
 

@@ -35,6 +35,9 @@ def torch_on_one() -> Iterator[None]:
     Sums of torch's depend on its threads; and one of them that has had work waits for more in a loop, which takes the
     processor from everybody else.
     """
+    if torch.get_num_threads() == 1:  # as it is within a run; to set it takes as long as a small product
+        yield
+        return
     share = available()
     with on_threads(1):
         _shared.set(share)

@@ -15,7 +15,7 @@ from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces
 from deimos.nn.adam import Adam
 from deimos.nn.losses import mean_squared_error
 from deimos.nn.mlps import MLPs
-from deimos.nn.networks import Activation, mlp
+from deimos.nn.networks import ACTIVATIONS, Activation, mlp
 from deimos.nn.ranks import gather_rows
 from deimos.nn.seeds import generator
 from deimos.nn.threads import torch_on_one
@@ -50,7 +50,7 @@ class Config(SelectorConfig):
 
     def __post_init__(self) -> None:
         check_choice("rule", self.rule, ["argmax", "proportional"])
-        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_choice("activation", self.activation, ACTIVATIONS)
         check_positive("learning_rate", self.learning_rate, finite=True)
         for name in ("candidates", "target", "features", "epochs", "minibatches"):
             check_at_least(name, getattr(self, name), 1)

@@ -18,7 +18,7 @@ from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces
 from deimos.nn.adam import Adam
 from deimos.nn.losses import ValueLoss
 from deimos.nn.mlps import MLPs
-from deimos.nn.networks import Activation, mlp
+from deimos.nn.networks import ACTIVATIONS, Activation, mlp
 from deimos.nn.ranks import mean_over_ranks, sum_over_ranks
 from deimos.nn.returns import advantages
 from deimos.nn.seeds import generator
@@ -62,7 +62,7 @@ class Config(SelectorConfig):
         check_choice("rule", self.rule, ["proportional", "argmax", "percentile", "uniform"])
         check_choice("role", self.role, ["replace", "auxiliary"])
         check_choice("data", self.data, ["all", "share"])
-        check_choice("activation", self.activation, ["relu", "elu", "tanh"])
+        check_choice("activation", self.activation, ACTIVATIONS)
         check_range("percentile", self.percentile, 0.0, 100.0)
         check_hidden("hidden", self.hidden)
         for name in ("critics", "candidates", "epochs", "minibatches"):
