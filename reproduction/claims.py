@@ -5,6 +5,7 @@ rejects the clause itself, and is *undecided* otherwise. Either verdict is wrong
 ``python -m reproduction.verdicts`` measures. Nothing is corrected over clauses, but where one of several is enough.
 """
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from reproduction.measures import Evidence, Place
 
 ALPHA = 0.05
 LEAST = 3  # policies of a method, below which it takes no part
+LEAST_BASES = 5  # that policies branched off, below which a number is an estimate without a verdict (legged.md)
 Verdict = Literal["holds", "does not hold", "undecided"]
 VERDICTS: tuple[Verdict, ...] = ("holds", "does not hold", "undecided")
 
@@ -171,7 +173,7 @@ def test(claim: Claim, evidence: Evidence) -> Outcome:
     """Test every clause of a claim wherever there are data for it."""
     results, without = [], []
     for clause in claim.clauses:
-        found = [(place, clause.test.find(evidence, place)) for place in clause.places(evidence)]
+        found = [(place, _find(clause.test, evidence, place)) for place in clause.places(evidence)]
         own = [Result(clause, place, finding) for place, finding in found if finding is not None]
         results += own
         if not own:
@@ -182,6 +184,14 @@ def test(claim: Claim, evidence: Evidence) -> Outcome:
             replace(each, finding=replace(each.finding, p_for=p)) for each, p in zip(results, corrected, strict=True)
         ]
     return Outcome(claim, tuple(results), tuple(without))
+
+
+def _find(test: Test, evidence: Evidence, place: Place) -> Finding | None:
+    """What a test finds; of few bases it is an estimate, for which nothing speaks and nothing against it."""
+    found = test.find(evidence, place)
+    if found is not None and evidence.paired(place) and min(found.n.values()) < LEAST_BASES:
+        return replace(found, p_for=1.0, p_against=1.0, detectable=math.inf)
+    return found
 
 
 def holm(p: Sequence[float]) -> list[float]:

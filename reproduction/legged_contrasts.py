@@ -29,9 +29,9 @@ from reproduction.thesis import LEGGED, LEGGED_METHODS
 
 REFERENCE = "uniform"
 PRIMARY = ("p75", "vds+p75", "penalty-30")
-CORE_HOURS = {"quad": 1.6, "quad_arm": 0.5}
+CORE_HOURS = {"quad": 1.7, "quad_arm": 0.4}
 """What one more method takes on all bases of a robot (legged.md)."""
-LONGER_HOURS = {"quad": 2.7, "quad_arm": 1.3}
+LONGER_HOURS = {"quad": 3.2, "quad_arm": 0.7}
 """What the evaluation of its policies at T10 takes."""
 TITLES = {
     ("quad", 100): "Quad at T2", ("quad", 500): "Quad at T10, trained at T2",
@@ -49,7 +49,7 @@ TEXT = (
     "Paired differences, base by base, fine-tuned from common base policies, 12 M of the thesis's 295 M transitions. A "
     "log rate is log(crashes + 1/2) - log(interactions + 1); worst is the worst of the attackers. p is that of flipped "
     "signs, exact and one-sided: that the method is better (a higher score, a lower rate); five bases reach 1/32 at "
-    "best. Found: the smallest mean difference that as many bases with this spread would have shown in 80 %."
+    "best. What would have been found is the smallest mean difference that as many bases with this spread show in 80 %."
 )
 
 
@@ -123,7 +123,7 @@ class Contrast:
 
     def row(self, *, judged: bool) -> dict[str, str]:
         """Its line in a table; only estimates unless ``judged``."""
-        verdict = {"p (better)": f"{self.p:.3g}", "found": f"{self.detectable:.3g}"} if judged else {}
+        verdict = {"p (better)": f"{self.p:.3g}", "would have been found": f"{self.detectable:.3g}"} if judged else {}
         return {
             "contrast": f"{self.method} - {self.reference}", "outcome": self.measure.name,
             "bases": str(len(self.bases)), "mean difference [95 %]": f"{self.mean:+.3g}",
@@ -167,8 +167,12 @@ def _tables(evidence: Evidence, place: Place) -> list[Block]:
     first, title = contrasts(evidence, place, PRIMARY), TITLES[place.environment, place.period]
     if place.environment != "quad":
         return _table(f"{title}: estimates", first + others, judged=False)
-    kind = "primary contrasts" if place.period == SHORT else "exploratory"
-    return [*_table(f"{title}: {kind}", first, judged=True), *_table(f"{title}: exploratory", others, judged=True)]
+    if place.period != SHORT:
+        first, others = [], first + others
+    return [
+        *_table(f"{title}: primary contrasts", first, judged=True),
+        *_table(f"{title}: exploratory", others, judged=True),
+    ]
 
 
 def _table(title: str, found: Sequence[Contrast], *, judged: bool) -> list[Block]:
@@ -197,21 +201,18 @@ def bases(folder: Path = KEPT_IN) -> list[Block]:
     found: list[Block] = []
     for robot, own in ROBOTS.items():
         homes = [RunFolder(folder / base_name(robot, index)) for index in range(len(own.seeds))]
-        homes = [home for home in homes if (home.path / "evaluation.json").exists()]
-        judged = {
-            (home.path.name, row["goal_period"]): row for home in homes for row in home.read_rows("evaluation.json")
-        }
+        judged = [(home, row) for home in homes for row in home.read_rows("evaluation.json")]
         rows = []
         for period in own.judged:
-            numbers = [_of_base(home, judged[home.path.name, period]) for home in homes]
+            numbers = {home.path.name: _of_base(home, row) for home, row in judged if row["goal_period"] == period}
             rows += [
-                {"base": home.path.name, "T": str(period)} | {name: f"{x:.3g}" for name, x in each.items()}
-                for home, each in zip(homes, numbers, strict=True)
+                {"base": name, "T": str(period)} | {what: f"{x:.3g}" for what, x in each.items()}
+                for name, each in numbers.items()
             ]
             if len(numbers) > 1:
+                columns = {what: [each[what] for each in numbers.values()] for what in next(iter(numbers.values()))}
                 rows.append({"base": "mean ± standard deviation", "T": str(period)} | {
-                    name: f"{np.mean(x):.3g} ± {np.std(x, ddof=1):.2g}"
-                    for name in numbers[0] if (x := [each[name] for each in numbers])
+                    what: f"{np.mean(x):.3g} ± {np.std(x, ddof=1):.2g}" for what, x in columns.items()
                 })  # fmt: skip
         found += [f"### The bases of {robot}", rows] if rows else []
     return found

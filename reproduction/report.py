@@ -24,7 +24,8 @@ CLAUSES = "clauses"
 """Name of the figure on the first page."""
 PAIRED = (
     "Policies that branched off the same base are compared with each other alone: clauses permute and resample within "
-    "bases. Two methods on five bases cannot be ordered by that, for even five of five is p = 1/16 on both sides."
+    "bases. Two methods on five bases cannot be ordered by that, for even five of five is p = 1/16 on both sides. "
+    "Fewer than five bases give estimates without a verdict."
 )
 
 

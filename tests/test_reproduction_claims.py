@@ -15,7 +15,7 @@ from reproduction import claim_tests, claims, lines, measures
 from reproduction.claim_list import CLAIMS
 from reproduction.claim_tests import Matters, Ordered
 from reproduction.claims import Claim, Clause, Finding, holm
-from reproduction.measures import ATTACKED, GAIN, NAIVE, PENALTIES, Evidence, Place
+from reproduction.measures import ATTACKED, GAIN, LATE, NAIVE, PENALTIES, Evidence, Place
 from reproduction.thesis import ENVIRONMENTS, LEGGED_METHODS, PARTICLE_METHODS
 
 POINTS = 40
@@ -109,6 +109,24 @@ def claim_of(*found, **more):
     """A claim whose clauses find these p-values, in one environment; ``None`` for one without data."""
     tests = [Told(None if each is None else finding(*each)) for each in found]
     return Claim("C0", "It is so.", tuple(Clause(1, "so", each, ("relative",)) for each in tests), **more)
+
+
+def test_few_bases_give_estimates_without_verdicts():
+    """Where policies branched off fewer than five bases the effect is told, and neither verdict."""
+    rows = [
+        {"environment": "relative", "goal_period": 100, "goals": "naive", "method": name, "seed": seed,
+         "crash_rate": 0.01 * (1 + seed + 20 * place), "block": f"base {seed}"}
+        for place, name in enumerate(("uniform", "p25", "p50", "p75")) for seed in range(6)
+    ]  # fmt: skip
+    test = Ordered(NAIVE, (("p25", "uniform"), ("p50", "uniform"), ("p75", "uniform")))
+    claim = Claim("C0", "It is so.", (Clause(1, "so", test, ("relative",)),))
+    found = {}
+    for bases in (4, 5):
+        own = Evidence([row for row in rows if row["seed"] < bases])
+        (found[bases],) = claims.test(claim, own).results
+    assert (found[5].verdict, found[5].finding.interval.estimate) == ("holds", 1.0)
+    few = found[4].finding
+    assert (few.verdict, few.interval.estimate, few.detectable) == ("undecided", 1.0, math.inf)
 
 
 def test_all_claims_are_there():
@@ -227,11 +245,15 @@ def test_weak_adversaries_count():
 
 
 def test_literal_directors_are_the_thesis():
-    """Where a study has methods that learn fear as the thesis does, they are what its names mean, unless told."""
+    """Where an environment has methods that learn fear as the thesis does, they are what names mean, unless told."""
     results = population(4, ["directional"], methods=["uniform", "p25", "p25-literal", "p50"])
+    elsewhere = population(4, ["quad"], methods=["p25"])
     rates = {row["method"]: row["crash_rate"] for row in results.rows if row["seed"] == 3 and row["goals"] == "naive"}
-    data, as_named = evidence(results), evidence(results, renamed=False)
-    assert data.methods == {"uniform": "uniform", "p25": "p25-literal", "p50": "p50"}
+    both = Results(results.rows + elsewhere.rows, results.curves + elsewhere.curves)
+    data, as_named = evidence(both), evidence(both, renamed=False)
+    assert data.methods == ["p25", "p50", "uniform"]
+    assert as_named.methods == ["p25", "p25-literal", "p50", "uniform"]
+    assert len(NAIVE(data, Place("quad", 100), "p25")) == len(LATE(data, Place("quad", 100), "p25")) == 4
     assert NAIVE(data, HERE, "p25")[3] == rates["p25-literal"]
     assert NAIVE(data.only([3]), HERE, "p25") == {3: rates["p25-literal"]}
     assert NAIVE(as_named, HERE, "p25")[3] == rates["p25"]

@@ -144,7 +144,7 @@ def test_tables_say_what_is_judged_and_what_is_estimated(tmp_path, monkeypatch):
     assert [row["base"] for row in engines] == ["1", "2", "3", "4", "5"] * 2
     assert [row["mujoco-warp"] == "-" for row in engines[:5]] == [False, False, True, True, True]
     assert engines[0]["native"] == primary[0]["of every base"].split(", ")[0]
-    assert {"robot": "quad", "not run": "coop", "would take [core-hours]": "1.6"}.items() <= next(
+    assert {"robot": "quad", "not run": "coop", "would take [core-hours]": "1.7"}.items() <= next(
         row for row in lacking if row["not run"] == "coop"
     ).items()
     assert {row["not run"] for row in lacking}.isdisjoint({"uniform", "p75", "vds", "vds+p75", "penalty-30"})
