@@ -43,8 +43,7 @@ class Step:
     goal_due: Tensor
     """True where the goal has been active for its whole period and the state is valid, bool, shape (num_envs,)."""
     invalid: Tensor
-    """True where the state is not physical any more, bool, shape (num_envs,). Such a world is truncated too, unless
-    it crashed."""
+    """True where the state is not physical any more, bool, shape (num_envs,); truncated too, unless it crashed."""
     tracking: Tensor | None = None
     """How well each group of goal components is met, in [0, 1], float32, shape (num_envs, len(goal_groups));
     ``None`` where there is one group and the reward itself says it."""
@@ -199,8 +198,7 @@ class Env(abc.ABC):
 
         Args:
             mask: bool, shape (num_envs,).
-            goal_scale: Share of the goal range that first goals come from, shape (goal_dim,), in
-                (0, 1]; ``None`` for the whole range.
+            goal_scale: Share of the goal range that first goals come from, shape (goal_dim,), in (0, 1]; ``None``: all.
         """
 
     @abc.abstractmethod
@@ -270,8 +268,7 @@ class Env(abc.ABC):
     def rest_goal(self) -> tuple[float | None, ...]:
         """The goal that asks a world to stay where it is, as the policy sees it.
 
-        By default all zeros: no speed, no way to go, the middle of the box. ``None`` for components that stay as they
-        are.
+        By default all zeros: no speed, no way to go, the middle of the box. ``None`` for components that stay.
         """
         return (0.0,) * self.goal_dim
 
