@@ -189,9 +189,9 @@ def test_who_cannot_be_recorded_is_said_once(monkeypatch, caplog):
     caplog.set_level(logging.INFO)
     config = replace(CONFIG, method="uniform")
     for owner, name, value, who in (
-        (uniform.Uniform, "dense", False, "Uniform does not say that its choices can be"),
-        (uniform.Uniform, "graph_key", lambda self: None, "Uniform does not say that its choices can be"),
-        (particle.Particle, "records", False, "Particle does not say that its steps can be"),
+        (uniform.Uniform, "dense", False, "Uniform does not say that its choices can be replayed"),
+        (uniform.Uniform, "graph_key", lambda self: None, "Uniform does not say that its choices can be replayed"),
+        (particle.Particle, "recordable", False, "Particle does not say that its steps can be replayed"),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, value)

@@ -84,14 +84,14 @@ class GoalLoop:
 
     def graph_key(self) -> Hashable:
         """What Python decides by in ``advance``; ``None`` where a CUDA graph cannot replay it, see ``why_eager``."""
-        return self.selector.graph_key() if self.env.records and self._dense else None
+        return self.selector.graph_key() if self.env.recordable and self._dense else None
 
     def why_eager(self) -> str:
         """Who keeps a CUDA graph from replaying steps, in a few words."""
-        if not self.env.records:
-            return f"{type(self.env).__name__} does not say that its steps can be (Env.records)"
+        if not self.env.recordable:
+            return f"{type(self.env).__name__} does not say that its steps can be replayed (Env.recordable)"
         who = type(self.selector).__name__ if self._guard is None else "a guard of goals"
-        return f"{who} does not say that its choices can be (GoalSelector.dense and graph_key)"
+        return f"{who} does not say that its choices can be replayed (GoalSelector.dense and graph_key)"
 
     def passed(self, steps: int) -> None:
         """Count steps that a CUDA graph has replayed, in which Python did not run."""

@@ -160,7 +160,7 @@ class Env(abc.ABC):
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
     steps: int = 0
     """Steps since it was built."""
-    records: bool = False
+    recordable: bool = False
     """Whether a CUDA graph may replay steps, resets and draws: work on the device alone, but for counting ``steps``."""
     may_go_on_invalid: bool = False
     """Whether the run continues where a world becomes invalid; else ``check`` stops it."""

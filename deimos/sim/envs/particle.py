@@ -119,7 +119,7 @@ class Particle(WarpEnv):
     """Particle Gym; see ``Config``. Actions are forces [u/step^2]."""
 
     config: Config
-    records = True
+    recordable = True
     quantities = BROKEN
 
     @own_settings()

@@ -105,7 +105,7 @@ class Locomotion(WarpEnv):
             _require_room(ground)
         self.terrain = ground or terrain.flat()
         self.physics = self._build_physics(ground)
-        self.records = self.physics.records
+        self.recordable = self.physics.recordable
         self.tensors = self.physics.tensors | self.tensors
         self.legged = self._join(ground)
         """All that the kernels work on."""

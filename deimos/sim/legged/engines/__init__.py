@@ -78,8 +78,8 @@ class Physics(abc.ABC):
     """Worlds that are evaluated on a thread of their own, from the first to the last."""
     lost_contacts: int
     """The bits of ``arrays.overflow`` that mean that a contact or a constraint was left out."""
-    records: bool = False
-    """Whether a CUDA graph of more than these may take in steps and resets; see ``Env.records``."""
+    recordable: bool = False
+    """Whether a CUDA graph of more than these may take in steps and resets; see ``Env.recordable``."""
     tensors: dict[str, torch.Tensor]
     """Everything that a bit-exact resume needs, by name; views, worlds along the first axis."""
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Engine(Physics):
     """See ``Physics`` and ``build``."""
 
-    records = True
+    recordable = True
 
     def __init__(
         self, robot: Robot, terrain: Terrain | None, num_envs: int, device: torch.device, config: PhysicsConfig, *,
