@@ -114,8 +114,9 @@ class Kernel:
 
     def collect(self) -> Tensor:
         """Write the gradient of what has been run, added up in the order of the parts; gives the loss's sums."""
-        torch.sum(self._gradient[..., : self._size], 1, out=self._grad)
-        return self._gradient[..., self._size :].sum(1)
+        total = self._gradient.sum(1)
+        self._grad.copy_(total[:, : self._size])
+        return total[:, self._size :]
 
 
 def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
