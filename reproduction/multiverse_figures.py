@@ -122,9 +122,10 @@ def over_headroom(settings: Sequence[Setting], methods: Sequence[str]) -> "Figur
         slope = removed(settings, name)
         panel.axhline(0.0, color="black", linewidth=0.8)
         panel.plot(room, effect, linestyle="", marker="o", markersize=3.5, color=BLUE, alpha=0.7)
-        ends = np.array([0.0, 100.0])
-        panel.plot(ends, effect.mean() + slope.estimate * (ends - base.mean()), color=RED, linewidth=1)
-        panel.set_title(f"{name}: removes\n{_spelled(slope)}")
+        if np.isfinite(slope.low):
+            ends = np.array([0.0, 100.0])
+            panel.plot(ends, effect.mean() + slope.estimate * (ends - base.mean()), color=RED, linewidth=1)
+        panel.set_title(f"{name}: removes\n{slope_named(slope)}")
         panel.grid(alpha=0.3)
         panel.set_xlim(-4, 104)
         panel.set_ylim(-104, 104)
@@ -135,7 +136,10 @@ def over_headroom(settings: Sequence[Setting], methods: Sequence[str]) -> "Figur
     return figure
 
 
-def _spelled(slope: Interval) -> str:
+def slope_named(slope: Interval) -> str:
+    """A slope with its interval, where it has one."""
+    if np.isnan(slope.estimate):
+        return "unknown"
     return f"{slope:.2f}" if np.isfinite(slope.low) else f"{slope.estimate:.2f} [no interval]"
 
 

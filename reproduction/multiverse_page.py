@@ -14,7 +14,7 @@ from deimos.study.document import Block, to_html, to_markdown
 from reproduction import multiverse
 from reproduction.measures import SAFE
 from reproduction.multiverse import AIM, AIM_SCORE, HEADROOM, LEARNT, LEAST_SCORE, NEW, UNIFORM, Roles, Setting
-from reproduction.multiverse_figures import draw, level_named, named
+from reproduction.multiverse_figures import draw, level_named, named, slope_named
 
 FIGURES = "figures"
 TOO_FEW = "These settings are too few to tell the factors apart."
@@ -109,7 +109,7 @@ def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
          "95 %": f"[{100 * each.safe.low:.0f}, {100 * each.safe.high:.0f}]",
          "mean attacked rate": f"{each.worst:.3f}", "score / Uniform's": f"{each.score:.3f}",
          "part of the headroom that it removes":
-         "-" if each.method == UNIFORM else f"{multiverse.removed(settings, each.method):.2f}"}
+         "-" if each.method == UNIFORM else slope_named(multiverse.removed(settings, each.method))}
         for each in multiverse.standings(settings)
     ]  # fmt: skip
     chosen = multiverse.most_headroom(settings)

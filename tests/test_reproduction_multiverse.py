@@ -304,6 +304,17 @@ def test_specification_curve_is_in_order(folders):
     assert "goal range x 1.5" in [text.get_text() for text in matrix.get_yticklabels()]
 
 
+def test_a_slope_without_an_interval_is_not_drawn(folders):
+    """Where a second measurement says nothing of the first, the picture says so and has no line."""
+    settings = multiverse.read(*folders)
+    lines = [len(axes.lines) for axes in multiverse_figures.over_headroom(settings, ["p75", "rnd"]).axes[:2]]
+    assert lines == [3, 3]
+    same = [Setting(each.name, each.levels, settings[0].screened, each.policies) for each in settings]
+    blind = multiverse_figures.over_headroom(same, ["p75"]).axes[0]
+    assert len(blind.lines) == 2
+    assert blind.get_title() == "p75: removes\nunknown"
+
+
 def test_page_of_a_map_that_is_not_finished(folders, tmp_path):
     """With settings that do not tell the factors apart the page says so, and has everything else."""
     for folder in folders:
