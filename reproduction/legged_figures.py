@@ -87,6 +87,8 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
 
 def _lines(axes: "Axes", values: np.ndarray) -> None:
     """A line for each base through the methods that it has, and a bar at each method's mean; shape (bases, methods)."""
+    if np.isnan(values).all():
+        axes.text(0.5, 0.5, "nobody attacked", ha="center", va="center", transform=axes.transAxes, color="#555555")
     for i, own in enumerate(values):
         known = np.flatnonzero(~np.isnan(own))
         axes.plot(known, own[known], color=_COLOURS[i % 6], marker=_MARKERS[i % 6], markersize=4, linewidth=0.9)
