@@ -56,7 +56,7 @@ class Kernel:
         self._counter = ctypes.c_int32()
         self._jobs = jobs = wp.zeros(1, dtype=Job, device="cpu")
         # A view of that memory; ctypes' costs least of all, and every minibatch fills in 30 fields.
-        self._job = np.ctypeslib.as_ctypes_type(Job.numpy_dtype()).from_address(jobs.ptr)
+        self._job = np.ctypeslib.as_ctypes_type(jobs.numpy().dtype).from_address(jobs.ptr)
         self._fill(
             count=count, block_rows=self._block_rows, stride=stride, counter=ctypes.addressof(self._counter),
             memory=self._memory.data_ptr(), memory_size=self._memory.shape[1], parameters=parameters.data_ptr(),
