@@ -24,7 +24,7 @@ BUDGET = {"uniform": (52, 5), "p75": (67, 5)}
 """Calls of torch that start work on the device, and launches of Warp, in a step of a rollout with goals of a method."""
 VIEWS = {"uniform": 37, "p75": 61}
 """Calls of torch in a step that start no work: views."""
-NOISE = 136
+NOISE = 137
 """Calls for the exploration of a whole rollout."""
 MINIBATCH, MINIBATCH_VIEWS = 127, 53
 """Calls in a minibatch of the update, under torch's products."""

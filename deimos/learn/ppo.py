@@ -170,8 +170,7 @@ class PPO(Stateful):
         self._fit = Recorded[Tensor](record)
         self._normalized = torch.zeros(num_envs, obs_dim, dtype=torch.float32, device=device)
         self._sizes = num_envs, obs_dim, action_dim, device
-        self._seed = seed
-        self._worlds, self._steps = (torch.arange(size, device=device) for size in (num_envs, config.num_steps))
+        self._seed, self._worlds = seed, torch.arange(num_envs, device=device)
 
     def new_rollout(self) -> Rollout:
         """Memory for what ``update`` learns from."""
@@ -193,7 +192,7 @@ class PPO(Stateful):
         size = max(1, 2**17 // len(self._worlds))  # steps at a time whose words stay within a core's caches
         for start in range(0, len(noise), size):
             part = noise[start : start + size]
-            steps = (self._steps[start : start + size] + first_step).unsqueeze(1)
+            steps = (torch.arange(start, start + len(part), device=noise.device) + first_step).unsqueeze(1)
             part.copy_(normals(self._seed, Purpose.EXPLORATION, self._worlds + env_offset, steps, noise.shape[2]))
 
     @torch.no_grad()
