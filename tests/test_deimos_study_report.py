@@ -29,7 +29,7 @@ def fill(folder, seeds=4, points=20):
         for method in METHODS:
             for seed in range(seeds):
                 key = {"environment": environment, "method": method, "seed": seed, "setting": environment,
-                       "selector": method, "hash": f"{environment}-{method}-{seed}"}  # fmt: skip
+                       "selector": method, "hash": f"{environment}-{method}-{seed}", "block": None}  # fmt: skip
                 for goals in ("naive", "adversary"):
                     row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | key
                     crashes = int(np.exp(rng.normal(5, 0.5))) if goals == "adversary" else 0
@@ -286,4 +286,4 @@ def test_caller_supplies_sections(folder, tmp_path, monkeypatch):
 
 def test_rolling_mean_is_short_at_the_start():
     """The rolling mean takes what there is until its window is full."""
-    assert figures._rolling(np.array([1.0, 3, 5, 7]), 2).tolist() == [1, 2, 4, 6]
+    assert figures.rolling(np.array([1.0, 3, 5, 7]), 2).tolist() == [1, 2, 4, 6]

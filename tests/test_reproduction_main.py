@@ -10,7 +10,7 @@ from reproduction import __main__ as reproduction
 def test_report_has_the_claims(tmp_path, capsys, monkeypatch):
     """The report of a folder of tables has a verdict on each of the thesis's claims."""
     values = {str: "v", int: 100, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
-    row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()}
+    row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | {"block": None}
     rows = [
         row | {"environment": "relative", "method": method, "hash": f"{method}{seed}", "seed": seed, "goals": goals}
         for method in ("uniform", "p25") for seed in range(2) for goals in ("naive", "adversary")
