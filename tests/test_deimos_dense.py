@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from short_training import leaves
 
 from deimos.goals import methods
 from deimos.goals.interactions import assign
@@ -41,15 +42,6 @@ def run(config, iterations):
         goals.append(trainer.rollout.obs[..., trainer.env.goal_slice].clone())
         cut_off.append(trainer.rollout.truncated.clone())
     return trainer, rows, torch.stack(goals), torch.stack(cut_off)
-
-
-def leaves(state, name=""):
-    """All that a state is made of, by name."""
-    if isinstance(state, dict | list | tuple):
-        for key, value in state.items() if isinstance(state, dict) else enumerate(state):
-            yield from leaves(value, f"{name}.{key}")
-    else:
-        yield name, state
 
 
 def differences(found, expected):

@@ -9,6 +9,7 @@ import pytest
 import torch
 import warp as wp
 from replay import Replay, replay_on_cpu
+from short_training import leaves
 
 from deimos.app import console
 from deimos.app.train import ResumeOptions
@@ -42,15 +43,6 @@ SELECTORS = {
     "learnability": learnability.Config(), "vds, then p75": methods.method("vds+p75"),
 }  # fmt: skip
 ITERATIONS = 7
-
-
-def leaves(state, name=""):
-    """All that a state is made of, by name."""
-    if isinstance(state, dict | list | tuple):
-        for key, value in state.items() if isinstance(state, dict) else enumerate(state):
-            yield from leaves(value, f"{name}.{key}")
-    else:
-        yield name, state
 
 
 def trained(config, device, iterations=ITERATIONS):
