@@ -113,8 +113,8 @@ OTHER_ERRORS = {
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
     "evaluate there": "there is not a run folder: it holds no config.json",
     "bench": "There is no command 'bench'",
-    "study walk": "There is no command 'study walk'; there are: run, cell, show, attack, pack, unpack, merge, export, "
-    "report",
+    "study walk": "There is no command 'study walk'; there are: run, cell, show, attack, pool, pack, unpack, merge, "
+    "export, report",
     "terrain walk": "There is no command 'terrain walk'; there are: list, shape, grid",
 }
 

@@ -168,7 +168,8 @@ def test_committed_studies_can_be_read():
     for table in tables:
         data = Data.read(table.parent)
         assert data.environments
-        assert any(data.curves(environment, "uniform") for environment in data.environments)
+        assert all(data.curves(environment, name) for environment in data.environments
+                   for name in data.methods(environment))  # fmt: skip
 
 
 def test_empty_folder_has_no_report(tmp_path):

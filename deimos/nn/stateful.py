@@ -78,7 +78,8 @@ def _state(value: Any) -> Any:
 def _restored(value: Any, state: Any) -> Any:
     """``value`` after it has taken over a state; another one only where it is plain."""
     if isinstance(value, Tensor):
-        state = torch.as_tensor(state)  # an older version's may be plain
+        if not isinstance(state, Tensor):  # an older version's may be plain
+            state = torch.tensor(state, device=value.device)
         if value.shape != state.shape:
             raise ValueError(f"A tensor of shape {tuple(value.shape)} cannot become one of {tuple(state.shape)}.")
         value.data.copy_(state)

@@ -62,11 +62,11 @@ class TrainConfig:
     tf32: bool = False
     """Whether a GPU may round the factors of float32 matrix products to 10 bits of mantissa (TF32), which is faster
     for large networks. CPUs never do."""
+    threads: int = 0
+    """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
     graph: Mode = "auto"
     """Whether a GPU replays rollouts and updates as CUDA graphs: auto does so where it can, on refuses to train where
     it cannot, off launches every operation by itself."""
-    threads: int = 0
-    """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
     log: tuple[str, ...] = ("tensorboard",)
     """Where its numbers are shown while it trains: tensorboard, wandb (Weights & Biases), both or nowhere."""
     video_every: int = 0
