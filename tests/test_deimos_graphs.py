@@ -60,7 +60,8 @@ def differences(found, expected):
     for name, value in expected.items():
         if isinstance(value, torch.Tensor | float | int):
             one, other = (torch.as_tensor(number).cpu() for number in (found[name], value))
-            if not torch.equal(one.nan_to_num(nan=-7.0), other.nan_to_num(nan=-7.0)):
+            same = one.shape == other.shape and ((one == other) | (one.isnan() & other.isnan())).all()
+            if not same:
                 yield name
         elif found[name] != value:
             yield name
