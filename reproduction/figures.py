@@ -11,6 +11,7 @@ from deimos.study.figures import WIDTH, Figures, as_rates, instead, legend, subp
 from deimos.study.outcomes import DOSE, of_environment
 from deimos.study.results import Row
 from reproduction import legged_figures
+from reproduction.measures import LITERAL, PENALTIES
 from reproduction.thesis import DIRECTOR_METHODS, ENVIRONMENTS
 
 if TYPE_CHECKING:
@@ -21,21 +22,30 @@ SHIFTED = (
     "On the right, Uniform policies under the Director's rules, from Coop to Antagonist, by a fear network trained on "
     "the finished policy and by exact fear from clones: what the shift of the goals does in itself."
 )
-_BASELINES = ("uniform", "rnd", "vds")
+_BASELINES = ("uniform", *PENALTIES, "rnd", "rnd-raw", "vds", "uniform-ensemble", "learnability", "cl")
+_LITERAL = tuple(name + LITERAL for name in DIRECTOR_METHODS)
+_CONTROLS = ("p25-threshold", "p75-threshold", "oracle", "swapped", "state-blind", "p75-penalty")
 _DIRECTOR_COLOURS = ("#fde333", "#b6c24a", "#6fa76b", "#3c8a7c", "#2e6b85", "#3a4a80", "#2d1e5f")  # yellow to blue
+_BY_FEAR = dict(zip(DIRECTOR_METHODS, _DIRECTOR_COLOURS, strict=True))
 STYLE = Style(
-    order=(*ENVIRONMENTS, *DIRECTOR_METHODS, *_BASELINES, "cl"),
-    panels={"Directors": DIRECTOR_METHODS, "baselines": _BASELINES},
-    everywhere="p25",
-    colours=dict(zip(DIRECTOR_METHODS, _DIRECTOR_COLOURS, strict=True)) | {  # the others are Okabe and Ito's
+    order=(*ENVIRONMENTS, *_LITERAL, *DIRECTOR_METHODS, *_CONTROLS, *_BASELINES),
+    panels={
+        "the thesis's Directors": _LITERAL, "Directors with crash memory": (*DIRECTOR_METHODS, *_CONTROLS),
+        "baselines": _BASELINES,
+    },
+    everywhere="uniform",
+    colours=_BY_FEAR | {  # the others are Okabe and Ito's
         "uniform": "#000000", "rnd": "#D55E00", "vds": "#CC79A7", "cl": "#56B4E9", "vds+p75": "#009E73",
         "learnability": "#E69F00",
-    },
+    } | dict(zip(_LITERAL, _DIRECTOR_COLOURS, strict=True)) | {
+        "p25-threshold": _BY_FEAR["p25"], "p75-threshold": _BY_FEAR["p75"], "oracle": "#e7298a", "swapped": "#a6761d",
+        "state-blind": "#66a61e", "p75-penalty": "#1f78b4", "rnd-raw": "#f4a582", "uniform-ensemble": "#b2abd2",
+    } | dict(zip(PENALTIES, ("#7f7f7f", "#bfbfbf"), strict=True)),
 )  # fmt: skip
 
 
 def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figures:
-    """The figures of every study; beside the delivered dose, Uniform policies under shifted goals.
+    """The figures of every study; beside the delivered dose, Uniform policies under shifted goals where there are rows.
 
     Where methods branched off common bases, those of ``legged_figures`` in place of boxes and bands.
 
@@ -47,19 +57,18 @@ def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figure
     found = of_environment(data, environment)
     for period in data.periods(environment):
         own = [row for row in shifted if (row["environment"], row["goal_period"]) == (environment, period)]
-        text = f"{environment}, T = {period}: {DOSE} {SHIFTED}"
-        found[f"dose-{environment}-T{period}"] = (text, dose_response(data, environment, period, own))
+        if own:
+            text = f"{environment}, T = {period}: {DOSE} {SHIFTED}"
+            found[f"dose-{environment}-T{period}"] = (text, dose_response(data, environment, period, own))
     if not data.paired(environment):
         return found
     found |= legged_figures.figures(data, environment)
     return {name: (f"{caption} {legged_figures.ORIGIN}", figure) for name, (caption, figure) in found.items()}
 
 
-def dose_response(data: Data, environment: str, period: int, shifted: Sequence[Row]) -> "Figure | None":
+def dose_response(data: Data, environment: str, period: int, shifted: Sequence[Row]) -> "Figure":
     """What a shift of goals in training does under uniform goals, and what it does to a Uniform policy in itself."""
     names = [name for name in data.methods(environment) if data.delivered(environment, name)]
-    if not names and not shifted:
-        return None
     hard = outcomes.attacked(data, environment, period)
     figure, axes = subplots(2, 2, (WIDTH, 4.8), sharex=True, sharey="row")
     places = (Where(environment, "naive", period), "score"), (hard.where, hard.metric)
@@ -84,9 +93,6 @@ def dose_response(data: Data, environment: str, period: int, shifted: Sequence[R
 
 def _over_shift(axes: "Axes", rows: Sequence[Row], metric: str) -> None:
     """A line for each policy, through the rules by rising percentile, by learnt fear and by exact fear."""
-    if not rows:
-        instead(axes, "shifted goals:\nnot recorded")
-        return
     unit = 1 if metric == "score" else 100
     for fear, colour, marker in (("learnt", "#000000", "o"), ("exact", "#D55E00", "^")):
         own = [row for row in rows if row["fear"] == fear]

@@ -24,7 +24,7 @@ def study(*, environments=("directional",), methods=("uniform", "p25", "p75"), s
         for i, method in enumerate(methods):
             for seed in range(seeds):
                 key = {"environment": environment, "method": method, "seed": seed, "setting": environment,
-                       "selector": method, "hash": f"{environment}{method}{seed}"}  # fmt: skip
+                       "selector": method, "hash": f"{environment}{method}{seed}", "block": None}  # fmt: skip
                 for goals in ("naive", "adversary"):
                     row = {name: EMPTY[kind] for name, kind in RESULT_COLUMNS.items()} | key
                     values = {
@@ -105,7 +105,7 @@ def test_dose_is_what_training_delivered():
 
 
 def test_shifted_goals_stand_beside_the_dose():
-    """Every Uniform policy has a line through its rules by rising percentile; what is missing is said in its place."""
+    """Every Uniform policy has a line through its rules by rising percentile; without rows it is as in any study."""
     rows = [
         {"environment": "directional", "goal_period": 100, "seed": seed, "fear": fear, "percentile": p,
          "score": 1 - p / 100, "crash_rate": p / 1000}
@@ -116,9 +116,24 @@ def test_shifted_goals_stand_beside_the_dose():
     assert [line.get_xdata().tolist() for line in right.lines] == [[10.0, 50.0, 90.0]] * 4
     assert figure.axes[3].lines[0].get_ydata() == pytest.approx([1.0, 5.0, 9.0])
     assert [text.get_text() for text in right.get_legend().get_texts()] == ["learnt fear", "exact fear"]
-    without = thesis.dose_response(study(), "directional", 100, [])
-    assert "shifted goals:\nnot recorded" in [text.get_text() for text in without.axes[1].texts]
-    assert thesis.dose_response(study(curve=False), "directional", 100, []) is None
+    unlearnt = thesis.dose_response(study(curve=False), "directional", 100, rows)
+    assert "delivered dose:\nnot recorded" in [text.get_text() for text in unlearnt.axes[0].texts]
+    assert unlearnt.axes[1].yaxis.get_ticklocs().size  # of the scores under shifted goals, on a scale that both share
+    own, without = (thesis.figures(study(), "directional", given)["dose-directional-T100"] for given in (rows, []))
+    assert (own[0].endswith(thesis.SHIFTED), without[0].endswith(thesis.SHIFTED)) == (True, False)
+    assert len(own[1].axes) == 2 * len(without[1].axes)
+
+
+def test_methods_of_the_populations_can_be_told_apart():
+    """Literal Directors have their own panel; no two methods share both colour and marker, whichever a study has."""
+    data = Data(study(methods=("uniform", "p25", "p25-literal", "p75-literal", "rnd"))._results, thesis.STYLE)
+    assert len({(data.style.colours[name], data.style.marker(name)) for name in thesis.STYLE.colours}) == len(
+        thesis.STYLE.colours
+    )
+    titles = [axes.get_title() for axes in figures.training(data, "directional").axes[:3]]
+    assert titles == ["the thesis's Directors", "Directors with crash memory", "baselines"]
+    only = Data(study(methods=("uniform", "rnd"))._results, thesis.STYLE)
+    assert [axes.get_title() for axes in figures.training(only, "directional").axes] == ["baselines", "", ""]
 
 
 def test_maps_have_the_share_of_goals_at_a_place():
@@ -146,7 +161,7 @@ def test_training_curves_are_medians(monkeypatch):
     for seed, line in enumerate(data._results.curves):
         line["reward"] = tuple(np.array([1.0, 2.0, 3.0]) + (100.0 if seed == 2 else seed))
     figure = figures.training(data, "directional")
-    line = next(line for axes in figure.axes[2:4] for line in axes.lines)
+    line = figure.axes[1].lines[0]  # a column of panels: uniform is a baseline
     assert line.get_ydata() == pytest.approx([2.0, 3.0, 4.0])
 
 

@@ -76,7 +76,7 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) ->
 def instead(axes: "Axes", text: str) -> None:
     """Say in the place of a panel why it is empty."""
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, color="#555555")
-    axes.set_yticks([])
+    axes.tick_params(axis="y", left=False, labelleft=False)  # of these axes alone, where others share their ticks
 
 
 def as_rates(axes: "Axes", which: Literal["x", "y"], label: str) -> None:
@@ -94,8 +94,9 @@ def training(data: Data, environment: str) -> "Figure | None":
     found = [name for name in data.methods(environment) if data.curves(environment, name)]
     if not found:
         return None
-    titles = [*data.style.panels]
-    own = {title: [name for name in found if data.style.panel(name) == title] for title in titles}
+    of_panel = {title: [name for name in found if data.style.panel(name) == title] for title in data.style.panels}
+    own = {title: names for title, names in of_panel.items() if names}
+    titles = [*own]
     most = max(map(len, own.values()))
     known = any(unfitted(data, environment, name) is not None for name in found)
     figure, axes = subplots(
