@@ -33,7 +33,7 @@ from reproduction.claim_tests import SETTLED_RATIO, SETTLED_SHARE, Alike, Best, 
 from reproduction.claims import ALPHA, Test
 from reproduction.measures import FLOOR
 
-ROWS = Path(__file__).parent.parent / "docs/results/particle"
+ROWS = Path(__file__).parent.parent / "docs/results/particle_0.1.0"
 SIZES = (10, 30)
 PERMUTATIONS = 199  # 5 of 200 are exactly 2.5 %
 POPULATIONS = ("normal", "lognormal", "bimodal", "rows")

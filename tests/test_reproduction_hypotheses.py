@@ -116,6 +116,6 @@ def test_missing_data_are_said(tmp_path):
 
 def test_command_prints_three_answers(monkeypatch, capsys):
     """The rows of 0.1.0 have neither fresh seeds nor penalties."""
-    monkeypatch.setattr("sys.argv", ["hypotheses", "docs/results/particle"])
+    monkeypatch.setattr("sys.argv", ["hypotheses", "docs/results/particle_0.1.0"])
     hypotheses.main()
     assert capsys.readouterr().out.count("is not shown") == 3
