@@ -1,23 +1,28 @@
 """What a study keeps of its policies and of their trainings, and what later attackers make of them."""
 
 import dataclasses
+import hashlib
 import math
 import shutil
 import subprocess
 import sys
 import time
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
 
+from deimos import plugins
 from deimos.checks import RunError
 from deimos.lock import hold
-from deimos.run.evaluation import evaluate
+from deimos.run import attackers
+from deimos.run.evaluation import evaluate, read_evaluation
 from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.folder import StudyFolder
+from deimos.study.results import evaluated
 
 WORST = ("worst", "worst_attacker", "worst_interactions")  # they depend on who attacked
 LONG = {"attackers": ("argmax-long",), "allow_uncommitted": True}
@@ -146,6 +151,31 @@ def test_attack_adds_rows_and_survives_a_kill(whole, tmp_path):
     assert len(once.results().rows) == 8  # there are no such seeds
     kept = [row for row in table(once, WORST) if row["goals"] != "'argmax-long'"]
     assert kept == table(whole, WORST)
+
+
+def test_rows_say_which_attacker_made_them(whole, tmp_path, monkeypatch, new_plugins):
+    """An attacker that is none of Deimos' own stands in the code of its rows with the hash of its file."""
+    source = b'"""Scripted under another name."""\n\nfrom deimos.run.attackers.scripted import Config as Scripted\n'
+    source += b"from dataclasses import dataclass\n\n\n@dataclass(frozen=True)\nclass Config(Scripted):\n    ...\n"
+    (tmp_path / "my_attacker.py").write_bytes(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plugins.register(attackers, "mine", "my_attacker")
+    cell = whole.cells()[0]
+    run = RunFolder(whole.cell_path(cell) / "run")
+    rows = read_evaluation(run)
+    rows.append(rows[0] | {"goals": "mine"})
+    made_by = {row["goals"]: row["code"] for row in evaluated(cell, run, rows, "0123")}
+    digest = hashlib.sha256(source).hexdigest()[:12]
+    assert made_by == {**dict.fromkeys(("naive", "argmax", "scripted"), "0123"), "mine": f"0123 my_attacker={digest}"}
+
+
+@pytest.mark.parametrize("name", ["particle_a", "particle_b"])
+def test_kept_policies_are_cells_of_today(tmp_path, name):
+    """What the archives of docs/results hold is still named as it was, so that it can be attacked."""
+    with zipfile.ZipFile(Path(__file__).parent.parent / "docs" / "results" / name / "policies.zip") as archive:
+        for place in [entry for entry in archive.namelist() if "-s0-" in entry and entry.endswith("cell.json")]:
+            archive.extract(place, tmp_path / "cells")
+    assert {cell.environment for cell in StudyFolder(tmp_path).cells()} == {"absolute", "directional", "relative"}
 
 
 def test_study_file_may_name_further_attackers(file, tmp_path):
