@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.folder import StudyFolder
-from deimos.study.results import evaluated
+from deimos.study.results import evaluated, identity
 
 WORST = ("worst", "worst_attacker", "worst_interactions")  # they depend on who attacked
 LONG = {"attackers": ("argmax-long",), "allow_uncommitted": True}
@@ -170,12 +171,25 @@ def test_rows_say_which_attacker_made_them(whole, tmp_path, monkeypatch, new_plu
 
 
 @pytest.mark.parametrize("name", ["particle_a", "particle_b"])
-def test_kept_policies_are_cells_of_today(tmp_path, name):
-    """What the archives of docs/results hold is still named as it was, so that it can be attacked."""
-    with zipfile.ZipFile(Path(__file__).parent.parent / "docs" / "results" / name / "policies.zip") as archive:
-        for place in [entry for entry in archive.namelist() if "-s0-" in entry and entry.endswith("cell.json")]:
-            archive.extract(place, tmp_path / "cells")
-    assert {cell.environment for cell in StudyFolder(tmp_path).cells()} == {"absolute", "directional", "relative"}
+def test_kept_policies_are_the_cells_of_their_rows(tmp_path, name):
+    """What an earlier version has finished keeps its hashes and can be attacked; what is open there is refused."""
+    kept = Path(__file__).parent.parent / "docs" / "results" / name
+    for table in ("results.csv", "curves.csv"):
+        shutil.copy(kept / table, tmp_path)
+    with zipfile.ZipFile(kept / "policies.zip") as every, zipfile.ZipFile(tmp_path / "policies.zip", "w") as some:
+        for entry in [entry for entry in every.namelist() if re.match(r"relative-p\S+-s0-", entry)]:
+            some.writestr(entry, every.read(entry))
+    study = StudyFolder(tmp_path)
+    cli.UnpackOptions(folder=study.path).run()
+    cells, rows = study.cells(), {row["hash"]: row for row in study.results().rows}
+    assert len(cells) >= 3
+    for cell in cells:
+        own = identity(cell)
+        assert {name: rows[cell.digest][name] or "" for name in own} == {name: own[name] or "" for name in own}
+    assert study.finished(cells) == {cell.digest for cell in cells}
+    (study.cell_path(cells[0]) / "result.json").unlink()
+    with pytest.raises(RunError, match="was made by another version of Deimos, whose defaults or methods differ"):
+        study.cells()
 
 
 def test_study_file_may_name_further_attackers(file, tmp_path):
