@@ -94,7 +94,7 @@ def short_study():
 @pytest.fixture
 def new_plugins(monkeypatch):
     """What a test registers it registers for itself alone, and modules register themselves anew."""
-    own = ("reproduction.oracle", "my_selector")
+    own = ("reproduction.oracle", "my_selector", "my_attacker")
     monkeypatch.setattr(plugins, "_registered", {})
     for name in own:
         monkeypatch.delitem(sys.modules, name, raising=False)

@@ -1,23 +1,29 @@
 """What a study keeps of its policies and of their trainings, and what later attackers make of them."""
 
 import dataclasses
+import hashlib
 import math
+import re
 import shutil
 import subprocess
 import sys
 import time
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
 
+from deimos import plugins
 from deimos.checks import RunError
 from deimos.lock import hold
-from deimos.run.evaluation import evaluate
+from deimos.run import attackers
+from deimos.run.evaluation import evaluate, read_evaluation
 from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.folder import StudyFolder
+from deimos.study.results import evaluated, identity
 
 WORST = ("worst", "worst_attacker", "worst_interactions")  # they depend on who attacked
 LONG = {"attackers": ("argmax-long",), "allow_uncommitted": True}
@@ -146,6 +152,44 @@ def test_attack_adds_rows_and_survives_a_kill(whole, tmp_path):
     assert len(once.results().rows) == 8  # there are no such seeds
     kept = [row for row in table(once, WORST) if row["goals"] != "'argmax-long'"]
     assert kept == table(whole, WORST)
+
+
+def test_rows_say_which_attacker_made_them(whole, tmp_path, monkeypatch, new_plugins):
+    """An attacker that is none of Deimos' own stands in the code of its rows with the hash of its file."""
+    source = b'"""Scripted under another name."""\n\nfrom deimos.run.attackers.scripted import Config as Scripted\n'
+    source += b"from dataclasses import dataclass\n\n\n@dataclass(frozen=True)\nclass Config(Scripted):\n    ...\n"
+    (tmp_path / "my_attacker.py").write_bytes(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plugins.register(attackers, "mine", "my_attacker")
+    cell = whole.cells()[0]
+    run = RunFolder(whole.cell_path(cell) / "run")
+    rows = read_evaluation(run)
+    rows.append(rows[0] | {"goals": "mine"})
+    made_by = {row["goals"]: row["code"] for row in evaluated(cell, run, rows, "0123")}
+    digest = hashlib.sha256(source).hexdigest()[:12]
+    assert made_by == {**dict.fromkeys(("naive", "argmax", "scripted"), "0123"), "mine": f"0123 my_attacker={digest}"}
+
+
+@pytest.mark.parametrize("name", ["particle_a", "particle_b"])
+def test_kept_policies_are_the_cells_of_their_rows(tmp_path, name):
+    """What an earlier version has finished keeps its hashes and can be attacked; what is open there is refused."""
+    kept = Path(__file__).parent.parent / "docs" / "results" / name
+    for table in ("results.csv", "curves.csv"):
+        shutil.copy(kept / table, tmp_path)
+    with zipfile.ZipFile(kept / "policies.zip") as every, zipfile.ZipFile(tmp_path / "policies.zip", "w") as some:
+        for entry in [entry for entry in every.namelist() if re.match(r"relative-p\S+-s0-", entry)]:
+            some.writestr(entry, every.read(entry))
+    study = StudyFolder(tmp_path)
+    cli.UnpackOptions(folder=study.path).run()
+    cells, rows = study.cells(), {row["hash"]: row for row in study.results().rows}
+    assert len(cells) >= 3
+    for cell in cells:
+        own = identity(cell)
+        assert {name: rows[cell.digest][name] or "" for name in own} == {name: own[name] or "" for name in own}
+    assert study.finished(cells) == {cell.digest for cell in cells}
+    (study.cell_path(cells[0]) / "result.json").unlink()
+    with pytest.raises(RunError, match="was made by another version of Deimos, whose defaults or methods differ"):
+        study.cells()
 
 
 def test_study_file_may_name_further_attackers(file, tmp_path):

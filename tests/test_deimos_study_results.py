@@ -228,6 +228,18 @@ def test_merge_adds_what_is_new(tmp_path):
     assert merge(tmp_path / "c", [tmp_path / "a"]) == (0, 2, 0)
 
 
+def test_merge_adds_what_other_attackers_did_to_the_same_policies(tmp_path):
+    """Two folders whose policies met different attackers make one with the rows of all, but for other weights."""
+    fill(tmp_path / "a", [result("1"), result("1", goals="mine", code="y mine=0")])
+    fill(tmp_path / "b", [result("1"), result("1", goals="yours", code="z yours=0")])
+    fill(tmp_path / "c", [result("1", goals="theirs", weights="y")])
+    assert merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b", tmp_path / "c"]) == (3, 1, 0)
+    assert [row["goals"] for row in Results.read(tmp_path / "all").rows] == ["naive", "mine", "yours"]
+    fill(tmp_path / "d", [result("2", goals="mine", code="y mine=1")])
+    with pytest.raises(RunError, match=r"'x', mine, were made by 2 versions of the code \(y mine=0, y mine=1\)"):
+        merge(tmp_path / "all", [tmp_path / "d"])
+
+
 def test_export_writes_the_tables_of_cells(tmp_path):
     """A folder that is merged with itself has tables that give the results of its cells again."""
     fill_cell(tmp_path / "a", [result("1")], curve("1"))

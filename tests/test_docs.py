@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import deimos
 from deimos import plugins
 from deimos.goals import selectors
 from deimos.goals.methods import METHODS
@@ -25,7 +26,9 @@ PAGES = [
     *sorted(DOCS.glob("lab/*.md")),
 ]  # fmt: skip
 SUFFIXES = {".py", ".md", ".toml", ".json", ".csv", ".png", ".svg", ".webp"}
-FURTHER_PAGES = {"cluster.md", "deploy.md", "director.md", "gallery.md", "gpu.md", "integrations.md", "view.md"}
+FURTHER_PAGES = {
+    "benchmark.md", "cluster.md", "deploy.md", "director.md", "gallery.md", "gpu.md", "integrations.md", "view.md",
+}  # fmt: skip
 """Those that the budget of all pages leaves out."""
 
 
@@ -124,6 +127,12 @@ def test_user_pages_are_short():
     assert sum(words(page) for page in USER_PAGES if page.name not in FURTHER_PAGES) <= 7057
     assert [page.name for page in USER_PAGES if words(page) > 700] == []
     assert words(HOME / "README.md") <= 900
+
+
+def test_citation_is_of_this_version():
+    """What CITATION.cff names is the version of the package."""
+    text = (HOME / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.findall(r"^version: (.*)$", text, re.MULTILINE) == [deimos.__version__]
 
 
 def test_every_picture_for_dark_pages_has_its_light_one():

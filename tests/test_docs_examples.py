@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -133,8 +134,20 @@ class Session:
         )
         for name in ("quad_flat", "quad_rough_walk", "quad_arm_reach"):
             shutil.copytree(DOCS / "results" / name, folder / "docs" / "results" / name)
+        self.keep_one_policy()
         monkeypatch.chdir(folder)
         monkeypatch.syspath_prepend(str(folder))
+
+    def keep_one_policy(self):
+        """Put the tables of the kept policies in the folder, and an archive of one of them."""
+        for name in ("particle_a", "particle_b"):
+            kept = shutil.ignore_patterns("policies.zip")
+            shutil.copytree(DOCS / "results" / name, self.folder / "docs" / "results" / name, ignore=kept)
+        part = Path("docs", "results", "particle_a", "policies.zip")
+        with zipfile.ZipFile(HOME / part) as every, zipfile.ZipFile(self.folder / part, "w") as one:
+            for name in every.namelist():
+                if name.startswith("directional-uniform-s0-"):
+                    one.writestr(name, every.read(name))
 
     def write(self, block, path=None):
         """Save a file; the evaluations of a study's are shortened."""
@@ -172,6 +185,8 @@ class Session:
             self.deimos(arguments)
         elif (program, arguments[0]) == ("python", "train.py"):
             self.deimos(["train", *arguments[1:]])
+        elif program == "cp":
+            self.process(program, *arguments)
         elif program == "torchrun":  # tests/test_deimos_ranks.py runs several; here it is one process
             self.deimos(["train", *arguments[arguments.index("train.py") + 1 :]])
         else:
@@ -221,7 +236,7 @@ class Session:
 
     def process(self, *command, cwd=None):
         """Run a program in a process of its own; returns what it printed."""
-        path = os.pathsep.join([str(self.folder), str(HOME)])
+        path = os.pathsep.join([str(self.folder), str(Path(deimos.__file__).parent.parent)])  # that of this process
         done = subprocess.run(
             command, cwd=cwd or self.folder, env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
             capture_output=True, text=True, check=False,

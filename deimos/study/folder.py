@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 
 from deimos.checks import RunError, one_line
@@ -21,7 +22,7 @@ from deimos.run.config import from_dict, to_dict
 from deimos.run.evaluation import Scale
 from deimos.run.folder import RunFolder
 from deimos.study.plan import AttackRound, Cell, read_cell
-from deimos.study.results import Results
+from deimos.study.results import Results, Row
 
 ATTACK, FEAR, SCALES = "attack.json", "fear.pt", "scales.json"
 
@@ -109,12 +110,16 @@ class StudyFolder:
     def cell(self, name: str) -> Cell:
         """The cell of a name.
 
+        Where it has results, it is the cell of these, so that its policy can be attacked by later versions too.
+
         Raises:
-            RunError: If it cannot be read, or if the same configuration is another cell today, because a default
-                or what a method stands for has changed since.
+            RunError: If it cannot be read, or if it has no results and the same configuration is another cell today,
+                because a default or what a method stands for has changed since.
         """
         path = self.path / "cells" / name / "cell.json"
         cell = read_cell(path)
+        if cell.name != name and (rows := Results.of_cell(path.parent).rows):
+            cell = _made_as(cell, rows[0])
         if cell.name != name:
             raise RunError(
                 f"{path} was made by another version of Deimos, whose defaults or methods differ; continue with that "
@@ -153,3 +158,11 @@ class StudyFolder:
         """Let every failed cell be tried again."""
         for path in self.path.glob("cells/*/failures.jsonl"):
             path.unlink(missing_ok=True)
+
+
+def _made_as(cell: Cell, row: Row) -> Cell:
+    """A cell under the hashes of one of its rows, which another version, with other defaults, has given it."""
+    made = replace(cell)
+    columns = {"digest": "hash", "setting": "setting", "selector": "selector", "block": "block"}
+    vars(made).update({name: row[column] or "" for name, column in columns.items()})  # the cached ones
+    return made

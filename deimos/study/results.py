@@ -15,11 +15,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import deimos
 from deimos.checks import RunError, one_line
 from deimos.files import first_line, read_bytes, write_bytes
+from deimos.run.attack import attacker
 from deimos.run.evaluation import worst
 from deimos.run.folder import RunFolder
 from deimos.study.plan import Cell
+from deimos.study.source import hashes
 
 SCHEMA = 1  # of result.json
 Row = dict[str, Any]
@@ -110,10 +113,18 @@ class Results:
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path} is not the result of a cell of schema {SCHEMA} ({one_line(error)}).") from error
 
-    def add(self, other: "Results") -> int:
-        """Take over the rows of cells that are not here yet; returns how many rows of evaluations that were."""
-        known, drawn = ({row["hash"] for row in rows} for rows in (self.rows, self.curves))
-        fresh = [row for row in other.rows if row["hash"] not in known]
+    def add(self, other: "Results", *, attacks: bool = False) -> int:
+        """Take over the rows of cells that are not here yet; returns how many rows of evaluations that were.
+
+        With ``attacks`` also what other attackers have done to the very policies that are here.
+        """
+        known, drawn = ({row["hash"]: row["weights"] for row in self.rows}, {row["hash"] for row in self.curves})
+        met = {_evaluation(row) for row in self.rows}
+        fresh = [
+            row for row in other.rows
+            if row["hash"] not in known
+            or (attacks and known[row["hash"]] == row["weights"] and _evaluation(row) not in met)
+        ]  # fmt: skip
         self.rows += fresh
         self.curves += [line for line in other.curves if line["hash"] not in drawn]
         return len(fresh)
@@ -157,11 +168,13 @@ def result(cell: Cell, run: RunFolder, rows: Iterable[Row], audited: Row | None 
 
 
 def evaluated(cell: Cell, run: RunFolder, rows: Iterable[Row], code: str | None) -> list[Row]:
-    """Rows of evaluations of a cell, as ``result.json`` has them; ``code`` evaluated it."""
+    """Rows of evaluations of a cell, as ``result.json`` has them; ``code`` evaluated it.
+
+    An attacker that is none of Deimos' own is part of the code of its rows, by the hash of its file.
+    """
     stored = run.read_json("config.json")
     names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
     shared = identity(cell) | {
-        "code": code,
         "env_steps": stored["config"]["env_steps"],
         "trained_period": cell.config.env.goal_period,
         "fps": median([float(row["fps"]) for row in run.read_csv("timing.csv")] or [math.nan]),
@@ -170,9 +183,19 @@ def evaluated(cell: Cell, run: RunFolder, rows: Iterable[Row], code: str | None)
     }
     # Evaluations call their own seed and a hash of their task by names that mean the cell's here.
     own = {"seed": cell.config.seed, "environment": cell.environment}
-    full = [shared | row | {"eval_seed": row["seed"]} | own for row in rows]
+    full = [
+        shared | row | {"eval_seed": row["seed"], "code": _made_by(row["goals"], code)} | own for row in rows
+    ]  # fmt: skip
     # Where a goal has one group of components, its tracking is the reward.
     return [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in full]
+
+
+def _made_by(goals: str, code: str | None) -> str | None:
+    """What made the rows of an evaluation, of Deimos' own ``code`` and an attacker's."""
+    module = type(attacker(goals)).__module__ if goals != "naive" else deimos.__name__
+    if module.partition(".")[0] == deimos.__name__:
+        return code
+    return " ".join([*([code] if code else []), *(f"{name}={value}" for name, value in hashes([module], {}).items())])
 
 
 def _curve(rows: list[dict[str, str]], points: int = 100) -> Row:
@@ -225,18 +248,23 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
     for source in sources:
         found = Results.read(source, may_be_empty=False)
         ours, theirs = (
-            {(row["hash"], row["goals"], row["goal_period"]): [_text(row[name]) for name in numbers] for row in rows}
+            {_evaluation(row): [_text(row[name]) for name in numbers] for row in rows}
             for rows in (merged.rows, found.rows)
         )
         both = ours.keys() & theirs.keys()
         present += len(both)
         differing += sum(ours[key] != theirs[key] for key in both)
-        added += merged.add(found)
+        added += merged.add(found, attacks=True)
     merged.check()
     merged.find_worst()
     target.mkdir(parents=True, exist_ok=True)
     merged.write(target)
     return added, present, differing
+
+
+def _evaluation(row: Row) -> tuple:
+    """Of what cell and what evaluation a row is."""
+    return row["hash"], row["goals"], row["goal_period"]
 
 
 def check_comparable(rows: Iterable[Row]) -> None:
