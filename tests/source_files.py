@@ -1,6 +1,7 @@
 """Our source files, for the tests that read them."""
 
 import ast
+import functools
 from pathlib import Path
 
 import deimos
@@ -9,11 +10,17 @@ HOME = Path(deimos.__file__).resolve().parent.parent
 PACKAGES = ("deimos", "kernels", "terrain")
 
 
+@functools.cache
+def syntax(path):
+    """The syntax tree of a file, read once for all tests, which leave it as it is."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def sources(*packages):
     """Paths of the source files of packages, with their syntax trees."""
     paths = [path for package in packages for path in sorted((HOME / package).rglob("*.py"))]
     assert len(paths) >= len(packages)
-    return {path.relative_to(HOME).as_posix(): ast.parse(path.read_text(encoding="utf-8")) for path in paths}
+    return {path.relative_to(HOME).as_posix(): syntax(path) for path in paths}
 
 
 def module_name(path):
