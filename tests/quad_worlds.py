@@ -3,8 +3,6 @@
 import numpy as np
 import torch
 
-from deimos.goals.selectors import uniform
-from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.envs import quad, quad_arm
 
 TASKS = {"quad": quad.Config, "quad-arm": quad_arm.Config}
@@ -16,25 +14,8 @@ def build(device, num_envs=6, seed=0, env_offset=0, task="quad", **config):
     return config.build(num_envs, device, seed, env_offset)
 
 
-def build_loop(env, candidates=3):
-    """A loop with uniform goals."""
-    return GoalLoop(env, uniform.Config(candidates=candidates).build(spaces(env), seed=0))
-
-
 def actions(num_envs, device, seed=0, scale=0.6, task="quad"):
     """Constant actions, other for every world: some robots fall early, some late."""
     joints = 12 if task == "quad" else 17
     a = np.random.default_rng(seed).normal(scale=scale, size=(num_envs, joints))
     return torch.tensor(a, dtype=torch.float32, device=device)
-
-
-def rows_of(env, *rows):
-    """Rows as an environment takes them; all of them if none is given."""
-    return torch.tensor(rows or range(env.num_envs), dtype=torch.int64, device=env.device)
-
-
-def mask_of(env, *rows):
-    """A mask of the listed worlds."""
-    mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
-    mask[list(rows)] = True
-    return mask

@@ -1,4 +1,4 @@
-"""A training of seconds for the tests of runs, with everything that a run can have; and what its state is made of."""
+"""A training of seconds for the tests of runs, with everything that a run can have."""
 
 from deimos.goals.fear import FearConfig
 from deimos.goals.selectors import director
@@ -19,12 +19,3 @@ CONFIG = TrainConfig(
     device="cpu",
     threads=1,
 )
-
-
-def leaves(state, name=""):
-    """All that a state is made of, by name."""
-    if isinstance(state, dict | list | tuple):
-        for key, value in state.items() if isinstance(state, dict) else enumerate(state):
-            yield from leaves(value, f"{name}.{key}")
-    else:
-        yield name, state

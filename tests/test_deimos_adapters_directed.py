@@ -246,58 +246,58 @@ def test_fear_is_learnt_in_a_wrapped_vector():
         histories(AutoresetMode.DISABLED, parted=False)
 
 
-class TestCommandTerm:
-    """``DirectedCommand`` in the example for Isaac Lab, over a stub of it."""
+@pytest.fixture
+def isaac_lab(monkeypatch):
+    """Makes an environment with a share of standing robots, of the example for Isaac Lab over a stub of it."""
+    monkeypatch.syspath_prepend(str(HOME / "tests" / "data" / "isaaclab_stub"))
+    example = runpy.run_path(str(HOME / "examples" / "isaac_lab_director.py"))
+    make = sys.modules["isaaclab.envs"].ManagerBasedRLEnv
+    yield lambda standing=0.0: make(64, example["DirectedVelocityCfg"](rel_standing_envs=standing))
+    for name in [name for name in sys.modules if name.split(".")[0] == "isaaclab"]:
+        del sys.modules[name]
 
-    @pytest.fixture
-    def env(self, monkeypatch):
-        """Makes an environment with a share of standing robots."""
-        monkeypatch.syspath_prepend(str(HOME / "tests" / "data" / "isaaclab_stub"))
-        example = runpy.run_path(str(HOME / "examples" / "isaac_lab_director.py"))
-        make = sys.modules["isaaclab.envs"].ManagerBasedRLEnv
-        yield lambda standing=0.0: make(64, example["DirectedVelocityCfg"](rel_standing_envs=standing))
-        for name in [name for name in sys.modules if name.split(".")[0] == "isaaclab"]:
-            del sys.modules[name]
 
-    def test_timers_and_resets_call_for_commands(self, env):
-        """A command changes where its timer has run out or an episode begins, and nowhere else; all are in the box."""
-        torch.manual_seed(0)
-        worlds = env()
-        changes = 0
-        for _ in range(40):
-            before, left = worlds.term.command.clone(), worlds.term.time_left.clone()
-            worlds.step()
-            new = (worlds.term.command != before).any(1)
-            expected = worlds.reset_terminated | worlds.reset_time_outs | (left - worlds.step_dt <= 0)
-            assert torch.equal(new, expected)
-            assert (worlds.term.command.abs() <= torch.tensor([1.0, 0.5, 2.0])).all()
-            changes += int(new.sum())
-        assert changes > 300
+def test_timers_and_resets_call_for_commands(isaac_lab):
+    """A command changes where its timer has run out or an episode begins, and nowhere else; all are in the box."""
+    torch.manual_seed(0)
+    worlds = isaac_lab()
+    changes = 0
+    for _ in range(40):
+        before, left = worlds.term.command.clone(), worlds.term.time_left.clone()
+        worlds.step()
+        new = (worlds.term.command != before).any(1)
+        expected = worlds.reset_terminated | worlds.reset_time_outs | (left - worlds.step_dt <= 0)
+        assert torch.equal(new, expected)
+        assert (worlds.term.command.abs() <= torch.tensor([1.0, 0.5, 2.0])).all()
+        changes += int(new.sum())
+    assert changes > 300
 
-    def test_interactions_are_those_of_the_commands(self, env):
-        """Falls under a command of the Director's are its crashes, first ones are not; it then asks for fast walks."""
-        torch.manual_seed(0)
-        worlds = env()
-        director, counted, found = worlds.term.director, 0, 0
-        for _ in range(300):
-            ours = director.interactions.active.clone()
-            worlds.step()
-            counted += int((worlds.reset_terminated & ours).sum())
-            resolved = director.interactions.resolved()
-            found += int((resolved.crashed & (resolved.resolved == director.interactions.now)).sum())
-        assert director.interactions.now == 300
-        assert counted == found > 50
-        assert director.selector.fear.fitted
-        state, speeds = torch.zeros(15), np.array([0.0, 0.95])
-        slow, fast = director.risk_map(state, torch.zeros(3), {0: speeds, 1: [0.0]}).probability[0]
-        assert fast > slow + 0.2
 
-    def test_what_is_executed_is_what_is_learnt(self, env):
-        """Robots that stand whatever they were asked for have pursued a goal of zeros."""
-        torch.manual_seed(0)
-        worlds = env(standing=0.5)
-        for _ in range(40):
-            worlds.step()
-        goals = worlds.term.director.interactions.resolved().next_goal
-        standing = (goals == 0).all(1).float().mean().item()
-        assert 0.3 < standing < 0.7
+def test_interactions_are_those_of_the_commands(isaac_lab):
+    """Falls under a command of the Director's are its crashes, first ones are not; it then asks for fast walks."""
+    torch.manual_seed(0)
+    worlds = isaac_lab()
+    director, counted, found = worlds.term.director, 0, 0
+    for _ in range(300):
+        ours = director.interactions.active.clone()
+        worlds.step()
+        counted += int((worlds.reset_terminated & ours).sum())
+        resolved = director.interactions.resolved()
+        found += int((resolved.crashed & (resolved.resolved == director.interactions.now)).sum())
+    assert director.interactions.now == 300
+    assert counted == found > 50
+    assert director.selector.fear.fitted
+    state, speeds = torch.zeros(15), np.array([0.0, 0.95])
+    slow, fast = director.risk_map(state, torch.zeros(3), {0: speeds, 1: [0.0]}).probability[0]
+    assert fast > slow + 0.2
+
+
+def test_what_is_executed_is_what_is_learnt(isaac_lab):
+    """Robots that stand whatever they were asked for have pursued a goal of zeros."""
+    torch.manual_seed(0)
+    worlds = isaac_lab(standing=0.5)
+    for _ in range(40):
+        worlds.step()
+    goals = worlds.term.director.interactions.resolved().next_goal
+    standing = (goals == 0).all(1).float().mean().item()
+    assert 0.3 < standing < 0.7

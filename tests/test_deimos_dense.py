@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from short_training import leaves
+from states import leaves
 
 from deimos.goals import methods
 from deimos.goals.interactions import assign

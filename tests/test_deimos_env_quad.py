@@ -10,7 +10,8 @@ from deimos.kernels.legged.height_scan import scan_points
 from deimos.kernels.legged.rewards import RewardWeights
 from deimos.kernels.legged.state import COLUMNS
 from deimos.kernels.random import Purpose
-from quad_worlds import actions, build, build_loop, mask_of, rows_of
+from quad_worlds import actions, build
+from worlds import build_loop, mask_of, rows_of
 
 from deimos.sim.envs.quad import Config
 from deimos.sim.legged import robots

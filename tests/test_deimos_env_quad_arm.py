@@ -1,19 +1,22 @@
 """Quad+arm: the task of the arm on the Go1; what it shares with Quad is shown in test_deimos_env_quad_state.py."""
 
 import dataclasses
+import functools
 import itertools
 import math
 
 import mujoco
 import numpy as np
 import pytest
+import quad_worlds
 import torch
 from deimos.kernels.legged.arm_goals import SHELL_HIGH, SHELL_LOW
 from deimos.kernels.legged.arm_rewards import ARM_TERMS, ArmWeights
 from deimos.kernels.legged.state import COLUMNS
+from worlds import build_loop, rows_of
 
 from deimos import plugins
-from deimos.goals.selectors import cl, director, uniform
+from deimos.goals.selectors import cl, director
 from deimos.run import presets
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim import envs, warp_env
@@ -24,23 +27,7 @@ from deimos.sim.legged.robots import go1_rx150 as rx150
 
 MIDDLE, HALF = (np.array(SHELL_HIGH) + SHELL_LOW) / 2, (np.array(SHELL_HIGH) - SHELL_LOW) / 2
 SCALE = torch.tensor([2.0, 2.0, 0.25, 1.0, 1.0, 1.0])
-
-
-def build(device, num_envs=6, seed=0, env_offset=0, **config):
-    """An environment with short goals and episodes unless told otherwise."""
-    config = {"goal_period": 5, "episode_steps": 40, "engine": "warp"} | config
-    return Config(**config).build(num_envs, device, seed, env_offset)
-
-
-def actions(num_envs, device, seed=0, scale=0.6):
-    """Constant actions, other for every world."""
-    a = np.random.default_rng(seed).normal(scale=scale, size=(num_envs, 17))
-    return torch.tensor(a, dtype=torch.float32, device=device)
-
-
-def rows_of(env):
-    """All rows as an environment takes them."""
-    return torch.arange(env.num_envs, device=env.device)
+actions, build = (functools.partial(make, task="quad-arm") for make in (quad_worlds.actions, quad_worlds.build))
 
 
 def places_of(goals):
@@ -118,7 +105,7 @@ def test_reward_is_the_sum_of_its_columns(torch_device):
     """The arm's columns come last, count before the clip at 0, and all of them sum to the reward and in the report."""
     env = build(torch_device, num_envs=32)
     assert env.columns == (*COLUMNS, *ARM_TERMS)
-    loop = GoalLoop(env, uniform.Config(candidates=3).build(spaces(env), 0))
+    loop = build_loop(env)
     total, clipped = 0.0, 0
     for _ in range(30):
         step = env.step(actions(32, torch_device))

@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from quad_worlds import actions, build, build_loop, rows_of
+from quad_worlds import actions, build
+from worlds import build_loop, rows_of
 
 from deimos.checks import SimulationError
 from deimos.sim.legged.engines import PhysicsConfig

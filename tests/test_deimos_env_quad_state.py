@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from quad_worlds import TASKS, actions, build, build_loop, mask_of, rows_of
-
-from deimos.sim.env import Step
+from quad_worlds import TASKS, actions, build
+from states import assert_same
+from worlds import build_loop, mask_of, rows_of, tensors_of
 
 both = pytest.mark.parametrize("task", TASKS)
 """With an arm or without, a robot keeps what an environment promises."""
@@ -15,18 +15,6 @@ both = pytest.mark.parametrize("task", TASKS)
 def build_on(simulator, **options):
     """The same with an engine, on a device that it knows."""
     return build(simulator.device, engine=simulator.engine, **options)
-
-
-def tensors_of(env, step):
-    """Copies of all that a resume needs and of all that a step gave back."""
-    return env.state_dict() | {name: getattr(step, name).clone() for name in Step.__dataclass_fields__}
-
-
-def assert_equal(found, expected):
-    """Two dictionaries of tensors are the same in every value."""
-    assert found.keys() == expected.keys()
-    for name in expected:
-        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=0, equal_nan=True, msg=name)
 
 
 @both
@@ -102,7 +90,7 @@ def test_resume_is_exact(task, simulator, hills):
     for want in expected:
         step = resumed_env.step(action)
         resumed.advance(step)
-        assert_equal(tensors_of(resumed_env, step), want)
+        assert_same(tensors_of(resumed_env, step), want)
     assert bool((env.tensors["episode_count"] > saved["env"]["episode_count"]).any())
 
 

@@ -13,7 +13,8 @@ from deimos.kernels.legged.step import evaluate_step
 from deimos.terrain import Grid, Share
 from deimos.terrain.shapes.flat import Shape as Flat
 from deimos.terrain.shapes.stairs import Shape as Stairs
-from quad_worlds import actions, build, build_loop, mask_of, rows_of
+from quad_worlds import actions, build
+from worlds import build_loop, mask_of, rows_of
 
 import deimos
 from deimos import terrain

@@ -9,7 +9,7 @@ import pytest
 import torch
 import warp as wp
 from replay import Replay, replay_on_cpu
-from short_training import leaves
+from states import leaves
 
 from deimos.app import console
 from deimos.app.train import ResumeOptions

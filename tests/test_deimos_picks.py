@@ -92,3 +92,9 @@ def test_without_any_weight_every_candidate_is_picked_alike():
     pick = picks.in_proportion(weight, EVENLY)
     assert (pick[::2] == 1).all()
     assert torch.bincount(pick[1::2], minlength=4).tolist() == [125, 125, 125, 125]
+
+
+def test_percentiles_count_ties_half():
+    """A constant score has the percentile 50, the largest of N different ones 100 (N - 1/2) / N."""
+    score = torch.tensor([[3.0, 3.0, 3.0, 3.0], [1.0, 2.0, 3.0, 4.0], [1.0, 1.0, 2.0, 3.0]])
+    assert picks.percentile(score, torch.tensor([3.0, 4.0, 1.0])).tolist() == [50.0, 87.5, 25.0]

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from states import assert_same
 
 import deimos
 from deimos.checks import RunError, SimulationError
@@ -374,22 +375,6 @@ def is_alive(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
-
-
-def assert_same(one, other):
-    """Whether two states are the same, to the last bit; NaN equals itself."""
-    if isinstance(one, torch.Tensor):
-        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
-    elif isinstance(one, dict):
-        assert one.keys() == other.keys()
-        for name in one:
-            assert_same(one[name], other[name])
-    elif isinstance(one, list | tuple):
-        assert len(one) == len(other)
-        for left, right in zip(one, other, strict=True):
-            assert_same(left, right)
-    else:
-        assert one == other or (one != one and other != other)
 
 
 if __name__ == "__main__":

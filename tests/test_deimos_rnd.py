@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from deimos.goals.interactions import Interactions
+from deimos.goals.methods import method
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import rnd
 from deimos.nn import mlps
@@ -61,6 +62,22 @@ def test_scores_are_the_predictors_errors(monkeypatch, kernel):
     with torch.no_grad():
         expected = (selector.predictor(whitened) - selector.target(whitened)).square().mean(2)
     torch.testing.assert_close(selector.surprise(state, goal, candidates), expected, rtol=1e-3, atol=1e-5)
+
+
+def test_raw_rnd_sees_inputs_as_they_are():
+    """Its networks are applied to what it is given, neither whitened nor clipped; by default they are."""
+    for whiten in (False, True):
+        world = World(whiten=whiten)
+        for _ in range(6):
+            world.update()
+        selector, (_, state, goal, candidates, _) = world.selector, world.decision()
+        assert selector.fitted
+        state = 30.0 * state
+        inputs = torch.cat([torch.cat([state, goal], 1).unsqueeze(1).expand(-1, CANDIDATES, -1), candidates], dim=2)
+        error = (selector.predictor(inputs) - selector.target(inputs)).square().mean(2).detach()
+        surprise = selector.surprise(state, goal, candidates)
+        assert torch.allclose(surprise, error, rtol=1e-3, atol=1e-3) != whiten
+    assert method("rnd-raw") == rnd.Config(whiten=False)
 
 
 def test_surprises_fit_the_workspace():

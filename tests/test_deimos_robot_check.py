@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from robot_models import PAGE, write_scout
 
 from deimos import plugins
 from deimos.app import cli
@@ -18,15 +19,13 @@ from deimos.sim.legged import engines, robot_check, robot_draft, robots
 from deimos.sim.legged.engines import PhysicsConfig
 
 HOME = Path(__file__).resolve().parent.parent
-PAGE = HOME / "docs" / "add_a_robot.md"
 
 
 @pytest.fixture
 def page(tmp_path):
     """The page's robot: its MJCF and its data file."""
-    text = PAGE.read_text(encoding="utf-8")
-    (tmp_path / "scout.xml").write_text(re.search(r"```xml\n(.*?)```", text, re.DOTALL)[1])
-    (tmp_path / "scout.toml").write_text(re.search(r"```toml\n(# scout.toml\n.*?)```", text, re.DOTALL)[1])
+    text = re.search(r"```toml\n(# scout.toml\n.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
+    write_scout(tmp_path).with_suffix(".toml").write_text(text)
     return tmp_path
 
 

@@ -13,8 +13,6 @@ from deimos.sim.legged import engines, robots
 from deimos.sim.legged.engines import PhysicsConfig
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1
 
-HFIELD_BIT = 32  # of mujoco-warp's overflow: a geom covered more prisms than are tested
-
 
 @pytest.fixture(scope="module")
 def robot():

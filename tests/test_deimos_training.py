@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 from short_training import CONFIG
+from states import assert_same
 
 import deimos
 from deimos.app import cli
@@ -77,18 +78,6 @@ def rows(path):
 def checkpoint(path):
     """What a run's checkpoint holds."""
     return training.load_checkpoint(RunFolder(path))
-
-
-def assert_same(found, expected, name=""):
-    """Two nested dictionaries are the same in every number, bit for bit, NaN included."""
-    if isinstance(expected, dict):
-        assert found.keys() == expected.keys(), name
-        for key in expected:
-            assert_same(found[key], expected[key], f"{name}/{key}")
-    elif isinstance(expected, torch.Tensor):
-        torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True, msg=name)
-    else:
-        assert found == expected or (found != found and expected != expected), name
 
 
 def assert_same_run(path, expected):

@@ -1,15 +1,19 @@
 """The ensemble of critics: against critics trained one by one, against PPO's own, and how it scores goals."""
 
 import copy
+import dataclasses
 import math
 
 import pytest
 import torch
+from taught_selectors import SPACES, decisions
 from torch import nn
 
+from deimos.goals import picks
 from deimos.goals.interactions import Interactions
+from deimos.goals.methods import method
 from deimos.goals.selector import Spaces
-from deimos.goals.selectors import vds
+from deimos.goals.selectors import uniform, vds
 from deimos.learn.ppo import PPO, PPOConfig
 from deimos.learn.rollout import Rollout
 from deimos.nn.returns import advantages
@@ -241,3 +245,29 @@ def test_it_needs_the_learners_rollout():
     assert math.isnan(
         ensemble(env, data="share").learn(no_interactions(env), random_rollout(env))["vds/deviation"]
     )  # members that saw different worlds have no common value to disagree about
+
+
+def test_uniform_ensemble_differs_from_uniform_in_the_baseline_alone():
+    """Its goals are the ones that Uniform picks, and PPO's baseline is VDS's ensemble."""
+    selector = method("uniform-ensemble").build(SPACES, 0)
+    arguments = decisions(count=200, candidates=1)
+    chosen = selector.propose(*arguments)
+    assert torch.equal(chosen.goal, uniform.Config().build(SPACES, 0).propose(*arguments).goal)
+    assert selector.num_candidates == 1
+    assert selector.critic() is not None
+    assert method("uniform-ensemble") == dataclasses.replace(method("vds"), rule="uniform")
+
+
+def test_vds_argmax_takes_the_largest_deviation():
+    """Of all candidates it takes the one that the critics disagree about most."""
+    selector = method("vds-argmax").build(SPACES, 0)
+    rows, state, goal, options, draws = decisions(count=50)
+    chosen = selector.propose(rows, state, goal, options, draws)
+    inputs = torch.cat([state.unsqueeze(1).expand(-1, 20, -1), options], dim=2)
+    deviation = selector.values(inputs).std(dim=0, correction=0)
+    assert torch.equal(chosen.goal, picks.take(options, deviation.argmax(1)))
+
+
+def test_vds_needs_no_candidates_for_uniform_goals():
+    """The rule is checked, and only ``uniform`` asks for one candidate."""
+    assert [vds.Config(rule=rule).build(SPACES, 0).num_candidates for rule in ("uniform", "argmax")] == [1, 100]

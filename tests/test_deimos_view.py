@@ -15,18 +15,15 @@ from PIL import Image, ImageSequence
 from deimos.app import cli
 from deimos.app.view import ViewOptions, caption
 from deimos.app.viewer_panel import Moment, Panel
-from deimos.app.viewer_scene import BoxScene, RobotScene, build_scene, palette, shades
-from deimos.app.viewer_session import BY_HAND, SIDE, UNIFORM, FearMap, Session, prepare
+from deimos.app.viewer_scene import BoxScene, build_scene
+from deimos.app.viewer_session import BY_HAND, SIDE, UNIFORM, Session, prepare
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy, save_policy
-from deimos.nn.layout import ObsField, goal_components
 from deimos.run import saved
 from deimos.run.fear import load_fear
 from deimos.run.saved import SavedRun
-from deimos.sim.envs.particle import Config
 
 WALK = Path(__file__).parent.parent / "docs" / "results" / "quad_flat"
-ARM = WALK.parent / "quad_arm_stand"
 
 
 @pytest.fixture(scope="module")
@@ -233,72 +230,6 @@ def test_a_new_checkpoint_is_loaded_where_the_worlds_are(scared, tmp_path):
     assert not session.reload()
 
 
-def test_components_have_names_and_units():
-    """Components of a goal are called after its groups, with units, and have the scale that the policy sees."""
-    session = session_of(WALK, worlds=1)
-    assert [component.label for component in session.components] == [
-        "velocity x [m/s]", "velocity y [m/s]", "yaw rate [rad/s]"
-    ]  # fmt: skip
-    assert [component.scale for component in session.components] == [2.0, 2.0, 0.25]
-    low, high = session.bounds()
-    torch.testing.assert_close(high, torch.ones(3))
-    torch.testing.assert_close(low, -torch.ones(3))
-
-
-def test_a_robot_is_shown_where_it_is():
-    """The picture's data are those of the world, the camera follows the base, and a session's step moves it."""
-    session = session_of(WALK, worlds=1)
-    scene = build_scene(session)
-    assert isinstance(scene, RobotScene)
-    assert scene.model.body(scene.body).name == scene.model.body(int(scene.model.jnt_bodyid[0])).name
-    before = scene.data.qpos.copy()
-    for _ in range(10):
-        session.step()
-    scene.update()
-    np.testing.assert_allclose(scene.data.qpos, session.env.tensors["qpos"][0].numpy(), atol=1e-6)
-    assert np.abs(scene.data.qpos - before).max() > 1e-3
-
-
-def ramp(axes=(0, 1)):
-    """A map whose fear grows with its first component."""
-    return FearMap(axes, (-1.0, -1.0), (1.0, 1.0), torch.linspace(0.1, 0.9, SIDE).expand(SIDE, SIDE))
-
-
-def test_tiles_are_brightest_where_fear_is_highest():
-    """Where fear grows with forward velocity, the tiles of fear get brighter along the robot's heading."""
-    session = session_of(WALK, worlds=1)
-    scene = RobotScene(session)
-    w, x, y, z = scene.data.qpos[3:7]
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    tiles = scene.shapes(ramp())
-    assert len(tiles) == 121
-    ahead = [float((tile.pos[:2] - scene.data.qpos[:2]) @ [np.cos(yaw), np.sin(yaw)]) for tile in tiles]
-    brightness = [float(np.sum(tile.rgba[:3])) for tile in tiles]
-    assert np.corrcoef(ahead, brightness)[0, 1] > 0.95
-    assert scene.shapes(ramp((0, 2))) == []  # not over a yaw rate
-    assert scene.shapes(None) == []
-    scene.has_tiles = False
-    assert scene.shapes(ramp()) == []
-
-
-def test_there_are_no_tiles_on_rough_ground():
-    """On another ground than the policy was trained on it acts as well, and there are no tiles of fear."""
-    scene = RobotScene(session_of(WALK, worlds=1, terrain="rough"))
-    assert scene.shapes(ramp()) == []
-    assert scene.model.nhfield == 1
-
-
-def test_an_arm_reaches_for_a_ball():
-    """Where a goal is a place, it is a ball in the picture; goals that fill no box have bounds all the same."""
-    session = session_of(ARM, worlds=1)
-    (ball,) = build_scene(session).shapes(None)
-    np.testing.assert_allclose(ball.pos, session.env.goal_point(0), atol=1e-6)
-    low, high = session.bounds()
-    assert bool((low <= torch.tensor(session.goal) + 0.2).all())
-    assert bool((high <= 1.0 + 1e-5).all())
-    assert bool((low[3:] < high[3:]).all())
-
-
 def test_particles_are_shown_where_they_are(scared):
     """Every particle is where its sketch says, with a goal, a line to it, its velocity, and marks of the crashes."""
     session = session_of(scared, worlds=3)
@@ -346,15 +277,6 @@ def test_what_begins_again_has_no_ends(scared, again, steps):
     scene.update()
     assert scene._ends == scene._trail == []
     assert not scene._velocity.any()
-
-
-def test_colours_span_the_map():
-    """The lowest probability of a map has the darkest colour, the highest the brightest; a level map has one."""
-    shade = shades(ramp())
-    assert (shade.min(), shade.max()) == (0, 255)
-    assert (np.diff(shade[0]) > 0).all()
-    assert set(shades(FearMap((0, 1), (0, 0), (1, 1), torch.full((SIDE, SIDE), 0.3))).ravel().tolist()) == {0}
-    assert (np.diff(palette().sum(axis=1)) > -0.02).all()
 
 
 def test_a_panel_keeps_what_is_asked_for_in_order(scared):
@@ -434,30 +356,3 @@ def test_options_are_checked():
     ):
         with pytest.raises(ValueError, match=message):
             ViewOptions(run=Path("run"), **options)
-
-
-def labels(field, groups=(slice(None),), names=("goal",)):
-    """Names with units of the components of a goal, between other fields."""
-    layout = (ObsField("velocity", 3, "m/s", 1.0), field, ObsField("action", 2, "1", 1.0))
-    return [component.label for component in goal_components(layout, groups, names)]
-
-
-def test_a_goal_of_one_unit_has_it_on_every_component():
-    """A particle's goal has three components of one unit."""
-    env = Config().build(1, torch.device("cpu"), 0)
-    found = goal_components(env.layout, env.goal_groups, env.goal_group_names)
-    assert [component.label for component in found] == ["goal x [u/step]", "goal y [u/step]", "goal z [u/step]"]
-    assert [component.name for component in found] == ["goal x", "goal y", "goal z"]
-
-
-def test_components_are_called_after_their_group():
-    """One alone has the group's name, up to three have letters, more have numbers; groups may stand in any order."""
-    field = ObsField("goal", 4, "m, m, m, rad", (1.0, 2.0, 3.0, 4.0))
-    places = ["place x [m]", "place y [m]", "place z [m]"]
-    assert labels(field, (slice(3, 4), slice(0, 3)), ("turn", "place")) == [*places, "turn [rad]"]
-    assert labels(field) == ["goal 0 [m]", "goal 1 [m]", "goal 2 [m]", "goal 3 [rad]"]
-    assert labels(ObsField("goal", 2, "1", 1.0)) == ["goal x", "goal y"]
-    scales = [component.scale for component in goal_components((field,), (slice(None),), ("goal",))]
-    assert scales == [1.0, 2.0, 3.0, 4.0]
-    with pytest.raises(ValueError, match="The layout has no field named 'goal'"):
-        goal_components((ObsField("velocity", 3, "m/s", 1.0),), (), ())

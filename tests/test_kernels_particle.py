@@ -1,106 +1,11 @@
-"""Point-mass physics, crash test, observation and resets."""
+"""Point-mass physics, crash test and observation."""
 
 import numpy as np
 import pytest
 import warp as wp
-from deimos.kernels.episodes import RESUMED, make_worlds
-from deimos.kernels.particle import (
-    BROKEN,
-    GOAL_START,
-    OBS_DIM,
-    PARTICLES,
-    ParticleParams,
-    reset_particles,
-    step_particles,
-)
-from deimos.kernels.particle_rewards import RewardShape
-from deimos.kernels.random import Purpose
-
-U = 2.0**-24  # relative error of one float32 operation
-VARIANTS = ["absolute", "directional", "relative"]
-VECTORS = PARTICLES.names  # ("position", "velocity", "force")
-COUNTERS = ("goal_clock", "episode_step", "episode_count", "goal_count")
-FLAGS = ("terminated", "truncated", "goal_due", "invalid")
-HALF_SIDE = 1000.0  # [u]
-LARGEST_DISTANCE = {name: np.sqrt(3) * (20.0 if name == "directional" else 2260.0) for name in VARIANTS}
-GOAL_RANGE = {name: 10.0 if name == "directional" else 1250.0 for name in VARIANTS}
-GOAL_SCALE = {name: 0.1 if name == "directional" else 1e-3 for name in VARIANTS}
-
-
-class World:
-    """Particles at rest in the middle, but for what is given, and outputs that no kernel has written yet."""
-
-    def __init__(self, num_envs, device, variant="directional", *, garbage=np.nan, flag=True, values=None, **changes):
-        task = {"goal_period": 100} | {name: changes.pop(name) for name in TASK if name in changes}
-        self.device, self.params = device, ParticleParams()
-        numbers = {
-            "velocity_goals": variant == "directional",
-            "half_side": HALF_SIDE,
-            "max_speed": 10.0,
-            "max_force": 1.0,
-            "spawn_range": 0.0,
-            "position_scale": 1e-3,
-            "velocity_scale": 0.1,
-            "force_scale": 1.0,
-            "reward_shape": int(RewardShape.LINEAR),
-            "reward_length": 2.5,
-            "largest_distance": LARGEST_DISTANCE[variant],
-        }
-        assert numbers.keys() == ParticleParams.vars.keys()
-        for name, value in (numbers | changes).items():
-            setattr(self.params, name, value)
-        scale = self.params.velocity_scale if variant == "directional" else self.params.position_scale
-        self.worlds = make_worlds(
-            num_envs, device, obs_dim=OBS_DIM, action_dim=3, goal_start=GOAL_START, goal_scale=[scale] * 3, **task
-        )
-        self.state = PARTICLES.allocate(device, num_envs=num_envs)
-        for name in ("obs", "reward"):
-            getattr(self.worlds, name).fill_(garbage)
-        for name in FLAGS:
-            getattr(self.worlds, name).fill_(flag)
-        for name, value in (values or {}).items():
-            self.set(name, value)
-        if variant == "relative":
-            self.worlds.origin = wp.from_torch(wp.to_torch(self.state.position))
-
-    def array(self, name):
-        """An array of the state or of the worlds."""
-        return getattr(self.state if name in VECTORS else self.worlds, name)
-
-    def set(self, name, value):
-        """Fill an array with a value for all worlds, or with one for each."""
-        array = self.array(name)
-        dtype = {wp.int32: np.int32, wp.bool: bool}.get(array.dtype, np.float32)
-        array.assign(np.broadcast_to(np.asarray(value, dtype), array.numpy().shape))
-
-    def get(self, name):
-        """An array as NumPy's."""
-        return self.array(name).numpy()
-
-    def step(self, action):
-        """One step."""
-        self.set("action", action)
-        step_particles(self.worlds, self.state, self.params).launch()
-        return self
-
-    def reset(self, mask=True, first_range=None):
-        """Reset the worlds of ``mask``."""
-        self.set("mask", mask)
-        self.set("first_range", GOAL_RANGE["directional"] if first_range is None else first_range)
-        reset_particles(self.worlds, self.state, self.params).launch()
-        return self
-
-    def snapshot(self):
-        """The bytes of everything that a reset may touch, world by world."""
-        return {name: [row.tobytes() for row in self.get(name)] for name in (*VECTORS, *RESUMED)}
-
-
-TASK = ("goal_period", "time_limit", "stagger", "seed", "world_offset")
-
-
-def vectors(value, num_envs):
-    """An array of vectors."""
-    return np.broadcast_to(np.asarray(value, np.float32), (num_envs, 3))
+from deimos.kernels.episodes import RESUMED
+from deimos.kernels.particle import BROKEN, GOAL_START, reset_particles, step_particles
+from particle_arrays import FLAGS, GOAL_RANGE, GOAL_SCALE, HALF_SIDE, LARGEST_DISTANCE, VARIANTS, VECTORS, U, World
 
 
 def on_grid(rng, low, high, size):
@@ -373,76 +278,6 @@ def test_recorded_step_reads_what_is_there_at_its_launch(device):
     np.testing.assert_array_equal(world.get("position"), np.full((2, 3), 0.5))
     launch.launch()
     np.testing.assert_array_equal(world.get("position"), np.full((2, 3), 1.5))
-
-
-@pytest.mark.parametrize("num_envs", [1, 257])
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_reset_matches_reference(device, uniform_reference, variant, num_envs):
-    """Start and first goal are the draws addressed by the world's own number and episode, bit for bit."""
-    rng = np.random.default_rng(seed=num_envs)
-    episode, goal_count = rng.integers(1000, size=(2, num_envs))
-    first_range = np.array([1.0, 0.5, 0.3], np.float32) * np.float32(GOAL_RANGE[variant])
-    values = {"episode_count": episode, "goal_count": goal_count, "goal_clock": 8, "episode_step": 9}
-    values |= dict.fromkeys((*VECTORS, "goal"), np.nan)
-    world = World(num_envs, device, variant, values=values, spawn_range=300.0, seed=77, world_offset=500)
-
-    world.reset(first_range=first_range)
-
-    number = 500 + np.arange(num_envs)
-    spawn = uniform_reference(77, Purpose.RESET, number, episode)[:, :3]
-    first = uniform_reference(77, Purpose.FIRST_GOAL, number, episode)[:, :3]
-    # 2 u - 1 is exact in float32, so only the products round.
-    position = np.float32(2 * spawn - 1) * np.float32(300)
-    goal = np.float32(2 * first - 1) * first_range
-    np.testing.assert_array_equal(world.get("position"), position)
-    np.testing.assert_array_equal(world.get("velocity"), np.zeros((num_envs, 3)))
-    np.testing.assert_array_equal(world.get("force"), np.zeros((num_envs, 3)))
-    np.testing.assert_array_equal(world.get("goal"), goal)
-    np.testing.assert_array_equal(world.get("goal_clock"), 0)
-    np.testing.assert_array_equal(world.get("episode_step"), 0)
-    np.testing.assert_array_equal(world.get("episode_count"), episode + 1)
-    np.testing.assert_array_equal(world.get("goal_count"), goal_count)
-    seen = (goal.astype(np.float64) - (position if variant == "relative" else 0.0)) * GOAL_SCALE[variant]
-    obs = np.concatenate([np.zeros((num_envs, 3)), position / 1000, np.zeros((num_envs, 3)), seen], axis=1)
-    # Three roundings: of the difference, of the scale and of the product with it.
-    np.testing.assert_allclose(world.get("obs"), obs, rtol=3.01 * U, atol=0)
-
-
-def test_reset_leaves_the_others_alone(device):
-    """Worlds outside the mask keep every byte; those inside are made new, even out of NaN."""
-    world = World(4, device, values=dict.fromkeys((*VECTORS, "goal"), np.nan))
-    before = world.snapshot()
-    world.reset([True, False, True, False])
-    after = world.snapshot()
-    for name in before:
-        assert [before[name][i] == after[name][i] for i in (1, 3)] == [True, True]
-    for name in (*VECTORS, "goal", "obs"):
-        assert np.isfinite(world.get(name)[[0, 2]]).all()
-
-
-def test_particles_start_uniformly_in_their_box(device):
-    """Starts and first goals fill their boxes evenly and independently: mean, spread and correlation say so."""
-    n = 2**14
-    world = World(n, device, spawn_range=100.0).reset()
-    x = np.concatenate([world.get("position") / 100.0, world.get("goal") / 10.0], axis=1).astype(np.float64)
-    sigmas = 5.0  # exceeded once in 1.7 million tests
-    assert np.abs(x).max() <= 1.0
-    assert np.all(np.abs(x.mean(axis=0)) < sigmas / np.sqrt(3 * n))  # the variance of a component is 1/3
-    assert np.all(np.abs((x**2).mean(axis=0) - 1 / 3) < sigmas * np.sqrt(4 / 45 / n))  # that of its square 4/45
-    assert np.all(np.abs(np.corrcoef(x.T) - np.eye(6)) < sigmas / np.sqrt(n))
-
-
-def test_reset_works_in_shared_memory(device):
-    """A torch mask written before the launch decides, and torch views see the reset at the same addresses."""
-    world = World(2, device, values={"position": 5.0})
-    chosen, position, obs = (wp.to_torch(world.array(name)) for name in ("mask", "position", "obs"))
-    launch = reset_particles(world.worlds, world.state, world.params)
-    chosen[1] = True
-    launch.launch()
-    for view, name in ((chosen, "mask"), (position, "position"), (obs, "obs")):
-        assert view.data_ptr() == world.array(name).ptr
-    assert position.tolist() == [[5.0] * 3, [0.0] * 3]
-    assert obs.isfinite().all(dim=1).tolist() == [False, True]
 
 
 # A struct refuses another dtype or number of dimensions by itself; the launcher checks the lengths.

@@ -41,7 +41,7 @@ from deimos.sim.legged.robots import go1
 from deimos.sim.shared import one_stream, warp_device
 
 HOME = Path(__file__).resolve().parents[2]
-TESTS = ("test_kernels_*.py", "test_deimos_env_particle.py", "test_deimos_interactions.py", "test_deimos_goal_loop.py")
+TESTS = ("test_kernels_*.py", "test_deimos_env_particle*.py", "test_deimos_interactions.py", "test_deimos_goal_loop.py")
 TOLERANCE = 1e-3  # of observations, CPU against GPU, after the steps below; products and sums round differently
 STEPS = 50
 EAGER_STEPS = 5
