@@ -153,31 +153,6 @@ def load(path):
     return module
 
 
-def test_the_table_of_results_is_that_of_the_rows():
-    """docs/lab/results.md shows what docs/pooled_results.py makes of all 330 policies, and the README its numbers."""
-    program = load(DOCS / "pooled_results.py")
-    table = program.table()
-    assert table.count("\n") == 12
-    assert table in (DOCS / "lab" / "results.md").read_text(encoding="utf-8")
-    cells = {line.split("`")[1]: re.findall(r"[\d.]+(?= \[)", line) for line in table.splitlines()[2:]}
-    readme = (HOME / "README.md").read_text(encoding="utf-8")
-    naive, attacked, _ = map(float, cells["uniform"])
-    assert f"{naive:.1f} % of these, but in {attacked:.0f} % of the Adversary's" in readme
-    assert f"{sum(values[0].size for values in program.read().values())} policies, all of them counted" in readme
-    ends = {
-        line.split("`")[1]: [[float(end) for end in pair] for pair in re.findall(r"\[([\d.]+), ([\d.]+)\]", line)]
-        for line in table.splitlines()[2:]
-    }
-    assert "The Director at p25 cannot be told from uniform goals" in readme
-    assert all(a[0] < b[1] and b[0] < a[1] for a, b in zip(ends["p25"], ends["uniform"], strict=True))
-    assert f"p75 crashes less than half as often under uniform goals, at {cells['p75'][2]} of the score" in readme
-    assert float(cells["p75"][0]) < naive / 2
-    assert "Novelty (RND) is the safest that still follows well" in readme
-    follows = {name for name, own in cells.items() if float(own[2]) >= float(cells["rnd"][2])}
-    assert min(follows, key=lambda name: float(cells[name][1])) == "rnd"
-    assert f"{float(cells['rnd'][1]):.0f} % under the Adversary at {cells['rnd'][2]} of the score" in readme
-
-
 @pytest.mark.parametrize(
     ("text", "found"),
     [
