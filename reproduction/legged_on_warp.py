@@ -4,10 +4,12 @@
     python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp --methods uniform p75 --seeds 1-2
 
 Uniform goals at T2, as ``studies/legged_warp.toml`` has them. The rows are those of an environment of its own,
-``quad_on_warp``, in a folder that ``deimos study merge`` takes.
+``quad_on_warp``, in a folder that ``deimos study merge`` takes. A policy whose row is in the tables of that folder is
+not judged again; the study may have its policies back from its archive (``deimos study unpack``).
 """
 
 import argparse
+import math
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +24,7 @@ from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.shared import one_stream
 from deimos.study.folder import StudyFolder
 from deimos.study.plan import Cell, parse_seeds
-from deimos.study.results import result
+from deimos.study.results import SCHEMA, evaluated, identity
 from deimos.study.source import check_sources
 from reproduction.legged_bases import SHORT
 
@@ -56,14 +58,17 @@ def judge(study: StudyFolder, out: StudyFolder, methods: Collection[str], seeds:
         raise RunError(f"{study.path} holds no finished policies of these methods and seeds.")
     device = torch.device("cpu")
     for cell in cells:
-        check_sources(f"Cell {cell.name}", {"code": cell.sources["code"]}, (), {})
         run, own = RunFolder.open(study.cell_path(cell) / "run"), on_warp(cell)
         out.add([own])
-        home = RunFolder(out.cell_path(own))
-        if not (home.path / "result.json").exists():
+        if not out.finished([own]):
+            check_sources(f"Cell {cell.name}", {"code": cell.sources["code"]}, (), {})
             with one_stream(device):
                 rows = evaluate_run(run, own.config.env, own.config.eval, device, again=False)
-            home.write_json("result.json", result(own, run, rows))
+            # Its training is the study's, which has the curve and the speed: also where the run came from an archive.
+            found = [row | {"fps": math.nan} for row in evaluated(own, run, rows, own.sources["code"])]
+            RunFolder(out.cell_path(own)).write_json(
+                "result.json", {"schema": SCHEMA, "rows": found, "curve": identity(own)}
+            )
         print(own.name, flush=True)
 
 

@@ -1,5 +1,7 @@
 """The bases of the legged studies: trained in two stages, kept once, judged, attacked by what the others taught."""
 
+import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +11,8 @@ from deimos.checks import RunError
 from deimos.run import presets, training
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
+from deimos.study import archive, cli, plan
 from deimos.study import cell as worker
-from deimos.study import plan
 from deimos.study.folder import StudyFolder
 from deimos.study.results import Results, merge
 from reproduction import legged_bases, legged_on_warp
@@ -84,7 +86,10 @@ def test_no_seed_is_used_twice():
 
 
 def test_policies_are_judged_on_the_other_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A finished policy has a row on mujoco-warp, of an environment of its own that merges with the study's tables."""
+    """A finished policy has a row on mujoco-warp, of an environment of its own that merges with the study's tables.
+
+    Where the study's folder was lost, its archive and tables give the same row; where the row is in tables, they do.
+    """
     monkeypatch.setattr(legged_on_warp, "EVALUATION", EvalConfig(worlds=4, steps=200, attackers=()))
     table = {"name": "quad", "env": {"kind": "quad", "goal_period": 100, "engine": "native"}}
     train = {"num_envs": 4, "env_steps": 24, "ppo": {"hidden": [8]}, "device": "cpu",
@@ -104,5 +109,18 @@ def test_policies_are_judged_on_the_other_engine(tmp_path: Path, monkeypatch: py
     assert {row["engine"] for row in RunFolder(study.cell_path(cell) / "run").read_rows("evaluation.json")} == {
         "native", "warp",
     }  # fmt: skip
+    (curve,) = Results.read(tmp_path / "warp").curves
+    assert (curve["crashes_per_1000"], math.isnan(warp["fps"])) == ((), True)  # its training is told once
     with pytest.raises(RunError, match="no finished policies of these methods and seeds"):
         legged_on_warp.judge(study, StudyFolder(tmp_path / "other"), ["uniform"], [])
+
+    lost = StudyFolder(tmp_path / "lost")
+    cli.PackOptions(folder=study.path).run()
+    merge(lost.path, [study.path])
+    shutil.copy2(study.path / archive.FILE, lost.path)
+    archive.unpack(lost)
+    legged_on_warp.judge(lost, StudyFolder(tmp_path / "from_archive"), [], [])
+    assert repr(Results.read(tmp_path / "from_archive")) == repr(Results.read(tmp_path / "warp"))
+    merge(tmp_path / "tables", [tmp_path / "warp"])
+    monkeypatch.setattr(legged_on_warp, "evaluate_run", None)
+    legged_on_warp.judge(lost, StudyFolder(tmp_path / "tables"), [], [])
