@@ -9,7 +9,6 @@ not judged again; the study may have its policies back from its archive (``deimo
 """
 
 import argparse
-import math
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.shared import one_stream
 from deimos.study.folder import StudyFolder
 from deimos.study.plan import Cell, parse_seeds
-from deimos.study.results import SCHEMA, evaluated, identity
+from deimos.study.results import SCHEMA, Results, Row, evaluated, identity
 from deimos.study.source import check_sources
 from reproduction.legged_bases import SHORT
 
@@ -64,12 +63,19 @@ def judge(study: StudyFolder, out: StudyFolder, methods: Collection[str], seeds:
             check_sources(f"Cell {cell.name}", {"code": cell.sources["code"]}, (), {})
             with one_stream(device):
                 rows = evaluate_run(run, own.config.env, own.config.eval, device, again=False)
-            # Its training is the study's, which has the curve and the speed: also where the run came from an archive.
-            found = [row | {"fps": math.nan} for row in evaluated(own, run, rows, own.sources["code"])]
-            RunFolder(out.cell_path(own)).write_json(
-                "result.json", {"schema": SCHEMA, "rows": found, "curve": identity(own)}
-            )
+            write(study, cell, out, own, evaluated(own, run, rows, own.sources["code"]))
         print(own.name, flush=True)
+
+
+def write(study: StudyFolder, cell: Cell, out: StudyFolder, own: Cell, rows: list[Row]) -> None:
+    """Write the result of a policy on mujoco-warp; its training is as the study tells it.
+
+    The run itself may have come from an archive, without its training curve.
+    """
+    trained = Results.of_cell(study.cell_path(cell))
+    found = [row | {"fps": trained.rows[0]["fps"]} for row in rows]
+    curve = trained.curves[0] | identity(own)
+    RunFolder(out.cell_path(own)).write_json("result.json", {"schema": SCHEMA, "rows": found, "curve": curve})
 
 
 def main() -> None:
