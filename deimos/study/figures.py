@@ -76,7 +76,7 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) ->
 def instead(axes: "Axes", text: str) -> None:
     """Say in the place of a panel why it is empty."""
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, color="#555555")
-    axes.set_yticks([])
+    axes.tick_params(axis="y", left=False, labelleft=False)  # its own: others may share the axis
 
 
 def as_rates(axes: "Axes", which: Literal["x", "y"], label: str) -> None:
