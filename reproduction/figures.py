@@ -77,6 +77,8 @@ def dose_response(data: Data, environment: str, period: int, shifted: Sequence[R
             outcomes.over_dose(left, data, where, name, metric)
         if not names:
             instead(left, "delivered dose:\nnot recorded")
+        elif not left.lines:
+            instead(left, outcomes.NOBODY)
         _over_shift(right, shifted, "score" if metric == "score" else "crash_rate")
         for panel in (left, right):
             panel.grid(alpha=0.3)

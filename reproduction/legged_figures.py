@@ -7,7 +7,7 @@ import numpy as np
 
 from deimos.study import outcomes
 from deimos.study.data import Data, Where
-from deimos.study.figures import CAVEAT, WIDTH, WINDOW, Figures, as_rates, rolling, subplots
+from deimos.study.figures import CAVEAT, WIDTH, WINDOW, Figures, as_rates, instead, rolling, subplots
 from reproduction.legged_contrasts import NAIVE, OUTCOMES, REFERENCE, WORST, contrasts
 from reproduction.measures import SCORE, Evidence, Place
 
@@ -30,6 +30,7 @@ TRAINING = "every line is a base, in grey Uniform's of the same bases; rolling m
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")  # Okabe and Ito's
 _MARKERS = "osD^vP"
 _COLUMNS = 5
+LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
 def figures(data: Data, environment: str) -> Figures:
@@ -88,7 +89,7 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
 def _lines(axes: "Axes", values: np.ndarray) -> None:
     """A line for each base through the methods that it has, and a bar at each method's mean; shape (bases, methods)."""
     if np.isnan(values).all():
-        axes.text(0.5, 0.5, "nobody attacked", ha="center", va="center", transform=axes.transAxes, color="#555555")
+        instead(axes, outcomes.NOBODY)
     for i, own in enumerate(values):
         known = np.flatnonzero(~np.isnan(own))
         axes.plot(known, own[known], color=_COLOURS[i % 6], marker=_MARKERS[i % 6], markersize=4, linewidth=0.9)
@@ -128,6 +129,8 @@ def differences(data: Data, environment: str, period: int) -> "Figure | None":
 
 def training(data: Data, environment: str) -> "Figure | None":
     """Crashes and reward during training, a panel for each method, a line for each base."""
+    from matplotlib.ticker import MaxNLocator
+
     methods = [name for name in _methods(data, environment) if data.curves(environment, name)]
     if not methods:
         return None
@@ -145,13 +148,17 @@ def training(data: Data, environment: str) -> "Figure | None":
             _curves(panel, data, environment, name, column, _COLOURS)
             panel.grid(alpha=0.3)
         top.set_title(name)
-        top.set_yscale("symlog", linthresh=0.1)
+        top.set_yscale("symlog", linthresh=LINEAR)
         top.yaxis.set_major_formatter("{x:g}")
         if index + columns >= len(methods):  # nothing below
             bottom.tick_params(labelbottom=True)
             bottom.set_xlabel("steps of every world")
     for which, label in enumerate(("crashes per 1000\ntransitions", "mean reward\nper transition")):
         _share_limits(axes[which::2], label)
+    for panel in axes[::2].flat:
+        low, high = panel.get_ylim()
+        if high < 10 * max(low, LINEAR):  # powers of ten would be one tick or none
+            panel.yaxis.set_major_locator(MaxNLocator(4))
     _legend(figure, bases(data, environment))
     return figure
 

@@ -4,7 +4,8 @@
     python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp --methods uniform p75 --seeds 1-2
 
 Uniform goals at T2, as ``studies/legged_warp.toml`` has them. The rows are those of an environment of its own,
-``quad_on_warp``, in a folder that ``deimos study merge`` takes.
+``quad_on_warp``, in a folder that ``deimos study merge`` takes. A policy whose row is in the tables of that folder is
+not judged again; the study may have its policies back from its archive (``deimos study unpack``).
 """
 
 import argparse
@@ -22,7 +23,7 @@ from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.shared import one_stream
 from deimos.study.folder import StudyFolder
 from deimos.study.plan import Cell, parse_seeds
-from deimos.study.results import result
+from deimos.study.results import SCHEMA, Results, Row, evaluated, identity
 from deimos.study.source import check_sources
 from reproduction.legged_bases import SHORT
 
@@ -56,15 +57,25 @@ def judge(study: StudyFolder, out: StudyFolder, methods: Collection[str], seeds:
         raise RunError(f"{study.path} holds no finished policies of these methods and seeds.")
     device = torch.device("cpu")
     for cell in cells:
-        check_sources(f"Cell {cell.name}", {"code": cell.sources["code"]}, (), {})
         run, own = RunFolder.open(study.cell_path(cell) / "run"), on_warp(cell)
         out.add([own])
-        home = RunFolder(out.cell_path(own))
-        if not (home.path / "result.json").exists():
+        if not out.finished([own]):
+            check_sources(f"Cell {cell.name}", {"code": cell.sources["code"]}, (), {})
             with one_stream(device):
                 rows = evaluate_run(run, own.config.env, own.config.eval, device, again=False)
-            home.write_json("result.json", result(own, run, rows))
+            write(study, cell, out, own, evaluated(own, run, rows, own.sources["code"]))
         print(own.name, flush=True)
+
+
+def write(study: StudyFolder, cell: Cell, out: StudyFolder, own: Cell, rows: list[Row]) -> None:
+    """Write the result of a policy on mujoco-warp; its training is as the study tells it.
+
+    The run itself may have come from an archive, without its training curve.
+    """
+    trained = Results.of_cell(study.cell_path(cell))
+    found = [row | {"fps": trained.rows[0]["fps"]} for row in rows]
+    curve = trained.curves[0] | identity(own)
+    RunFolder(out.cell_path(own)).write_json("result.json", {"schema": SCHEMA, "rows": found, "curve": curve})
 
 
 def main() -> None:

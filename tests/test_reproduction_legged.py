@@ -1,5 +1,6 @@
 """The bases of the legged studies: trained in two stages, kept once, judged, attacked by what the others taught."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +10,10 @@ from deimos.checks import RunError
 from deimos.run import presets, training
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
+from deimos.study import archive, cli, plan
 from deimos.study import cell as worker
-from deimos.study import plan
 from deimos.study.folder import StudyFolder
-from deimos.study.results import Results, merge
+from deimos.study.results import TABLES, Results, merge
 from reproduction import legged_bases, legged_on_warp
 
 SETTINGS = {"quad": ("rough", 500), "quad_arm": ("flat", 100)}
@@ -84,7 +85,10 @@ def test_no_seed_is_used_twice():
 
 
 def test_policies_are_judged_on_the_other_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A finished policy has a row on mujoco-warp, of an environment of its own that merges with the study's tables."""
+    """A finished policy has a row on mujoco-warp, of an environment of its own that merges with the study's tables.
+
+    Where the study's folder was lost, its archive and tables give the same row; where the row is in tables, they do.
+    """
     monkeypatch.setattr(legged_on_warp, "EVALUATION", EvalConfig(worlds=4, steps=200, attackers=()))
     table = {"name": "quad", "env": {"kind": "quad", "goal_period": 100, "engine": "native"}}
     train = {"num_envs": 4, "env_steps": 24, "ppo": {"hidden": [8]}, "device": "cpu",
@@ -104,5 +108,21 @@ def test_policies_are_judged_on_the_other_engine(tmp_path: Path, monkeypatch: py
     assert {row["engine"] for row in RunFolder(study.cell_path(cell) / "run").read_rows("evaluation.json")} == {
         "native", "warp",
     }  # fmt: skip
+    curves = Results.read(tmp_path / "all").curves
+    assert curves[0]["crashes_per_1000"] == curves[1]["crashes_per_1000"] != ()  # one training
     with pytest.raises(RunError, match="no finished policies of these methods and seeds"):
         legged_on_warp.judge(study, StudyFolder(tmp_path / "other"), ["uniform"], [])
+
+    lost = StudyFolder(tmp_path / "lost")
+    cli.PackOptions(folder=study.path).run()
+    merge(lost.path, [study.path])
+    shutil.copy2(study.path / archive.FILE, lost.path)
+    archive.unpack(lost)
+    legged_on_warp.judge(lost, StudyFolder(tmp_path / "from_archive"), [], [])
+    for name in ("from_archive", "warp"):
+        merge(tmp_path / f"{name}_tables", [tmp_path / name])
+    kept = StudyFolder(tmp_path / "warp_tables")
+    for name in TABLES:
+        assert (tmp_path / "from_archive_tables" / name).read_bytes() == (kept.path / name).read_bytes()
+    monkeypatch.setattr(legged_on_warp, "evaluate_run", None)
+    legged_on_warp.judge(lost, kept, [], [])

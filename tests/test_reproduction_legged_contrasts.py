@@ -13,12 +13,13 @@ from deimos.run.evaluation import EvalConfig
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import particle
 from deimos.study import cell as worker
+from deimos.study import outcomes as study_outcomes
 from deimos.study import plan, stats
 from deimos.study.data import Data, Where
 from deimos.study.folder import StudyFolder
 from deimos.study.report import outcomes
-from deimos.study.results import merge
-from reproduction import claim_tests, legged_bases, legged_contrasts, legged_figures, report
+from deimos.study.results import Results, merge
+from reproduction import claim_tests, figures, legged_bases, legged_contrasts, legged_figures, report
 from reproduction.measures import SCORE, Evidence, Place
 
 QUAD = Place("quad", 100)
@@ -230,3 +231,29 @@ def test_pictures_show_every_policy(tables):
     curves = legged_figures.training(data, "quad").axes
     own = {len(panel.lines) for panel in curves if panel.get_visible()}
     assert own == {BASES, 2 * BASES}  # Uniform's own panels, and those with Uniform in grey behind
+
+
+@pytest.mark.parametrize("crashes", [(2.2, 4.5), (0.3, 0.5), (0.02, 40.0)])
+def test_axes_of_trainings_have_numbers(tables, crashes):
+    """However narrow the range of the crashes is, the axis has two numbers or more."""
+    data = Data.read(tables)
+    for row in data.curve_rows:
+        row["crashes_per_1000"] = tuple(np.geomspace(*crashes, len(row["env_steps"])))
+    for panel in legged_figures.training(data, "quad").axes[: len(METHODS)]:
+        low, high = panel.get_ylim()
+        assert sum(low <= tick <= high for tick in panel.get_yticks()) >= 2
+
+
+def test_pictures_say_where_nobody_attacked(tables):
+    """Panels of attacks say so where there were none, and scores over the dose keep their numbers."""
+    found = Results.read(tables)
+    rows = [row for row in found.rows if row["goals"] == "naive"]
+    alone = Results(rows, [row | {"goal_percentile": (50.0,) * len(row["env_steps"])} for row in found.curves])
+    alone.find_worst()
+    data = Data(alone)
+    pictures = figures.dose_response(data, "quad", 100, []), study_outcomes.profiles(data, "quad", 100)
+    said = [[text.get_text() for panel in figure.axes for text in panel.texts] for figure in pictures]
+    assert [texts.count(study_outcomes.NOBODY) for texts in said] == [1, len(data.style.panels)]
+    score = pictures[0].axes[0]
+    assert len(score.get_yticks()) > 1
+    assert score.yaxis.get_tick_params()["labelleft"]

@@ -16,7 +16,7 @@ from deimos.run.attack import attacker
 from deimos.run.evaluation import EvalConfig, make_target
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs import particle
-from reproduction import attackers_table, particle_pool, pilots
+from reproduction import attackers_table, legged_bases, particle_pool, pilots
 from reproduction.pilots import Pilot, choose, means, sizes
 from reproduction.runs import finished
 
@@ -167,17 +167,22 @@ CHECKSUMS = dict(line.split()[::-1] for line in (particle_pool.POOL / "SHA256SUM
 
 
 @pytest.mark.parametrize("name", list(CHECKSUMS))
-def test_committed_pools_attack_the_default_environment(name):
-    """The file of a variant is what its checksum says, small, and makes an informed attacker of its environment."""
+def test_committed_pools_are_informed(name):
+    """The file of a variant or of a base is what its checksum says, small, and informs an attacker of its worlds."""
     path = particle_pool.POOL / name
     assert hashlib.sha256(path.read_bytes()).hexdigest() == CHECKSUMS[name]
     assert path.stat().st_size < 200_000
-    config = particle_pool.VARIANTS[path.stem].env
-    target = make_target(lambda obs: torch.zeros(len(obs), 3), config, replace(TINY, pool=path), CPU)
+    robot, _, number = path.stem.partition("_base_")
+    if number:
+        bases = legged_bases.ROBOTS[robot]
+        config = legged_bases.base_config(bases, len(bases.stages) - 1, int(number) - 1)
+    else:
+        config = particle_pool.VARIANTS[robot]
+    target = make_target(lambda obs: obs, config.env, replace(TINY, pool=path), CPU)  # nobody acts
     attack = attacker("pooled").prepare(target)
     assert not attack.facts["uninformed"]
-    assert attack.facts["adversary_crashes"] > 1000
-    assert attack.facts["adversary_auroc"] > 0.8
+    assert attack.facts["adversary_crashes"] > (0 if number else 1000)  # few policies that walk teach a base's
+    assert attack.facts["adversary_auroc"] > (0.5 if number else 0.8)
 
 
 def test_pool_is_made_of_balanced_policies(tmp_path, monkeypatch):

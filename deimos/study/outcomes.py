@@ -10,7 +10,7 @@ import numpy as np
 from deimos.study import figures, stats
 from deimos.study.audits import diversity
 from deimos.study.data import Data, Style, Where
-from deimos.study.figures import WIDTH, Figures, as_rates, legend, line, subplots
+from deimos.study.figures import WIDTH, Figures, as_rates, instead, legend, line, subplots
 from deimos.study.stats import Array
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SAFE = 1.0  # [%] of interactions: safe policies crash in fewer, under the worst attacker
+NOBODY = "nobody attacked"
 BOXES = (
     "every point is a policy; boxes are quartiles, whiskers 1.5 times their range; n policies. The dotted line is 1 % "
     "of interactions."
@@ -32,9 +33,9 @@ DOSE = (
     "Uniform's. Every dot is a policy, every large marker the medians of a method."
 )
 MAPS = (
-    "where goals were in the last quarter of training (up), given the place of the world (across), axis by axis, "
-    "-1 and 1 being the walls. The number is the diversity of goals: their entropy given the place, 1 where they are "
-    "uniform, 0 where the place says the goal."
+    "where goals were in the last quarter of training (up), given the place of the world (across), or the goal before "
+    "where goals are no places, axis by axis, from one end of the range to the other. The number is the diversity of "
+    "goals: their entropy given the place, 1 where they are uniform, 0 where the place says the goal."
 )
 MOST_LEVELS = 6
 LEVELS = (
@@ -206,6 +207,9 @@ def profiles(data: Data, environment: str, period: int) -> "Figure | None":
                     line(panel, data.style, name, thresholds, share, band, every=12, alpha=0.1, step="post")
             panel.grid(alpha=0.3)
             panel.set_title(f"{title}, under {each.by}")
+        if not any(panel.lines for panel in row):
+            for panel in row:
+                instead(panel, NOBODY)
     for panel in axes[1]:
         as_rates(panel, "x", "crashes per interaction [%]")
     for panel in axes[:, 0]:
