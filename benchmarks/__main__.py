@@ -49,6 +49,7 @@ class BenchOptions:
             "engines",
             "engine-training",
             "stability",
+            "builds",
             "terrain",
             "director",
             "learner",
@@ -104,6 +105,10 @@ def run(options: BenchOptions) -> dict[str, Any]:
     if options.what == "viewer":
         results["viewer"] = viewer.measure(options.rounds)
         viewer.show(results["viewer"])
+        return _write(results, options.json)
+    if options.what == "builds":
+        results["memory"] = stability.measure_builds()
+        print("MiB after each build:", *map(round, results["memory"]))
         return _write(results, options.json)
     if options.what == "learner":
         results["learner"] = learner.measure(options.rounds)

@@ -14,6 +14,7 @@ from deimos.goals.selectors import uniform
 from deimos.learn.policy import load_policy
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.presets import preset
+from deimos.sim.envs import quad
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.task import Locomotion
 
@@ -21,6 +22,7 @@ WALKER = Path(__file__).parent.parent / "docs" / "results" / "quad_flat"
 WORLDS, WORLD_STEPS = 1024, 10_000_000
 EXPLORATION = 0.5  # deviation of the noise on actions, about that of a policy halfway through its training
 REPORTS = 20  # of memory and levels
+BUILDS, ROBOTS = 10, 8
 
 
 @torch.no_grad()
@@ -60,6 +62,15 @@ def measure(device: torch.device, world_steps: int = WORLD_STEPS, num_envs: int 
         "invalid_share": invalid / (steps * num_envs), "crashes": crashes, "seconds": time.perf_counter() - begin,
         "mean_level": levels, "memory": memory,
     }  # fmt: skip
+
+
+def measure_builds(count: int = BUILDS) -> list[float]:
+    """Memory of this process [MiB] after each of many environments on rough ground that are made and dropped."""
+    config, memory = quad.Config(terrain="rough"), []
+    for _ in range(count):
+        config.build(ROBOTS, torch.device("cpu"), seed=0)
+        memory.append(_memory())
+    return memory
 
 
 def _memory() -> float:

@@ -30,6 +30,17 @@ def from_triangles(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     return Trimesh(vertices, faces, process=False, validate=False)
 
 
+def take_apart(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a mesh that nobody uses any more; all else of it is freed.
+
+    A mesh of trimesh's and its helpers (cache, colours, rays) hold each other, so that it would keep its arrays until
+    Python searches for cycles, which no array, however large, brings about.
+    """
+    parts = mesh.vertices, mesh.faces
+    vars(mesh).clear()
+    return parts
+
+
 def sheet(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
     """A surface through a lattice of points.
 

@@ -12,7 +12,7 @@ from deimos.checks import check_at_least, check_positive, check_range
 from . import catalog
 from .grid import Terrain, cells, on_ground
 from .heightfield import rasterise
-from .mesh import Mesh, from_quads, from_triangles
+from .mesh import Mesh, from_quads, from_triangles, take_apart
 from .shape import TileShape
 
 Progress = Callable[[str, float], None]
@@ -121,7 +121,9 @@ class Grid:
 
 def build(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> Terrain:
     """Make a world; see ``build_with_mesh``."""
-    return build_with_mesh(grid, device=device, progress=progress)[0]
+    terrain, mesh = build_with_mesh(grid, device=device, progress=progress)
+    take_apart(mesh)
+    return terrain
 
 
 def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> tuple[Terrain, Mesh]:
@@ -159,14 +161,13 @@ def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
     for level, difficulty in enumerate(grid.difficulty):
         for column, shape in enumerate(grid.column_shapes):
             seed = np.random.SeedSequence(grid.seed, spawn_key=(level, column))
-            tile = shape.build(float(difficulty), np.random.default_rng(seed))
-            tile.vertices += centres[level, column]
-            parts.append(tile)
+            vertices, faces = take_apart(shape.build(float(difficulty), np.random.default_rng(seed)))
+            parts.append((vertices + centres[level, column], faces))
         if progress is not None:
             progress("tiles", (level + 1) / grid.levels)
     if grid.border > 0:
-        parts.append(_border(grid))
-    return from_triangles(*append_faces([part.vertices for part in parts], [part.faces for part in parts]))
+        parts.append(take_apart(_border(grid)))
+    return from_triangles(*append_faces(*zip(*parts, strict=True)))
 
 
 def require_memory(num_samples: tuple[int, int], need: int, name: str, cell: float) -> None:

@@ -157,6 +157,15 @@ def test_stability_is_measured(capsys, monkeypatch):
         stability.measure(CPU, 1000, num_envs=20)
 
 
+def test_memory_after_builds_is_measured(monkeypatch, capsys):
+    """The process's memory is read after every environment on rough ground that was made and dropped."""
+    monkeypatch.setattr(stability, "measure_builds", partial(stability.measure_builds, 2))
+    found = benchmarks.run(benchmarks.BenchOptions(what="builds", device="cpu", threads=1))["memory"]
+    assert len(found) == 2
+    assert min(found) > 100
+    assert "MiB after each build: " + " ".join(f"{value:.0f}" for value in found) in capsys.readouterr().out
+
+
 def test_quad_is_measured(capsys):
     """A legged environment is timed beside the bare simulator, on flat and on rough ground."""
     result = quad.measure_env("quad", CPU, 1, num_envs=2)

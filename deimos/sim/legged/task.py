@@ -42,7 +42,7 @@ from deimos.sim.legged import engines
 from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.engines import Physics
 from deimos.sim.legged.engines.captured import Captured
-from deimos.sim.legged.goal_parts import GoalPart
+from deimos.sim.legged.goal_parts import GoalPart, Launches
 from deimos.sim.legged.robots import Robot
 from deimos.sim.shared import warp_device
 from deimos.sim.warp_env import WarpEnv
@@ -185,30 +185,30 @@ class Locomotion(WarpEnv):
         })  # fmt: skip
 
     def _begin(self) -> None:
-        """Record step and reset, each as one graph, and begin every world's first episode."""
-        rows = self.physics.parts
+        """Record step and reset, each as one graph, and begin every world's first episode.
+
+        What is recorded knows the memory that it works on and not the environment, which keeps it: so the environment
+        is freed with the last reference to it, and does not wait for Python's search for cycles.
+        """
+        legged, launches, rows = self.legged, self._launches, self.physics.parts
         faults = wp.zeros((len(rows), 3), dtype=wp.int32, device=self.worlds.fault.device)
-        evaluate = [partial(self._finish_step, self.legged.rows(part, faults[i]), part) for i, part in enumerate(rows)]
-        run_step = self.physics.record_step(partial(apply_actions, self.legged), evaluate)
+        evaluate = [partial(_finish_step, legged.rows(part, faults[i]), launches, part) for i, part in enumerate(rows)]
+        run_step = self.physics.record_step(partial(apply_actions, legged), evaluate)
         gather_faults = self._gather(wp.to_torch(faults))
+        sums, term = self._sums, self.term
 
         def step() -> None:
             run_step()
             gather_faults()
-            self._sums += self.term.sum(0)
+            sums.add_(term.sum(0))
 
-        validations = [part.validate for part in self._launches if part.validate]
+        validations = [part.validate for part in launches if part.validate]
         if len(validations) > 1:
             raise ValueError(f"At most one part may restrict which goals are valid, got {len(validations)}.")
         valid_goals = partial(validations[0], self._row.array, self._candidate_scale.array) if validations else None
-        self.begin(step, Captured(self._run_reset, self.device), valid_goals=valid_goals)
+        run_reset = partial(_run_reset, legged, launches, self.physics)
+        self.begin(step, Captured(run_reset, self.device), valid_goals=valid_goals)
         self.physics.report()  # what the recording needed says nothing about these worlds
-
-    def _finish_step(self, worlds: LeggedWorlds, rows: slice) -> None:
-        for part in self._launches:
-            part.evaluate(worlds, rows)
-        evaluate_step(worlds)
-        finish_obs(worlds, worlds.worlds.invalid, wanted=False)
 
     def _gather(self, faults: Tensor) -> Callable[[], None]:
         """What joins the faults of parts, shape (parts, 3), to those of all worlds."""
@@ -223,14 +223,6 @@ class Locomotion(WarpEnv):
             faults.copy_(nothing)
 
         return gather
-
-    def _run_reset(self) -> None:
-        update_levels(self.legged)
-        self.physics.reset(self.worlds.mask)
-        reset_worlds(self.legged)
-        for part in self._launches:
-            part.reset()
-        finish_obs(self.legged, self.worlds.mask, wanted=True)
 
     @property
     def action_range(self) -> tuple[Tensor, Tensor]:
@@ -335,6 +327,25 @@ class Locomotion(WarpEnv):
         """See ``Env.goal_point``."""
         places = [part.points for part in self._launches if part.points]
         return places[0]()[world] if places else None
+
+
+def _finish_step(legged: LeggedWorlds, launches: Sequence[Launches], rows: slice) -> None:
+    """Launch what follows a step of the simulator, in some of the worlds: ``legged`` is theirs alone."""
+    for part in launches:
+        part.evaluate(legged, rows)
+    evaluate_step(legged)
+    finish_obs(legged, legged.worlds.invalid, wanted=False)
+
+
+def _run_reset(legged: LeggedWorlds, launches: Sequence[Launches], physics: Physics) -> None:
+    """Launch the reset of the worlds of the mask."""
+    mask = legged.worlds.mask
+    update_levels(legged)
+    physics.reset(mask)
+    reset_worlds(legged)
+    for part in launches:
+        part.reset()
+    finish_obs(legged, mask, wanted=True)
 
 
 def _require_room(ground: Terrain) -> None:
