@@ -113,7 +113,7 @@ def training(data: Data, environment: str) -> "Figure | None":
         top.set_yscale("symlog", linthresh=0.1)
         top.set_ylim(bottom=0)
         top.yaxis.set_major_formatter("{x:g}")
-        _strips(strip, data, environment, own[title], known)
+        _strips(strip, data, environment, own[title], known, most)
     axes[0, 0].set_ylabel("crashes per 1000\ntransitions")
     axes[1, 0].set_ylabel("mean reward\nper transition")
     legend(figure, data.style, found, "below")
@@ -130,10 +130,10 @@ def unfitted(data: Data, environment: str, method: str) -> Array | None:
     return 1.0 - np.mean([curve[:length] for curve in curves], axis=0) if length else None
 
 
-def _strips(axes: "Axes", data: Data, environment: str, names: Sequence[str], known: bool) -> None:
+def _strips(axes: "Axes", data: Data, environment: str, names: Sequence[str], known: bool, rows: int) -> None:
     """A strip for each method with a fear network, dark where the networks of its policies did not learn.
 
-    ``known`` says whether that was recorded of any method.
+    ``known`` says whether that was recorded of any method; there is room for as many ``rows``, as beside it.
     """
     found = {name: shares for name in names if (shares := unfitted(data, environment, name)) is not None}
     if not found:
@@ -143,8 +143,8 @@ def _strips(axes: "Axes", data: Data, environment: str, names: Sequence[str], kn
         steps = data.curves(environment, name, "env_steps")[0][: len(shares)]
         edges = np.concatenate([[0.0], steps])
         axes.pcolormesh(edges, [row - 0.4, row + 0.4], shares[None], cmap="Greys", vmin=0, vmax=1.2, rasterized=True)
-        axes.text(1.01, row, name, transform=axes.get_yaxis_transform(), va="center", fontsize=7)
-    axes.set_ylim(len(found) - 0.4, -0.6)
+        axes.text(1.01, row, name, transform=axes.get_yaxis_transform(), va="center", fontsize=6.5)
+    axes.set_ylim(rows - 0.4, -0.6)
     axes.set_yticks([])
     axes.set_ylabel("fear did\nnot learn")
 
@@ -182,7 +182,8 @@ def legend(
                markeredgecolor="black", markeredgewidth=0.4, label=name)
         for name in methods
     ]  # fmt: skip
-    where = {"loc": "outside right center"} if place == "beside" else {"loc": "outside lower center", "ncols": 7}
+    columns = int(WIDTH / (0.45 + 0.055 * max(map(len, methods), default=1)))  # [inch] of a handle and of a letter
+    where = {"loc": "outside right center"} if place == "beside" else {"loc": "outside lower center", "ncols": columns}
     figure.legend(handles=handles, frameon=False, **where)
 
 
