@@ -15,7 +15,7 @@ import numpy as np
 
 from deimos.study import stats
 from deimos.study.data import Data, Style
-from deimos.study.figures import WIDTH, print_size, subplots, write
+from deimos.study.figures import WIDTH, print_size, subplots
 from deimos.study.stats import Array, Interval
 from reproduction.figures import STYLE
 from reproduction.hypotheses import CHOOSING, TESTING, VARIANTS, samples
@@ -86,8 +86,10 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("out", type=Path)
     options = parser.parse_args()
-    with print_size():
-        write({NAME: ("", draw(Data.read(options.folder, STYLE)))}, options.out)
+    import matplotlib
+
+    with print_size(), matplotlib.rc_context({"svg.hashsalt": NAME}):  # the same file from the same data
+        draw(Data.read(options.folder, STYLE)).savefig(options.out / f"{NAME}.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
