@@ -69,5 +69,5 @@ def test_the_page_quotes_the_hypotheses(evidence):
         *[f"| {each.corrected:.1g} | {100 * each.detectable:.1f} |" for each in answers[:2]],
         "{:.2f} points a percentile [{:.2f}, {:.2f}]".format(*percent[2]),
         f"| {answers[2].corrected:.1g} | {100 * answers[2].detectable:.2f} |",
-        "at {:.2f} of the score".format(float(answers[1].note.split()[3])),
+        f"at {float(answers[1].note.split()[3]):.2f} of the score",
     ], PAGE)  # fmt: skip
