@@ -73,12 +73,10 @@ def dose_response(data: Data, environment: str, period: int, shifted: Sequence[R
     figure, axes = subplots(2, 2, (WIDTH, 4.8), sharex=True, sharey="row")
     places = (Where(environment, "naive", period), "score"), (hard.where, hard.metric)
     for (left, right), (where, metric) in zip(axes, places, strict=True):
-        for name in names:
-            outcomes.over_dose(left, data, where, name, metric)
-        if not names:
+        if names:
+            outcomes.over_dose(left, data, where, names, metric)
+        else:
             instead(left, "delivered dose:\nnot recorded")
-        elif not left.lines:
-            instead(left, outcomes.NOBODY)
         _over_shift(right, shifted, "score" if metric == "score" else "crash_rate")
         for panel in (left, right):
             panel.grid(alpha=0.3)

@@ -19,7 +19,7 @@ from deimos.study.data import Data, Where
 from deimos.study.folder import StudyFolder
 from deimos.study.report import outcomes
 from deimos.study.results import Results, merge
-from reproduction import claim_tests, figures, legged_bases, legged_contrasts, legged_figures, report
+from reproduction import claim_tests, legged_bases, legged_contrasts, legged_figures, report
 from reproduction.measures import SCORE, Evidence, Place
 
 QUAD = Place("quad", 100)
@@ -251,7 +251,7 @@ def test_pictures_say_where_nobody_attacked(tables):
     alone = Results(rows, [row | {"goal_percentile": (50.0,) * len(row["env_steps"])} for row in found.curves])
     alone.find_worst()
     data = Data(alone)
-    pictures = figures.dose_response(data, "quad", 100, []), study_outcomes.profiles(data, "quad", 100)
+    pictures = study_outcomes.dose(data, "quad", 100), study_outcomes.profiles(data, "quad", 100)
     said = [[text.get_text() for panel in figure.axes for text in panel.texts] for figure in pictures]
     assert [texts.count(study_outcomes.NOBODY) for texts in said] == [1, len(data.style.panels)]
     score = pictures[0].axes[0]

@@ -1,7 +1,7 @@
 """What came out, drawn: the policies of every method, score against safety, and outcomes by level of a factor."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -287,8 +287,7 @@ def dose(data: Data, environment: str, period: int) -> "Figure | None":
     for panel, where, metric in (
         (axes[0, 0], Where(environment, "naive", period), "score"), (axes[0, 1], hard.where, hard.metric),
     ):  # fmt: skip
-        for name in names:
-            over_dose(panel, data, where, name, metric)
+        over_dose(panel, data, where, names, metric)
         panel.set_xlabel("delivered dose: mean percentile of fear")
         panel.grid(alpha=0.3)
     axes[0, 0].set_ylabel("score under uniform goals")
@@ -297,8 +296,15 @@ def dose(data: Data, environment: str, period: int) -> "Figure | None":
     return figure
 
 
-def over_dose(axes: "Axes", data: Data, where: Where, method: str, metric: str) -> None:
-    """Draw a method's policies and their medians over the delivered dose; crashes in percent."""
+def over_dose(axes: "Axes", data: Data, where: Where, methods: Sequence[str], metric: str) -> None:
+    """Draw the policies of some methods and their medians over the delivered dose; crashes in percent."""
+    for name in methods:
+        _over_dose(axes, data, where, name, metric)
+    if not axes.lines:
+        instead(axes, NOBODY)
+
+
+def _over_dose(axes: "Axes", data: Data, where: Where, method: str, metric: str) -> None:
     doses = data.delivered(where.environment, method)
     both = [
         (doses[seed], value[0]) for seed in data.seeds(where, [method])
