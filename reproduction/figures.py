@@ -30,7 +30,7 @@ _BY_FEAR = dict(zip(DIRECTOR_METHODS, _DIRECTOR_COLOURS, strict=True))
 STYLE = Style(
     order=(*ENVIRONMENTS, *_LITERAL, *DIRECTOR_METHODS, *_CONTROLS, *_BASELINES),
     panels={
-        "the thesis's Directors": _LITERAL, "Directors with crash memory": (*DIRECTOR_METHODS, *_CONTROLS),
+        "the thesis's Directors": _LITERAL, "crash memory, controls": (*DIRECTOR_METHODS, *_CONTROLS),
         "baselines": _BASELINES,
     },
     everywhere="uniform",

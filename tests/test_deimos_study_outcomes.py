@@ -131,7 +131,7 @@ def test_methods_of_the_populations_can_be_told_apart():
         thesis.STYLE.colours
     )
     titles = [axes.get_title() for axes in figures.training(data, "directional").axes[:3]]
-    assert titles == ["the thesis's Directors", "Directors with crash memory", "baselines"]
+    assert titles == ["the thesis's Directors", "crash memory, controls", "baselines"]
     only = Data(study(methods=("uniform", "rnd"))._results, thesis.STYLE)
     assert [axes.get_title() for axes in figures.training(only, "directional").axes] == ["baselines", "", ""]
 
