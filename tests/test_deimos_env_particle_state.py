@@ -7,7 +7,7 @@ from deimos.kernels.episodes import RESUMED
 from deimos.kernels.particle import PARTICLES
 from particle_worlds import VARIANTS, U, build, constant_actions, put_outside
 from states import assert_same
-from worlds import build_loop, mask_of, rows_of, step_tensors, tensors_of
+from worlds import build_loop, mask_of, played, rows_of, step_tensors
 
 
 def assert_same_state(env, other, rows=slice(None), other_rows=slice(None)):
@@ -115,19 +115,12 @@ def test_resume_is_exact(torch_device, variant):
     for _ in range(63):
         loop.advance(env.step(action))
     saved = loop.state_dict()
-    expected = []
-    for _ in range(100):
-        step = env.step(action)
-        loop.advance(step)
-        expected.append(tensors_of(env, step))
+    expected = played(env, loop, action, 100)
 
     resumed_env = build(torch_device, **config)
     resumed = build_loop(resumed_env)
     resumed.load_state_dict(saved)
-    for want in expected:
-        step = resumed_env.step(action)
-        resumed.advance(step)
-        assert_same(tensors_of(resumed_env, step), want)
+    assert_same(played(resumed_env, resumed, action, 100), expected)
     assert_same(vars(resumed.interactions.resolved()), vars(loop.interactions.resolved()))
     assert bool((env.tensors["episode_count"] > saved["env"]["episode_count"]).any())
     assert bool((env.tensors["goal_count"] > saved["env"]["goal_count"] + 10).all())

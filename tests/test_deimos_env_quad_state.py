@@ -6,7 +6,7 @@ import pytest
 import torch
 from quad_worlds import TASKS, actions, build
 from states import assert_same
-from worlds import build_loop, mask_of, rows_of, tensors_of
+from worlds import build_loop, mask_of, played, rows_of
 
 both = pytest.mark.parametrize("task", TASKS)
 """With an arm or without, a robot keeps what an environment promises."""
@@ -79,18 +79,11 @@ def test_resume_is_exact(task, simulator, hills):
     for _ in range(30):
         loop.advance(env.step(action))
     saved = loop.state_dict()
-    expected = []
-    for _ in range(45):
-        step = env.step(action)
-        loop.advance(step)
-        expected.append(tensors_of(env, step))
+    expected = played(env, loop, action, 45)
     resumed_env = build_on(simulator, task=task, **config)
     resumed = build_loop(resumed_env)
     resumed.load_state_dict(saved)
-    for want in expected:
-        step = resumed_env.step(action)
-        resumed.advance(step)
-        assert_same(tensors_of(resumed_env, step), want)
+    assert_same(played(resumed_env, resumed, action, 45), expected)
     assert bool((env.tensors["episode_count"] > saved["env"]["episode_count"]).any())
 
 

@@ -85,6 +85,17 @@ def test_every_policy_is_a_dot():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["p25", "p75", "uniform"]
 
 
+def test_a_legend_takes_names_of_any_length():
+    """Below a figure stand as many names in a row as fit, and at least one."""
+    columns = []
+    for length in (3, 40, 400):
+        figure, _ = figures.subplots(1, 1, (7.0, 2.0))
+        names = [letter * length for letter in "abcd"]
+        figures.legend(figure, Data(study(methods=names)._results).style, names, "below")
+        columns.append(figure.legends[0]._ncols)
+    assert columns[0] >= 4 > columns[1] > columns[2] == 1
+
+
 def test_boxes_say_how_many_policies_they_have():
     """Beside every box stands the number of its policies, also where one has no score."""
     data = study(seeds=4)

@@ -29,6 +29,11 @@ def step_tensors(step):
     return {name: tensor for name in Step.__dataclass_fields__ if (tensor := getattr(step, name)) is not None}
 
 
-def tensors_of(env, step):
-    """Copies of all that a resume needs and of all that a step gave back."""
-    return env.state_dict() | {name: tensor.clone() for name, tensor in step_tensors(step).items()}
+def played(env, loop, action, steps):
+    """Copies, after each of some steps, of all that a resume needs and of all that the step gave back."""
+    found = []
+    for _ in range(steps):
+        step = env.step(action)
+        loop.advance(step)
+        found.append(env.state_dict() | {name: tensor.clone() for name, tensor in step_tensors(step).items()})
+    return found

@@ -182,7 +182,8 @@ def legend(
                markeredgecolor="black", markeredgewidth=0.4, label=name)
         for name in methods
     ]  # fmt: skip
-    columns = int(WIDTH / (0.45 + 0.055 * max(map(len, methods), default=1)))  # [inch] of a handle and of a letter
+    widest = 0.45 + 0.055 * max(map(len, methods), default=0)  # [inch]: of a handle, and of each letter
+    columns = max(1, int(WIDTH / widest))
     where = {"loc": "outside right center"} if place == "beside" else {"loc": "outside lower center", "ncols": columns}
     figure.legend(handles=handles, frameon=False, **where)
 
