@@ -203,17 +203,25 @@ def slopes(policies: Array, ends: Array) -> Array:
     return np.array(found)
 
 
+def table(evidence: Evidence) -> list[str]:
+    """Lines of Markdown: a row for each hypothesis."""
+    lines = [
+        "| | hypothesis | answer | p | by Holm | effect [95 %] | smallest that would be found | |", "|---" * 8 + "|",
+    ]  # fmt: skip
+    for each in primary(evidence):
+        effect = "-" if each.effect is None else f"{each.effect:.3g}"
+        lines.append(
+            f"| {each.name} | {each.text} | {'holds' if each.holds else 'is not shown'} | {each.p:.3g} "
+            f"| {each.corrected:.3g} | {effect} | {each.detectable:.3g} | {each.note} |"
+        )
+    return lines
+
+
 def main() -> None:
     """See the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    evidence = Evidence.of(Data.read(parser.parse_args().folder), renamed=False)
-    print("| | hypothesis | answer | p | by Holm | effect [95 %] | smallest that would be found | |")
-    print("|---|---|---|---|---|---|---|---|")
-    for each in primary(evidence):
-        effect = "-" if each.effect is None else f"{each.effect:.3g}"
-        print(f"| {each.name} | {each.text} | {'holds' if each.holds else 'is not shown'} | {each.p:.3g} "
-              f"| {each.corrected:.3g} | {effect} | {each.detectable:.3g} | {each.note} |")  # fmt: skip
+    print("\n".join(table(Evidence.of(Data.read(parser.parse_args().folder), renamed=False))))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Is fear too weak, or is the principle? Tables of what each Director asked for, what it knew, and what came of it.
 
-    python -m reproduction.mechanism FOLDER --environment directional --methods uniform p75 oracle swapped
+    python -m reproduction.mechanism FOLDER --environment directional --methods uniform p75 oracle swapped --seeds 0-9
 
 A row is a method, and its numbers are means over policies:
 
@@ -23,7 +23,9 @@ import numpy as np
 
 from deimos.study import stats
 from deimos.study.data import Data
+from deimos.study.plan import parse_seeds
 from deimos.study.stats import Array
+from reproduction.figures import STYLE
 from reproduction.measures import (
     ATTACKED,
     AUROC,
@@ -39,9 +41,11 @@ from reproduction.measures import (
 )
 
 NO_NUMBER = "-"
+ORDER = ("uniform", *[name for name in STYLE.order if name != "uniform"])
+"""All methods, the one that every other is compared with first."""
 
 
-def table(evidence: Evidence, environment: str, methods: Sequence[str]) -> list[str]:
+def table(evidence: Evidence, environment: str, methods: Sequence[str] = ORDER) -> list[str]:
     """Lines of Markdown: a row for each of some methods that an environment has policies of.
 
     Args:
@@ -100,9 +104,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--environment", required=True)
-    parser.add_argument("--methods", nargs="+", required=True)
+    parser.add_argument("--methods", nargs="+", default=ORDER, help="in the order of the rows; by default all")
+    parser.add_argument("--seeds", type=parse_seeds, help="those that count, as in a study's file; by default all")
     options = parser.parse_args()
     evidence = Evidence.of(Data.read(options.folder), renamed=False)
+    if options.seeds:
+        evidence = evidence.only(options.seeds)
     print("\n".join(table(evidence, options.environment, options.methods)))
 
 

@@ -1,4 +1,4 @@
-"""The numbers that the README and the page of the populations quote are those of the rows."""
+"""The numbers that the README, the page of the populations and their lab's tables have are those of the rows."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, read_table
-from reproduction import hypotheses
-from reproduction.hypotheses import CHOOSING, TESTING, samples
+from reproduction import beside, hypotheses, mechanism
+from reproduction.hypotheses import CHOOSING, TESTING, VARIANTS, samples
 from reproduction.measures import ATTACKED, Evidence, under
 from reproduction.particle_picture import points
 
@@ -16,6 +16,7 @@ TABLES = sorted((HOME / "docs" / "results").glob("particle_[a-z]"))
 README, PAGE = (
     " ".join((HOME / name).read_text(encoding="utf-8").split()) for name in ("README.md", "docs/particle.md")
 )
+LAB = (HOME / "docs" / "lab" / "results.md").read_text(encoding="utf-8").splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +72,13 @@ def test_the_page_quotes_the_hypotheses(evidence):
         f"| {answers[2].corrected:.1g} | {100 * answers[2].detectable:.2f} |",
         f"at {float(answers[1].note.split()[3]):.2f} of the score",
     ], PAGE)  # fmt: skip
+
+
+def test_the_lab_has_the_tables_of_the_rows(evidence):
+    """Hypotheses, every method on both sets of seeds, and all of them beside Uniform, line by line."""
+    early, late = evidence.only(CHOOSING), evidence.only(TESTING)
+    tables = [
+        hypotheses.table(evidence), *[mechanism.table(each, name) for each in (early, late) for name in VARIANTS],
+        mechanism.table(early, "relative"), *[beside.table(each) for each in (early, late)],
+    ]  # fmt: skip
+    assert not missing([line for table in tables for line in table], LAB)
