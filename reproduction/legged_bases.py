@@ -31,7 +31,7 @@ from reproduction.runs import finished
 KEPT_IN = Path(__file__).parent.parent / "docs/results/legged"
 KEPT = ("config.json", "checkpoint.pt", "policy.pt", "progress.csv")
 LONG, SHORT = 500, 100  # T10 and T2 [steps]
-ATTACKS = EvalConfig(worlds=512, steps=1500)
+ATTACKS = EvalConfig(worlds=400, steps=2000, adversary_steps=2000)  # two robots on every tile of the ground
 
 
 @dataclass(frozen=True)

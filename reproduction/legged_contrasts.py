@@ -24,7 +24,7 @@ from deimos.study.stats import Array, Interval
 from reproduction.claim_list import CLAIMS
 from reproduction.claims import Clause
 from reproduction.legged_bases import KEPT_IN, LONG, ROBOTS, SHORT, base_name
-from reproduction.measures import PENALTIES, SCORE, Evidence, Measure, Numbers, Place
+from reproduction.measures import DOSE, LEVEL, PENALTIES, SCORE, VARIANCE, Evidence, Measure, Numbers, Place
 from reproduction.thesis import LEGGED, LEGGED_METHODS
 
 REFERENCE = "uniform"
@@ -33,6 +33,8 @@ CORE_HOURS = {"quad": 1.7, "quad_arm": 0.4}
 """What one more method takes on all bases of a robot (legged.md)."""
 LONGER_HOURS = {"quad": 3.2, "quad_arm": 0.7}
 """What the evaluation of its policies at T10 takes."""
+WALKS = 0.3
+"""Least score at T2 of a base that walks."""
 TITLES = {
     ("quad", 100): "Quad at T2", ("quad", 500): "Quad at T10, trained at T2",
     ("quad_long", 100): "Quad at T2, trained at T10", ("quad_long", 500): "Quad at T10, trained at T10",
@@ -50,6 +52,11 @@ TEXT = (
     "log rate is log(crashes + 1/2) - log(interactions + 1); worst is the worst of the attackers. p is that of flipped "
     "signs, exact and one-sided: that the method is better (a higher score, a lower rate); five bases reach 1/32 at "
     "best. What would have been found is the smallest mean difference that as many bases with this spread show in 80 %."
+)
+VDS_TEXT = (
+    "Under vds and vds+p75 the ensemble of VDS, which begins from nothing, takes the place of the base's critic: their "
+    "contrasts with uniform are of both, those with uniform-ensemble, where it ran, of the goals alone. The delivered "
+    "dose of vds+p75 is that of its half under p75."
 )
 
 
@@ -156,7 +163,36 @@ def blocks(evidence: Evidence) -> list[Block]:
             found += _tables(evidence, place)
     if not found:
         return []
-    return ["## Methods in pairs, base by base", TEXT, *found, *_engines(evidence), *bases(), *not_run(evidence)]
+    return [
+        "## Methods in pairs, base by base", TEXT, *found, *_of_walkers(evidence), *_engines(evidence),
+        *_trainings(evidence), *bases(), *not_run(evidence),
+    ]  # fmt: skip
+
+
+def _of_walkers(evidence: Evidence, folder: Path = KEPT_IN) -> list[Block]:
+    """The primary contrasts without bases that do not walk; nothing where all do."""
+    homes = {index + 1: RunFolder(folder / base_name("quad", index)) for index in range(len(ROBOTS["quad"].seeds))}
+    walking = {
+        number for number, home in homes.items() for row in home.read_rows("evaluation.json")
+        if row["goal_period"] == SHORT and row["score"] >= WALKS
+    }  # fmt: skip
+    if not walking or len(walking) == len(homes):
+        return []
+    found = contrasts(evidence.only(walking), Place("quad", SHORT), PRIMARY)
+    return _table(f"The same without bases whose score at T2 is below {WALKS:g}", found, judged=True)
+
+
+def _trainings(evidence: Evidence) -> list[Block]:
+    """What a method's goals did to its own training: ground, critic and dose, base by base."""
+    rows = [
+        {"environment": environment, "method": name} | {
+            each.name: ", ".join(f"{x:.3g}" for x in each(evidence, place, name).values()) or "-"
+            for each in (LEVEL, VARIANCE, DOSE)
+        }
+        for environment in dict.fromkeys(name for name, _ in TITLES) for place in evidence.places(environment)[:1]
+        if evidence.paired(place) for name in evidence.methods if evidence.trainings(place, name)
+    ]  # fmt: skip
+    return ["### Trainings, base by base", VDS_TEXT, rows] if rows else []
 
 
 def _tables(evidence: Evidence, place: Place) -> list[Block]:
@@ -164,6 +200,7 @@ def _tables(evidence: Evidence, place: Place) -> list[Block]:
     known = [name for name in evidence.methods if evidence.evaluations(place, "naive", name) and name != REFERENCE]
     others = contrasts(evidence, place, sorted(set(known) - set(PRIMARY)))
     others += contrasts(evidence, place, ["vds+p75"], "vds")
+    others += contrasts(evidence, place, ["vds", "vds+p75"], "uniform-ensemble")
     first, title = contrasts(evidence, place, PRIMARY), TITLES[place.environment, place.period]
     if place.environment != "quad":
         return _table(f"{title}: estimates", first + others, judged=False)

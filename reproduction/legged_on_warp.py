@@ -28,7 +28,7 @@ from deimos.study.source import check_sources
 from reproduction.legged_bases import SHORT
 
 ENVIRONMENT = "quad_on_warp"
-EVALUATION = EvalConfig(worlds=256, steps=2100, attackers=())
+EVALUATION = EvalConfig(worlds=200, steps=2700, attackers=())  # a robot on every tile
 
 
 def on_warp(cell: Cell) -> Cell:

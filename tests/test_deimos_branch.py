@@ -147,6 +147,17 @@ def test_method_penalty_and_period_may_differ(origin, tmp_path):
     assert trainer.env.goal_period == 24
 
 
+def test_clocks_stay_spread_where_the_period_is_shorter(origin, tmp_path):
+    """Goals that lasted longer at the origin do not all fall due at once: clocks keep their place in the new period."""
+    period = CONFIG.env.goal_period // 4
+    config = branched(origin, env=replace(CONFIG.env, goal_period=period))
+    trainer, _ = training.start(config, tmp_path / "run", branch_from=origin)
+    before = training.load_checkpoint(RunFolder(origin))["loop"]["env"]["goal_clock"]
+    clock = trainer.env.tensors["goal_clock"]
+    assert int((before >= period).sum()) > CONFIG.num_envs // 8
+    assert torch.equal(clock, before % period)
+
+
 def test_a_branch_by_the_command_line_and_in_python(origin, tmp_path):
     """``--branch-from`` starts from the run's own settings, takes what may differ, and equals the same in Python."""
     arguments = "--device cpu --threads 1 --env-steps 16 --no-evaluation selector:director --selector.percentile 60"

@@ -91,6 +91,17 @@ def test_play_counts_what_a_plain_loop_counts():
     assert found["return_per_step"] == pytest.approx(sum(gain for _, _, gain, _ in in_time) / len(in_time), rel=1e-5)
 
 
+@pytest.mark.parametrize(("kinds", "even"), [([], 3), (["stairs", "flat", "flat", "slope", "slope"], 3),
+                                             (["stairs", "flat", "slope", "waves", "waves"], 4)])  # fmt: skip
+def test_halves_are_of_the_same_kinds(kinds, even):
+    """Where there are kinds of worlds, every second one of each kind belongs to the half that chooses the attacker."""
+    env = particle.Config(goal_period=7).for_evaluation().build(5, torch.device("cpu"), 0)
+    env.strata = lambda: kinds
+    row = play(env, lambda obs: torch.zeros(5, 3), uniform.Config().build(spaces(env), 0), 30)
+    assert row["interactions"] % 5 == 0 < row["interactions"]
+    assert row["even_interactions"] == even * row["interactions"] // 5
+
+
 def test_errors_are_read_at_the_end_of_goals():
     """What an environment calls an error is read where a goal has been active for T steps, and not elsewhere."""
     env = particle.Config(goal_period=7).for_evaluation().build(5, torch.device("cpu"), 0)

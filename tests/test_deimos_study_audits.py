@@ -116,21 +116,27 @@ def test_dangerous_and_safe_places_of_particles(variant):
 
 
 def test_stairs_are_told_from_flat_ground():
-    """Of a robot's worlds those on stairs are dangerous and those on flat ground safe; both must be there."""
+    """Of a robot's worlds those on stairs that see a step are dangerous, those on flat ground that see none safe."""
     from deimos.sim.legged.task import Locomotion
 
     class Ground:
-        device = CPU
+        device, obs_dim, points = CPU, 6, range(4)
 
-        def __init__(self, *shapes):
+        def __init__(self, *shapes, step=0.05):
             self.shapes = shapes
+            self.obs = torch.tensor([0.0, 9.0, 1.0, 1.0, 1.0 + 5.0 * step, 1.0]).repeat(len(shapes), 1)
+            self.obs[[shape == "flat" for shape in shapes], 2:] = 1.0
 
         def tiles(self):
             return [(shape, 0) for shape in self.shapes]
 
     risky, safe = Locomotion.risk_contrast(Ground("stairs-up", "flat", "waves", "stairs-down"))
     assert (risky.tolist(), safe.tolist()) == ([0, 3], [1])
-    assert Locomotion.risk_contrast(Ground("stairs-up", "waves")) is None
+    level = Ground("stairs-up", "slope-up", step=0.01)
+    assert [rows.tolist() for rows in Locomotion.risk_contrast(level)] == [[], [1]]
+    edge = Ground("stairs-up", "slope-up")
+    assert [rows.tolist() for rows in Locomotion.risk_contrast(edge)] == [[0], []]
+    assert Locomotion.risk_contrast(Ground("waves")) is None
 
 
 def test_the_ground_of_studies_has_stairs_and_flat_places():
@@ -138,10 +144,18 @@ def test_the_ground_of_studies_has_stairs_and_flat_places():
     from deimos.run.presets import preset
 
     env = preset("quad-rough").env.for_evaluation().resolved(CPU).build(audits.PLACES, CPU, 0)
-    risky, safe = env.risk_contrast()
-    tiles = env.tiles()
-    assert {tiles[i][0] for i in risky.tolist()} == {"stairs-up", "stairs-down"}
-    assert {tiles[i] for i in safe.tolist()} == {("slope-up", 0), ("slope-down", 0)}
+    tiles, seen, counts = env.tiles(), [], [0, 0]
+    for _ in range(audits.SPAWNS):
+        risky, safe = env.risk_contrast()
+        assert {tiles[i][0] for i in risky.tolist()} == {"stairs-up", "stairs-down"}
+        assert {tiles[i] for i in safe.tolist()} <= {("slope-up", 0), ("slope-down", 0)}
+        counts = [counts[0] + len(risky), counts[1] + len(safe)]
+        seen.append(env.obs[:, -1].clone())
+        env.reset(torch.ones(audits.PLACES, dtype=torch.bool))
+        assert env.tiles() == tiles
+    assert counts[0] > 20 * audits.SPAWNS
+    assert counts[1] > audits.SPAWNS
+    assert len({tuple(each.tolist()) for each in seen}) == audits.SPAWNS
 
 
 def test_map_counts_places_and_goals():

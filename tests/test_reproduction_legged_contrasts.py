@@ -182,6 +182,34 @@ def test_bases_are_told_with_their_spread(tmp_path):
     assert [row["level at the end of training"] for row in rows[:2]] == ["4", "5"]
 
 
+def test_contrasts_without_bases_that_do_not_walk(tmp_path):
+    """Where a base's score at T2 is low, the primary contrasts stand a second time without it; otherwise not."""
+    evidence = simulated(NO_EFFECT)
+    assert legged_contrasts._of_walkers(evidence, tmp_path) == []
+    for base in range(5):
+        folder = legged_contrasts.RunFolder.create(tmp_path / legged_bases.base_name("quad", base))
+        scores = {100: 0.7 if base else 0.1, 500: 0.0}
+        folder.write_json("evaluation.json", [{"goal_period": t, "score": score} for t, score in scores.items()])
+    title, rows = legged_contrasts._of_walkers(evidence, tmp_path)
+    assert title == "### The same without bases whose score at T2 is below 0.3"
+    assert {row["bases"] for row in rows} == {"4"}
+    assert rows[0]["of every base"] == ", ".join(
+        legged_contrasts.contrasts(evidence, QUAD, ["p75"])[0].row(judged=True)["of every base"].split(", ")[1:]
+    )
+    folder = legged_contrasts.RunFolder(tmp_path / legged_bases.base_name("quad", 0))
+    folder.write_json("evaluation.json", [{"goal_period": 100, "score": 0.31}])
+    assert legged_contrasts._of_walkers(evidence, tmp_path) == []
+
+
+def test_trainings_are_told_base_by_base(tables):
+    """What goals did to a method's own training stands in a table, with a dash for what the task does not have."""
+    rows = legged_contrasts._trainings(Evidence.of(Data.read(tables)))[2]
+    assert [row["method"] for row in rows] == sorted(METHODS)
+    for row in rows:
+        assert row["mean level of the ground in training"] == "-"
+        assert len(row["explained variance of the critic in training"].split(", ")) == BASES
+
+
 def test_a_study_of_branches_gives_its_tables(tables, capsys, monkeypatch):
     """The command prints the contrasts of real rows: every base of the study in every outcome."""
     monkeypatch.setattr("sys.argv", ["legged_contrasts", str(tables)])

@@ -8,6 +8,7 @@ policy's weaknesses and not those of some training run.
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -284,7 +285,8 @@ def worst(policies: Sequence[Sequence[dict]]) -> list[dict]:
     """The worst that attackers did to each policy, among those that every policy has met.
 
     The largest of several noisy rates is too large. So the attacker is chosen by its crashes in worlds of even number
-    and reported by those in worlds of odd number.
+    and reported by those in worlds of odd number. Where there are kinds of worlds, those of each are numbered apart, so
+    that both halves stand on the same ground.
 
     Args:
         policies: For each, the rows of one evaluation; those of ``naive`` goals do not count.
@@ -343,8 +345,8 @@ def play(
 
     Returns:
         ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions`` (issued early enough
-        to end in time), ``crash_rate`` (share of those that crashed), those of worlds of even number apart, and
-        steps and crashes under first goals.
+        to end in time), ``crash_rate`` (share of those that crashed), those of worlds of even number (see ``worst``)
+        apart, and steps and crashes under first goals.
         ``return_per_step``, the mean over interactions of (sum of the rewards over the T steps, 0 from a crash on) / T,
         cannot be raised by crashing, unlike the reward per transition: a crash puts a particle back to the origin, far
         from every wall. ``matching``, where goals have several groups of components, is the same of their tracking,
@@ -375,7 +377,7 @@ def play(
     done = loop.outcomes()
     reward_sum, crash_count, first_count, first_crash_count = totals.sum(1).tolist()
     transitions = steps * env.num_envs
-    crashed, even = int(done.crashed.sum()), done.env % 2 == 0
+    crashed, even = int(done.crashed.sum()), _numbers(env).to(done.env.device)[done.env] % 2 == 0
     return {
         "reward": reward_sum / transitions,
         "crashes": int(crash_count),
@@ -395,6 +397,16 @@ def play(
         "strata": _by_stratum(env.strata(), crashes, tracking / steps, done),
         "errors": {name: values.nanmedian().item() for name, values in errors.items()},
     }
+
+
+def _numbers(env: Env) -> Tensor:
+    """Every world's number among those of its kind, from 0, int64, shape (num_envs,)."""
+    counts: Counter[str] = Counter()
+    numbers = []
+    for kind in env.strata() or [""] * env.num_envs:
+        numbers.append(counts[kind])
+        counts[kind] += 1
+    return torch.tensor(numbers)
 
 
 def _matching(env: Env, done: Resolved) -> float:

@@ -26,7 +26,7 @@ from deimos.sim.env import Env, EnvConfig
 
 POINTS = 5  # in the last quarter of a training
 BINS = 12  # of either axis of a map
-PLACES = 64  # worlds whose fear is asked for, half of them in a dangerous place
+PLACES, SPAWNS = 64, 16  # worlds in which fear is asked about dangerous and safe places, and their fresh starts
 WORLDS = 200  # that speed is measured in
 SPEEDS = ("velocity", "linear_velocity")  # what environments call the velocity in their observations
 FILE = "audits.json"
@@ -89,19 +89,23 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _risk(trainer: Trainer) -> float:
-    """How often fear at a dangerous place exceeds that at a safe one, over goals, ties counting half; see ``Env``."""
+    """How often fear at a dangerous place exceeds that at a safe one, over starts and goals, ties counting half."""
     afraid = fear_selector(trainer.loop.selector)
     if afraid is None or not afraid.fear.fitted:
         return math.nan
     env = trainer.config.env.for_evaluation().build(PLACES, trainer.env.device, trainer.config.seed)
-    contrast = env.risk_contrast()
-    if contrast is None:
-        return math.nan
-    rows = torch.cat(contrast)
-    obs, candidates = env.obs[rows], env.sample_goals(rows, CANDIDATES).clone()
-    score = afraid.score(env.state(obs), obs[:, env.goal_slice], candidates)
-    risky = torch.arange(len(rows), device=env.device) < len(contrast[0])
-    return auroc(score.flatten(), risky.repeat_interleave(CANDIDATES))
+    scores: list[Tensor] = []
+    risky: list[Tensor] = []
+    for _ in range(SPAWNS):
+        contrast = env.risk_contrast()
+        if contrast is not None:
+            rows = torch.cat(contrast)
+            obs, candidates = env.obs[rows], env.sample_goals(rows, CANDIDATES).clone()
+            scores.append(afraid.score(env.state(obs), obs[:, env.goal_slice], candidates).flatten())
+            dangerous = torch.arange(len(rows), device=env.device) < len(contrast[0])
+            risky.append(dangerous.repeat_interleave(CANDIDATES))
+        env.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+    return auroc(torch.cat(scores), torch.cat(risky)) if scores else math.nan
 
 
 def goal_map(place: Tensor, chosen: Tensor) -> list[int]:

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
 MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
 SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
+STEP_IN_SIGHT = 0.02  # [m]; the lowest step of the stairs is 5 cm high
 EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
 NOWHERE = 1e9  # [m]; a plane has no edge
 SETTLED = 2.0  # [s] after which a robot that stands is at rest
@@ -278,14 +279,20 @@ class Locomotion(WarpEnv):
     def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
         """See ``Env.risk_contrast``: as they are, on stairs and on flat ground (thesis, 4.1).
 
-        Smooth slopes are flat on level 0.
+        Smooth slopes are flat on level 0. Whoever stands on stairs and sees no step, or on flat ground and sees one, is
+        in neither place.
         """
+        seen = self.obs[:, self.obs_dim - len(self.points) :].aminmax(dim=1)
+        uneven = (seen.max - seen.min > HEIGHT_SCALE * STEP_IN_SIGHT).tolist()
         shapes = ["flat" if shape.startswith("slope") and not level else shape for shape, level in self.tiles()]
         risky, safe = (
-            torch.tensor([i for i, shape in enumerate(shapes) if shape.startswith(kind)], device=self.device)
-            for kind in ("stairs", "flat")
-        )
-        return (risky, safe) if len(risky) and len(safe) else None
+            torch.tensor(
+                [i for i, shape in enumerate(shapes) if shape.startswith(kind) and uneven[i] == steps],
+                dtype=torch.int64, device=self.device,
+            )
+            for kind, steps in (("stairs", True), ("flat", False))
+        )  # fmt: skip
+        return (risky, safe) if len(risky) or len(safe) else None
 
     def tracking_at_rest(self) -> float | None:
         """See ``Env.tracking_at_rest``: of ``GOALS_AT_REST`` goals and more, by the robots once they stand.
