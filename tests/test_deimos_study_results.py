@@ -188,6 +188,13 @@ def test_curve_of_fear_knows_where_it_stood_still():
     assert "goal_percentile" not in found
 
 
+def test_rows_have_the_rate_of_every_kind_of_ground():
+    """It is the share of goals that were not survived; a kind on which no goal has ended has none."""
+    strata = {"stairs-up 3": {"success": 0.75}, "slope 0": {"success": 1.0}, "waves 1": {"success": math.nan}}
+    assert results._by_kind({"strata": strata}) == {"stairs-up 3": 0.25, "slope 0": 0.0}
+    assert results._by_kind({}) == {}
+
+
 def attacked(hash, goals, even, odd):
     """A row of 20 interactions, half of them in even worlds, with as many crashes in either."""
     return result(
