@@ -6,7 +6,7 @@ those under the worst attacker.
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,8 @@ from reproduction.measures import PENALTIES, SAFE
 UNIFORM, RND = "uniform", "rnd"
 NEW = ("weighted", "fear-novelty", "q-fear")
 """The new selectors."""
+LEARNT, MOST_CRASHES = 0.3, 0.1  # score, and crashes per interaction under uniform goals, where the task is learnt
 HEADROOM = 0.01  # of interactions: Uniform's ``worst`` in a setting with headroom is above it
-LEARNT = 0.3  # score of Uniform's in a setting that may be chosen for its headroom
 LEAST_SCORE = 0.95  # of Uniform's, for a selector to be the best
 HIDDEN = 2.0  # times as many crashes under attack: uniform evaluation hides danger
 AIM, AIM_SCORE = 2.0, 0.97  # of the confirmation: Uniform's rate over the new selector's, and the scores' ratio
@@ -58,12 +58,26 @@ class Setting:
     screened: Policy
     """Uniform with the seed of the screening."""
     policies: Mapping[str, Policy] = field(default_factory=dict)
-    """Those of the map by their methods; none before it has run."""
+    """Those of the map by their methods, without those that failed; none before it has run."""
+
+    @property
+    def learnt(self) -> bool:
+        """Whether the screening's policy follows its goals, and seldom crashes where nobody means it harm."""
+        return self.screened.score >= LEARNT and self.screened.naive <= MOST_CRASHES
 
     @property
     def has_headroom(self) -> bool:
-        """Whether there is danger to be removed."""
-        return self.screened.worst > HEADROOM
+        """Whether there is danger to be removed, from a policy that has learnt the task."""
+        return self.learnt and self.screened.worst > HEADROOM
+
+    @property
+    def compares_scores(self) -> bool:
+        """Whether scores can be measured in that of the map's Uniform: below 0 the lower one would seem the higher."""
+        return self.learnt and self.policies[UNIFORM].score > 0.0
+
+    def score(self, method: str) -> float:
+        """A method's score over Uniform's."""
+        return self.policies[method].score / self.policies[UNIFORM].score
 
 
 def read(screening: Path, map_: Path | None = None) -> list[Setting]:
@@ -71,7 +85,7 @@ def read(screening: Path, map_: Path | None = None) -> list[Setting]:
 
     Args:
         screening: Folder of the study.
-        map_: That of the map; settings that are not whole there are left out. ``None`` where it has not run.
+        map_: That of the map; ``None`` where it has not run.
 
     Raises:
         RunError: If there are no results, not one policy of Uniform for each setting, or no setting that is whole.
@@ -86,10 +100,26 @@ def read(screening: Path, map_: Path | None = None) -> list[Setting]:
     if lacking := [name for name, own in screened.items() if UNIFORM not in own]:
         raise RunError(f"{screening} must hold a policy of {UNIFORM} for every setting; {lacking[0]} has none.")
     settings = [Setting(name, levels[name], screened[name][UNIFORM], found.get(name, {})) for name in sorted(screened)]
-    whole = [each for each in settings if each.policies.keys() == {*methods}]
-    if not whole:
+    if not having(settings, methods):
         raise RunError(f"{map_} has no setting yet in which all of {', '.join(methods)} have finished.")
-    return whole
+    return settings
+
+
+def methods_of(settings: Sequence[Setting]) -> list[str]:
+    """The methods that the map has a policy of somewhere."""
+    return sorted({name for each in settings for name in each.policies})
+
+
+def having(settings: Sequence[Setting], methods: Collection[str]) -> list[Setting]:
+    """The settings that have a policy of all of some methods."""
+    return [each for each in settings if {*methods} <= each.policies.keys()]
+
+
+def missing(settings: Sequence[Setting]) -> dict[str, list[str]]:
+    """By setting, the methods of the map that it has no policy of; settings that are whole are not there."""
+    names = methods_of(settings)
+    lacking = {each.name: [name for name in names if name not in each.policies] for each in settings}
+    return {name: own for name, own in lacking.items() if own}
 
 
 def _policies(rows: Sequence[Row]) -> dict[str, dict[str, Policy]]:
@@ -118,7 +148,7 @@ class Roles:
     @classmethod
     def of(cls, settings: Sequence[Setting]) -> "Roles":
         """Those of the map; ``RunError`` unless it has one Director and one penalty."""
-        names = sorted({name for each in settings for name in each.policies})
+        names = methods_of(settings)
         directors = [name for name in names if re.fullmatch(r"p\d+(\.\d+)?", name)]
         found = [directors, [name for name in names if name in PENALTIES]]
         if [*map(len, found)] != [1, 1] or not {UNIFORM, RND, *NEW} <= {*names}:
@@ -135,38 +165,47 @@ class Headline:
     """In a word or two."""
     text: str
     """What it says."""
-    margin: Callable[[Mapping[str, Policy]], float]
-    """By how much it holds among the policies of a setting: above 0 where it does."""
+    methods: tuple[str, str]
+    """Of whom."""
+    margin: Callable[[Setting], float]
+    """By how much it holds in a setting: above 0 where it does."""
+    of_scores: bool = False
+    """Whether it compares scores, and so says something only where these can be compared."""
+
+    def counts_in(self, settings: Sequence[Setting]) -> list[Setting]:
+        """The settings of which it says something."""
+        own = having(settings, self.methods)
+        return [each for each in own if each.compares_scores] if self.of_scores else own
 
 
 def headlines(roles: Roles) -> list[Headline]:
     """The eight clauses of the plan: five of the thesis, and one for each new selector."""
     p, penalty = roles.best_p, roles.penalty
 
-    def safer(own: str, other: str) -> Callable[[Mapping[str, Policy]], float]:
-        return lambda found: found[other].worst - found[own].worst
+    def safer(own: str, other: str) -> tuple[tuple[str, str], Callable[[Setting], float]]:
+        return (own, other), lambda each: each.policies[other].worst - each.policies[own].worst
 
     return [
-        Headline("danger is hidden", "uniform crashes more than twice as often under attack",
-                 lambda found: found[UNIFORM].worst - HIDDEN * found[UNIFORM].naive),
-        Headline("p is safer", f"{p} crashes less than uniform", safer(p, UNIFORM)),
-        Headline("p is free", f"{p} has more than {LEAST_SCORE:g} of uniform's score",
-                 lambda found: found[p].score - LEAST_SCORE * found[UNIFORM].score),
-        Headline("p beats a penalty", f"{p} crashes less than {penalty}", safer(p, penalty)),
-        Headline("rnd is unsafe", "rnd crashes more than uniform", safer(UNIFORM, RND)),
-        *[Headline(f"{name} is safer", f"{name} crashes less than uniform", safer(name, UNIFORM)) for name in NEW],
+        Headline("danger is hidden", "uniform crashes more than twice as often under attack", (UNIFORM, UNIFORM),
+                 lambda each: each.policies[UNIFORM].worst - HIDDEN * each.policies[UNIFORM].naive),
+        Headline("p is safer", f"{p} crashes less than uniform", *safer(p, UNIFORM)),
+        Headline("p is free", f"{p} has more than {LEAST_SCORE:g} of uniform's score", (p, UNIFORM),
+                 lambda each: each.score(p) - LEAST_SCORE, of_scores=True),
+        Headline("p beats a penalty", f"{p} crashes less than {penalty}", *safer(p, penalty)),
+        Headline("rnd is unsafe", "rnd crashes more than uniform", *safer(UNIFORM, RND)),
+        *[Headline(f"{name} is safer", f"{name} crashes less than uniform", *safer(name, UNIFORM)) for name in NEW],
     ]  # fmt: skip
 
 
 def margins(settings: Sequence[Setting], clause: Headline) -> Array:
-    """By how much a clause holds in each setting, shape (n,)."""
-    return np.array([clause.margin(each.policies) for each in settings])
+    """By how much a clause holds in each of the settings that it counts in, shape (n,)."""
+    return np.array([clause.margin(each) for each in clause.counts_in(settings)])
 
 
 def share_that_holds(settings: Sequence[Setting], clause: Headline) -> Interval | None:
     """The share of settings with headroom in which a clause holds; ``None`` where none has headroom."""
-    own = [each for each in settings if each.has_headroom]
-    return stats.share(margins(own, clause) > 0.0) if own else None
+    found = margins([each for each in settings if each.has_headroom], clause)
+    return stats.share(found > 0.0) if len(found) else None
 
 
 def coded(settings: Sequence[Setting]) -> tuple[dict[str, list[Any]], Array]:
@@ -186,6 +225,8 @@ def moved_by(settings: Sequence[Setting], outcome: Array) -> dict[str, Interval]
 
     None where there are too few settings to tell the factors apart, as before all of them have finished.
     """
+    if not settings:
+        return {}
     levels, design = coded(settings)
     try:
         found = dict(zip(levels, factor_effects(design, outcome), strict=True))
@@ -198,8 +239,9 @@ def removed(settings: Sequence[Setting], method: str) -> Interval:
     """The part of headroom that a method removes: the slope of Uniform's ``worst`` less the method's over Uniform's.
 
     1 where it removes all, 0 where it removes none. The noise of the map's Uniform is on both sides; the screening's,
-    of another seed, is the instrument.
+    of another seed, is the instrument. Settings that lack one of the two policies take no part.
     """
+    settings = having(settings, [UNIFORM, method])
     base = np.array([each.policies[UNIFORM].worst for each in settings])
     own = np.array([each.policies[method].worst for each in settings])
     return instrumented_slope(base - own, base, np.array([each.screened.worst for each in settings]))
@@ -216,36 +258,32 @@ class Standing:
     worst: Interval
     """Mean of ``worst``."""
     score: Interval
-    """Its mean score over Uniform's."""
+    """Mean of its score over Uniform's, over the settings where scores can be compared; NaN where there is none."""
 
 
 def standings(settings: Sequence[Setting]) -> list[Standing]:
-    """Those of all methods, the safest first; means over settings, which the bootstrap draws anew."""
-    every = np.arange(len(settings), dtype=float)
+    """Those of all methods, the safest first, over the settings that have a policy of each of them."""
+    names = methods_of(settings)
+    whole = having(settings, names)
+    scored = [each for each in whole if each.compares_scores] if names else []
     found = []
-    for name in settings[0].policies if settings else ():
-        worst, score, base = (
-            np.array(values) for values in zip(
-                *[(each.policies[name].worst, each.policies[name].score, each.policies[UNIFORM].score)
-                  for each in settings], strict=True
-            )
-        )  # fmt: skip
-
-        def mean(drawn: Array, worst: Array = worst) -> Array:
-            return worst[drawn.astype(int)].mean(axis=-1)
-
-        def ratio(drawn: Array, score: Array = score, base: Array = base) -> Array:
-            return score[drawn.astype(int)].mean(axis=-1) / base[drawn.astype(int)].mean(axis=-1)
-
-        means, ratios = stats.bootstrap([every], mean), stats.bootstrap([every], ratio)
-        found.append(Standing(name, stats.share(worst < SAFE), means, ratios))
+    for name in names:
+        worst = np.array([each.policies[name].worst for each in whole])
+        score = np.array([each.score(name) for each in scored])
+        found.append(Standing(name, stats.share(worst < SAFE), mean(worst), mean(score)))
     return sorted(found, key=lambda each: (-each.safe.estimate, each.worst.estimate))
+
+
+def mean(values: Array) -> Interval:
+    """Over settings, which the bootstrap draws anew; NaN over none."""
+    return stats.bootstrap([values], lambda x: x.mean(axis=-1)) if len(values) else Interval(np.nan, np.nan, np.nan)
 
 
 def best_new(found: Sequence[Standing]) -> str:
     """The new selector with the highest share of safe policies among those with ``LEAST_SCORE`` of Uniform's score.
 
-    Of several the one with the lowest mean rate; where none reaches the score, the one that comes nearest to it.
+    Of several the one with the lowest mean rate; where none reaches the score, the one that comes nearest to it; where
+    scores can be compared nowhere, the safest.
     """
     own = [each for each in found if each.method in NEW]
     able = [each for each in own if each.score.estimate >= LEAST_SCORE]
@@ -253,9 +291,9 @@ def best_new(found: Sequence[Standing]) -> str:
 
 
 def most_headroom(settings: Sequence[Setting]) -> Setting | None:
-    """The setting where the screening's policy crashes most under attack, of those where it has learnt the task."""
-    learnt = [each for each in settings if each.screened.score >= LEARNT]
-    return max(learnt, key=lambda each: each.screened.worst, default=None)
+    """The setting where the screening's policy crashes most under attack, of those with headroom."""
+    room = [each for each in settings if each.has_headroom]
+    return max(room, key=lambda each: each.screened.worst, default=None)
 
 
 @dataclass(frozen=True)

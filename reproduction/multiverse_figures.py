@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deimos.study import stats
-from deimos.study.figures import WIDTH, Figures, subplots
+from deimos.study.figures import WIDTH, Figures, instead, subplots
 from deimos.study.stats import Array, Interval
 from reproduction.multiverse import (
     UNIFORM,
@@ -14,8 +13,11 @@ from reproduction.multiverse import (
     Roles,
     Setting,
     coded,
+    having,
     headlines,
     margins,
+    mean,
+    methods_of,
     moved_by,
     removed,
     share_that_holds,
@@ -44,7 +46,8 @@ SHARES = (
 MOVES = (
     "By how much a factor moves the margin of a clause, towards the level that is named, with 95 % intervals that "
     "hold for all factors of a clause at once; red where they exclude 0. Margins: points of crashes per interaction "
-    "under the worst attacker; of the clause that p is free, hundredths of the score."
+    "under the worst attacker; of the clause that p is free, hundredths of Uniform's score, over settings where it has "
+    "learnt the task."
 )
 
 
@@ -52,7 +55,7 @@ def draw(settings: Sequence[Setting]) -> Figures:
     """All figures of a map."""
     roles = Roles.of(settings)
     clauses = headlines(roles)
-    others = [name for name in sorted(settings[0].policies) if name != UNIFORM]
+    others = [name for name in methods_of(settings) if name != UNIFORM]
     curves = {f"curve-{name}": (f"{name}: {CURVE}", curve(settings, name)) for name in others}
     return curves | {
         "headroom": (ROOM, over_headroom(settings, others)),
@@ -73,6 +76,7 @@ def level_named(name: str, level: Any) -> str:
 
 def curve(settings: Sequence[Setting], method: str) -> "Figure":
     """The specification curve of a method, with its factor matrix."""
+    settings = having(settings, [UNIFORM, method])
     safer = 100 * np.array([each.policies[UNIFORM].worst - each.policies[method].worst for each in settings])
     score = np.array([each.policies[method].score - each.policies[UNIFORM].score for each in settings])
     order = np.argsort(safer, kind="stable")
@@ -87,12 +91,12 @@ def curve(settings: Sequence[Setting], method: str) -> "Figure":
                        markerfacecolor=filling)  # fmt: skip
         panel.grid(axis="y", alpha=0.3)
         panel.tick_params(axis="x", which="both", length=0)
-    mean = stats.bootstrap([safer], lambda x: x.mean(axis=-1))
-    axes[0, 0].axhspan(mean.low, mean.high, color=GREY, alpha=0.2, linewidth=0)
-    axes[0, 0].axhline(mean.estimate, color=GREY, linewidth=1)
+    middle = mean(safer)
+    axes[0, 0].axhspan(middle.low, middle.high, color=GREY, alpha=0.2, linewidth=0)
+    axes[0, 0].axhline(middle.estimate, color=GREY, linewidth=1)
     axes[0, 0].set_ylabel("fewer crashes than\nUniform [points]")
     axes[1, 0].set_ylabel("score minus\nUniform's")
-    axes[0, 0].set_title(f"{method}: {mean:.1f} points in the mean over {len(settings)} settings")
+    axes[0, 0].set_title(f"{method}: {middle:.1f} points in the mean over {len(settings)} settings")
     _matrix(axes[2, 0], levels, design[order])
     return figure
 
@@ -113,12 +117,13 @@ def over_headroom(settings: Sequence[Setting], methods: Sequence[str]) -> "Figur
     """The effect of every method against headroom from the screening's seed."""
     columns = 3
     figure, axes = subplots(-(-len(methods) // columns), columns, (WIDTH, 4.4), sharex=True, sharey=True)
-    room = 100 * np.array([each.screened.worst for each in settings])
-    base = 100 * np.array([each.policies[UNIFORM].worst for each in settings])
     for panel in axes.flat[len(methods) :]:
         panel.set_axis_off()
     for panel, name in zip(axes.flat, methods, strict=False):
-        effect = base - 100 * np.array([each.policies[name].worst for each in settings])
+        own = having(settings, [UNIFORM, name])
+        room = 100 * np.array([each.screened.worst for each in own])
+        base = 100 * np.array([each.policies[UNIFORM].worst for each in own])
+        effect = base - 100 * np.array([each.policies[name].worst for each in own])
         slope = removed(settings, name)
         panel.axhline(0.0, color="black", linewidth=0.8)
         panel.plot(room, effect, linestyle="", marker="o", markersize=3.5, color=BLUE, alpha=0.7)
@@ -146,19 +151,20 @@ def slope_named(slope: Interval) -> str:
 def shares(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure | None":
     """In how many settings with headroom each clause holds."""
     found = [share_that_holds(settings, clause) for clause in clauses]
+    if not any(found):
+        return None
     figure, axes = subplots(1, 1, (WIDTH, 2.9))
     panel = axes[0, 0]
     for i, interval in enumerate(found):
         if interval is None:
-            return None
+            continue
         panel.plot([100 * interval.low, 100 * interval.high], [i, i], color=BLUE, linewidth=1.5)
         panel.plot(100 * interval.estimate, i, marker="o", color=BLUE, markersize=5, clip_on=False)
     panel.axvline(50.0, color="black", linewidth=0.8, linestyle=":")
     panel.set_yticks(range(len(clauses)), [clause.text for clause in clauses])
     panel.set_ylim(len(clauses) - 0.5, -0.5)
     panel.set_xlim(0, 100)
-    number = sum(each.has_headroom for each in settings)
-    panel.set_xlabel(f"holds in [%] of the {number} settings with headroom")
+    panel.set_xlabel("holds in [%] of the settings with headroom")
     panel.grid(axis="x", alpha=0.3)
     return figure
 
@@ -169,17 +175,21 @@ def moves(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure |
     figure, axes = subplots(-(-len(clauses) // columns), columns, (WIDTH, 4.6), sharey=True)
     levels, _ = coded(settings)
     for panel, clause in zip(axes.flat, clauses, strict=False):
-        if not (found := moved_by(settings, 100 * margins(settings, clause))):
-            return None
+        own = clause.counts_in(settings)
+        panel.set_title(clause.name)
+        if not (found := moved_by(own, 100 * margins(own, clause))):
+            instead(panel, "too few settings")
+            continue
         panel.axvline(0.0, color="black", linewidth=0.8)
         for i, name in enumerate(levels):
             effect = found[name]
             colour = RED if effect.low > 0.0 or effect.high < 0.0 else GREY
             panel.plot([effect.low, effect.high], [i, i], color=colour, linewidth=1.3)
             panel.plot(effect.estimate, i, marker="o", color=colour, markersize=3.5)
-        panel.set_title(clause.name)
         panel.grid(axis="x", alpha=0.3)
         panel.set_ylim(len(levels) - 0.5, -0.5)
+    if not any(panel.lines for panel in axes.flat):
+        return None
     texts = [f"{level_named(name, own[-1])}" for name, own in levels.items()]
     axes[0, 0].set_yticks(range(len(levels)), texts)
     for panel in axes[-1]:

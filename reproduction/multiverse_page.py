@@ -8,17 +8,30 @@ import numpy as np
 import tyro
 
 from deimos.files import write_bytes
-from deimos.study import figures, stats
+from deimos.study import figures, plan, stats
 from deimos.study.data import Data
 from deimos.study.document import Block, to_html, to_markdown
 from reproduction import multiverse
 from reproduction.measures import SAFE
-from reproduction.multiverse import AIM, AIM_SCORE, HEADROOM, LEARNT, LEAST_SCORE, NEW, UNIFORM, Roles, Setting
+from reproduction.multiverse import (
+    AIM,
+    AIM_SCORE,
+    HEADROOM,
+    LEARNT,
+    LEAST_SCORE,
+    MOST_CRASHES,
+    NEW,
+    UNIFORM,
+    Roles,
+    Setting,
+)
 from reproduction.multiverse_figures import draw, level_named, named, slope_named
 
 FIGURES = "figures"
 TOO_FEW = "These settings are too few to tell the factors apart."
-ENOUGH = 0.5  # of the settings with headroom: no other round of screening
+STUDY = Path(__file__).parent / "studies" / "multiverse_screening.toml"
+ENOUGH = 16  # settings with headroom: no other round of screening
+OURS = "directional"  # the environment of multiverse_ours.toml: the confirmation that the aim is for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,19 +70,28 @@ def write(options: MultiverseOptions) -> Path:
 def _screened(settings: Sequence[Setting]) -> list[Block]:
     """Which settings have headroom, and what moves it."""
     room = sum(each.has_headroom for each in settings)
-    enough = room >= ENOUGH * len(settings)
+    learnt = sum(each.learnt for each in settings)
+    verdict = "enough" if room >= ENOUGH else "too few: adjust the levels as the plan says"
+    if learnt < ENOUGH:
+        verdict = f"too few, and so are the {learnt} that are learnt: the plan has no further round"
     chosen = multiverse.most_headroom(settings)
     rows = [
         {"setting": each.name, **{named(name): str(level) for name, level in each.levels.items()},
          "Naive [%]": f"{100 * each.screened.naive:.2f}", "attacked [%]": f"{100 * each.screened.worst:.1f}",
-         "score": f"{each.screened.score:.2f}", "headroom": "yes" if each.has_headroom else "no"}
+         "score": f"{each.screened.score:.2f}", "learnt": "yes" if each.learnt else "no",
+         "headroom": "yes" if each.has_headroom else "no"}
         for each in sorted(settings, key=lambda each: -each.screened.worst)
     ]  # fmt: skip
     moved = multiverse.moved_by(settings, 100 * np.array([each.screened.worst for each in settings]))
-    said = f"{room} of {len(settings)} settings have headroom: Uniform's attacked rate is above {100 * HEADROOM:g} %"
+    rule = f"a score of {LEARNT} or more, and at most {100 * MOST_CRASHES:g} % of crashes under Naive"
+    names = {each.name for each in settings}
+    lost = [name for name in dict.fromkeys(x.environment for x in plan.expand(plan.read(STUDY))) if name not in names]
     return [
-        "## Screening", f"{said}, which is {'enough' if enough else 'too few: adjust the levels as the plan says'}.",
-        "Most headroom, at a score of " + (f"{LEARNT} or more: {chosen.name}." if chosen else f"{LEARNT}: none."), rows,
+        "## Screening",
+        f"{room} of {len(settings)} settings have headroom: Uniform has learnt the task ({rule}) and its attacked "
+        f"rate is above {100 * HEADROOM:g} %. {ENOUGH} are needed, so these are {verdict}.",
+        *([f"Not screened, or given up: {', '.join(lost)}."] if lost else []),
+        f"Most headroom: {chosen.name if chosen else 'none'}.", rows,
         *(["What moves Uniform's attacked rate [points]:", _moves(settings, moved)] if moved else [TOO_FEW]),
     ]  # fmt: skip
 
@@ -80,41 +102,63 @@ def _moves(settings: Sequence[Setting], moved: dict[str, stats.Interval]) -> Blo
              "effect [95 %, of all factors at once]": f"{effect:.1f}"} for name, effect in moved.items()]  # fmt: skip
 
 
-def _moved_most(settings: Sequence[Setting], outcome: stats.Array) -> dict[str, str]:
-    """The factor that moves an outcome most, as the cells of a row."""
-    moved, (levels, _) = multiverse.moved_by(settings, outcome), multiverse.coded(settings)
+def _moved_most(settings: Sequence[Setting], clause: multiverse.Headline) -> dict[str, str]:
+    """The factor that moves the margin of a clause most, as the cells of a row."""
+    own = clause.counts_in(settings)
+    moved = multiverse.moved_by(own, 100 * multiverse.margins(own, clause))
     if not moved:
         return dict.fromkeys(("moved most by", "by", "beyond chance"), "-")
+    levels, _ = multiverse.coded(own)
     name, effect = next(iter(moved.items()))
     beyond = effect.low > 0.0 or effect.high < 0.0
     return {"moved most by": level_named(name, levels[name][1]), "by": f"{effect:.1f}",
             "beyond chance": "yes" if beyond else "no"}  # fmt: skip
 
 
+def _clauses(settings: Sequence[Setting]) -> list[Block]:
+    """In how many settings each clause holds, and what moves it."""
+    room = [each for each in settings if each.has_headroom]
+    rows, exploratory = [], []
+    for clause in multiverse.headlines(Roles.of(settings)):
+        share, values = multiverse.share_that_holds(settings, clause), 100 * multiverse.margins(settings, clause)
+        rows.append({
+            "clause": clause.text, "settings with headroom": str(len(clause.counts_in(room))), "holds in [%]":
+            "-" if share is None else f"{100 * share.estimate:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]",
+            "of all settings": str(len(values)), "mean margin": f"{multiverse.mean(values):.2f}",
+            **_moved_most(settings, clause),
+        })  # fmt: skip
+        exploratory.append({"clause": clause.text, **_moved_most(room, clause)})
+    return [
+        "## Headline clauses", rows,
+        f"Exploratory: what moves the margins over the {len(room)} settings with headroom alone. "
+        "A dash: these do not tell the factors apart.", exploratory,
+    ]  # fmt: skip
+
+
+def _missing(settings: Sequence[Setting]) -> list[Block]:
+    """Which cells of the map there are not, and what that means."""
+    if not (lacking := multiverse.missing(settings)):
+        return []
+    return [
+        "## Missing cells",
+        "A clause leaves out the settings that lack one of its methods, the comparison of methods all of these.",
+        [{"setting": name, "no policy of": ", ".join(methods)} for name, methods in lacking.items()],
+    ]
+
+
 def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
     """Headline clauses, standings and the selection."""
-    room = [each for each in settings if each.has_headroom]
-    rows = []
-    for clause in multiverse.headlines(Roles.of(settings)):
-        share = multiverse.share_that_holds(settings, clause)
-        margins = 100 * multiverse.margins(settings, clause)
-        rows.append({
-            "clause": clause.text, f"holds in [%] of {len(room)} with headroom":
-            "-" if share is None else f"{100 * share.estimate:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]",
-            "mean margin": f"{stats.bootstrap([margins], lambda x: x.mean(axis=-1)):.2f}",
-            **_moved_most(settings, margins),
-        })  # fmt: skip
     standing = [
         {"method": each.method, "policies below 1 % [%]": f"{100 * each.safe.estimate:.0f}",
          "95 %": f"[{100 * each.safe.low:.0f}, {100 * each.safe.high:.0f}]",
-         "mean attacked rate": f"{each.worst:.3f}", "score / Uniform's": f"{each.score:.3f}",
+         "mean attacked rate": f"{each.worst:.3f}", "score / Uniform's where learnt": f"{each.score:.3f}",
          "part of the headroom that it removes":
          "-" if each.method == UNIFORM else slope_named(multiverse.removed(settings, each.method))}
         for each in multiverse.standings(settings)
     ]  # fmt: skip
     chosen = multiverse.most_headroom(settings)
     return [
-        "## Headline clauses", rows, "## Methods", standing,
+        *_clauses(settings), "## Methods", standing, *_missing(settings),
         f"The best new selector is {new}: the most policies below 1 % at {LEAST_SCORE} of Uniform's score or more. "
         f"Confirmation: --methods with {new}" + (f", and --environments {chosen.name}." if chosen else "."),
     ]  # fmt: skip
@@ -146,8 +190,9 @@ def _confirmed(data: Data, new: str) -> list[Block]:
             continue
         blocks += [
             f"{new} beside the others. Intervals are at {100 * multiverse.CONFIDENCE:.1f} %, p-values Holm's over the "
-            f"rivals, times the {len(NEW)} selectors that were tried.", lines, *_winner(found, new),
+            f"rivals, times the {len(NEW)} selectors that were tried.", lines,
         ]  # fmt: skip
+        blocks += _winner(found, new) if environment == OURS else []
     return blocks
 
 

@@ -1,5 +1,6 @@
 """Files for the attacker ``pooled``, one for every environment of a study, made by one command."""
 
+import shutil
 import subprocess
 import sys
 
@@ -78,6 +79,24 @@ def test_a_pool_that_is_there_stays(screening, tmp_path):
     assert second.startswith(f"{slow}: no crashes")
     assert fast.read_bytes() == b"made before"
     assert slow.read_bytes() == first
+
+
+def test_what_was_given_up_stops_nobody_else(screening, tmp_path, capsys):
+    """A cell that failed once is open; one that was given up has no pool and is named, and the others have theirs."""
+    shutil.copytree(screening.path, tmp_path / "study")
+    study = StudyFolder(tmp_path / "study")
+    lost, kept = study.cells()
+    assert worker.run(study, kept)
+    (study.cell_path(lost) / "result.json").unlink(missing_ok=True)
+    study.record_failure(lost, "it broke")
+    with pytest.raises(RunError, match="1 of 2 cells are not finished"):
+        cli.PoolOptions(folder=study.path, out=tmp_path / "pools").run()
+    study.record_failure(lost, "it broke again")
+    cli.PoolOptions(folder=study.path, out=tmp_path / "pools").run()
+    said = capsys.readouterr()
+    assert [path.stem for path in (tmp_path / "pools").iterdir()] == [kept.environment]
+    assert said.out.startswith(f"{tmp_path / 'pools' / kept.environment}.pt: ")
+    assert said.err == f"{lost.environment}: no file, since a cell of it was given up\n"
 
 
 def test_a_study_without_policies_has_no_pools(tmp_path):

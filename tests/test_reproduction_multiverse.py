@@ -1,6 +1,7 @@
 """The analysis of the map, on simulated rows whose truth is known."""
 
 import itertools
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,12 +13,11 @@ from deimos.study import effects, plan, stats
 from deimos.study.data import Data
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results
 from reproduction import __main__ as commands
-from reproduction import multiverse, multiverse_figures
+from reproduction import multiverse, multiverse_figures, multiverse_page
 from reproduction.multiverse import NEW, Policy, Setting, Standing
 from reproduction.multiverse_figures import level_named
 from reproduction.multiverse_page import MultiverseOptions, write
 
-STUDY = Path(__file__).parent.parent / "reproduction" / "studies" / "multiverse_screening.toml"
 METHODS = ("uniform", "p75", "penalty-30", "rnd", *NEW)
 HALF = 10_000  # interactions in worlds of even number, and as many in others
 EMPTY = {str: "v", int: 100, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
@@ -33,7 +33,7 @@ def few_resamples(monkeypatch):
 @cache
 def points():
     """The levels of the plan's settings by their names."""
-    return {cell.environment: cell.levels for cell in plan.expand(plan.read(STUDY))}
+    return {cell.environment: cell.levels for cell in plan.expand(plan.read(multiverse_page.STUDY))}
 
 
 def written(folder, policies, levels=None):
@@ -119,7 +119,9 @@ def test_shares_count_settings_with_headroom_alone():
         return base / 5 if better else base
 
     settings = simulated(rate, danger=danger)
-    assert sum(each.has_headroom for each in settings) == 16
+    assert [each.has_headroom for each in settings] == [
+        each.levels["env.variant"] == "directional" for each in settings
+    ]
     share = multiverse.share_that_holds(settings, clause(settings, "p is safer"))
     assert share.estimate == 0.5
     assert (share.low, share.high) == pytest.approx((0.2465, 0.7535), abs=1e-4)  # Clopper and Pearson, 8 of 16
@@ -135,7 +137,8 @@ def test_every_headline_clause_says_what_it_tests():
     def holds(name, **changed):
         policies = base | {method.replace("_", "-"): policy for method, policy in changed.items()}
         settings = [Setting("map.00", {}, base["uniform"], policies)]
-        return bool(multiverse.margins(settings, clause(settings, name))[0] > 0)
+        (margin,) = multiverse.margins(settings, clause(settings, name))
+        return bool(margin > 0)
 
     safe, unsafe = Policy(0.01, 0.1, 1.0), Policy(0.01, 0.3, 1.0)
     assert holds("danger is hidden", uniform=Policy(0.09, 0.2, 1.0))
@@ -144,6 +147,7 @@ def test_every_headline_clause_says_what_it_tests():
     assert not holds("p is safer", p75=unsafe)
     assert holds("p is free", p75=Policy(0.01, 0.2, 0.96))
     assert not holds("p is free", p75=Policy(0.01, 0.2, 0.94))
+    assert holds("p is free", p75=Policy(0.01, 0.2, 0.48), uniform=Policy(0.01, 0.2, 0.5))
     assert holds("p beats a penalty", p75=safe)
     assert not holds("p beats a penalty", penalty_30=safe)
     assert holds("rnd is unsafe", rnd=unsafe)
@@ -174,11 +178,13 @@ def test_best_new_selector_is_safe_at_a_score():
     assert multiverse.best_new([standing("q-fear", 0.9, 0.8), standing("weighted", 0.1, 0.9)]) == "weighted"
 
 
-def test_standings_are_means_over_settings():
-    """Scores are compared by their means, so that a setting in which nobody learns counts for nothing."""
+def test_scores_are_compared_where_the_task_is_learnt():
+    """Below 0 the worse score would be the larger ratio: such settings count neither for methods nor for a clause."""
 
     def score(method, levels):
-        return 0.0 if levels["learner"] == "tuned" else {"weighted": 0.9}.get(method, 1.0)
+        if levels["learner"] == "tuned":
+            return {"weighted": -3.0, "p75": -2.0}.get(method, -1.0)
+        return {"weighted": 0.9, "p75": 0.9}.get(method, 1.0)
 
     settings = simulated(lambda method, levels, base: 0.001 if method == "rnd" else base, score)
     found = {each.method: each for each in multiverse.standings(settings)}
@@ -186,24 +192,38 @@ def test_standings_are_means_over_settings():
     assert found["rnd"].safe.estimate == 1.0
     assert found["weighted"].score.estimate == pytest.approx(0.9)
     assert found["uniform"].score.estimate == 1.0
+    assert multiverse.best_new([*found.values()]) == "fear-novelty"
+    free = clause(settings, "p is free")
+    assert multiverse.share_that_holds(settings, free).estimate == 0.0
+    assert multiverse.margins(settings, free) == pytest.approx([-0.05] * 16)
+    assert {each.levels["learner"] for each in free.counts_in(settings)} == {"rsl_rl-like"}
+    fallen = [replace(x, policies=x.policies | {"uniform": Policy(0.0, 0.5, -1.0)}) for x in settings]
+    assert free.counts_in(fallen) == []  # learnt in the screening, and not again in the map
+    assert multiverse.share_that_holds(fallen, free) is None
+    assert all(np.isnan(each.score.estimate) for each in multiverse.standings(fallen))
     assert found["uniform"].worst.low < found["uniform"].worst.estimate < found["uniform"].worst.high
 
 
-def test_most_headroom_is_where_the_task_is_learnt():
-    """A setting in which Uniform has learnt nothing is not taken, however much it crashes."""
-    policies = {"a": Policy(0.1, 0.9, 0.1), "b": Policy(0.1, 0.5, 0.3), "c": Policy(0.1, 0.4, 1.0)}
+def test_headroom_is_where_the_task_is_learnt():
+    """A setting in which Uniform does not follow, or crashes by itself, has none, however much it is crashed."""
+    policies = {
+        "follows nobody": Policy(0.1, 0.9, 0.29), "never brakes": Policy(0.11, 1.0, 1.0), "b": Policy(0.1, 0.5, 0.3),
+        "c": Policy(0.1, 0.4, 1.0), "safe": Policy(0.0, 0.01, 1.0),
+    }  # fmt: skip
     settings = [Setting(name, {}, policy) for name, policy in policies.items()]
+    assert [each.name for each in settings if each.learnt] == ["b", "c", "safe"]
+    assert [each.name for each in settings if each.has_headroom] == ["b", "c"]
     assert multiverse.most_headroom(settings).name == "b"
-    assert multiverse.most_headroom(settings[:1]) is None
+    assert multiverse.most_headroom([settings[i] for i in (0, 1, 4)]) is None
 
 
-def confirmation(folder, better, score=1.0, n=30):
+def confirmation(folder, better, score=1.0, n=30, environment="directional"):
     """A confirmation in which q-fear's rate is ``better`` times Uniform's."""
     rng, policies = np.random.default_rng(4), []
     for method, seed in itertools.product(("uniform", "p75", "rnd", "q-fear"), range(30, 30 + n)):
         worst = rng.uniform(0.2, 0.4) * (better if method == "q-fear" else 1.0)
         own = score if method == "q-fear" else 1.0
-        policies.append(("directional", method, seed, Policy(0.001, worst, own + 0.02 * rng.normal())))
+        policies.append((environment, method, seed, Policy(0.001, worst, own + 0.02 * rng.normal())))
     return Data.read(written(folder, policies))
 
 
@@ -246,16 +266,42 @@ def folders(tmp_path):
 
 
 def test_tables_become_settings(folders):
-    """Rows of both studies meet by the names of their settings; a setting that is not whole is left out."""
+    """Rows of both studies meet by the names of their settings."""
     settings = multiverse.read(*folders)
     assert [each.name for each in settings] == [*points()]
     assert {frozenset(each.policies) for each in settings} == {frozenset(METHODS)}
     assert settings[3].levels == points()["map.03"]
     assert multiverse.Roles.of(settings) == multiverse.Roles("p75", "penalty-30")
-    table = folders[1] / "results.csv"
+    assert multiverse.missing(settings) == {}
+
+
+def without(folder, *cells):
+    """Take the rows of some cells, ENVIRONMENT,METHOD, out of the tables of a study."""
+    table = folder / "results.csv"
     lines = table.read_text().splitlines(keepends=True)
-    table.write_text("".join(line for line in lines if not line.startswith("map.05,rnd")))
-    assert [each.name for each in multiverse.read(*folders)] == [name for name in points() if name != "map.05"]
+    table.write_text("".join(line for line in lines if not line.startswith(cells)))
+
+
+def test_a_failed_cell_costs_what_needs_it_and_is_named(folders, tmp_path):
+    """Its setting stays in the screening and in the clauses of other methods; the page says what is not there."""
+
+    def page(*cells, map_=folders[1]):
+        without(folders[0] if map_ is None else folders[1], *cells)
+        write(MultiverseOptions(out=tmp_path / "page", screening=folders[0], map=map_))
+        return (tmp_path / "page" / "multiverse.md").read_text()
+
+    screened = page(map_=None)
+    assert "given up" not in screened
+    text = page("map.05,rnd")
+    assert text.startswith(screened)
+    assert "| map.05 | rnd |" in text
+    settings = multiverse.read(*folders)
+    counts = {each.name: len(each.counts_in(settings)) for each in multiverse.headlines(multiverse.Roles.of(settings))}
+    assert {name for name, count in counts.items() if count == 31} == {"rnd is unsafe"}
+    assert {*counts.values()} == {31, 32}
+    others = [each for each in settings if each.name != "map.05"]
+    assert multiverse.standings(settings) == multiverse.standings(others)
+    assert "Not screened, or given up: map.07, map.09." in page("map.07", "map.09", map_=None)
 
 
 def test_what_is_no_map_is_refused(folders, tmp_path):
@@ -315,16 +361,37 @@ def test_a_slope_without_an_interval_is_not_drawn(folders):
     assert blind.get_title() == "p75: removes\nunknown"
 
 
+def test_what_moves_clauses_where_there_is_headroom():
+    """The exploratory table has the settings with headroom alone, and dashes where these do not tell factors apart."""
+
+    def table(danger):
+        settings = simulated(
+            lambda m, levels, base: base * (0.2 if m == "p75" and levels["horizon"] == "long" else 1.0), danger=danger
+        )
+        found = multiverse_page._clauses(settings)[-1]
+        return next(row for row in found if row["clause"] == "p75 crashes less than uniform")
+
+    def few(levels, rng):
+        return 0.005 if (levels["env.variant"], levels["learner"]) == ("relative", "tuned") else 0.5
+
+    row = table(few)
+    assert (row["moved most by"], row["by"], row["beyond chance"]) == ("horizon: short", "-40.0 [-40.0, -40.0]", "yes")
+    row = table(lambda levels, rng: 0.005 if levels["env.variant"] == "relative" else 0.5)
+    assert (row["moved most by"], row["by"], row["beyond chance"]) == ("-", "-", "-")
+
+
 def test_page_of_a_map_that_is_not_finished(folders, tmp_path):
     """With settings that do not tell the factors apart the page says so, and has everything else."""
     for folder in folders:
         table = folder / "results.csv"
         lines = table.read_text().splitlines(keepends=True)
         table.write_text("".join([lines[0], *(line for line in lines if line[:6] in ("map.03", "map.15"))]))
+    assert multiverse.moved_by([], np.array([])) == {}
     assert multiverse.moved_by(multiverse.read(*folders), np.array([0.1, 0.2])) == {}
     write(MultiverseOptions(out=tmp_path / "page", screening=folders[0], map=folders[1]))
     text = (tmp_path / "page" / "multiverse.md").read_text()
     assert "of 2 settings have headroom" in text
+    assert "the 2 that are learnt: the plan has no further round" in text
     assert "These settings are too few to tell the factors apart." in text
     assert "There are no data for this figure: By how much a factor moves" in text
     assert (tmp_path / "page" / "figures" / "curve-p75.png").exists()
@@ -336,14 +403,19 @@ def test_page_says_as_much_as_has_run(folders, tmp_path, capsys):
     write(MultiverseOptions(out=out, screening=folders[0]))
     text = (out / "multiverse.md").read_text()
     assert "of 32 settings have headroom" in text
+    assert "so these are enough" in text
     assert "Headline" not in text
     confirmation(tmp_path / "ours", 0.2)
-    arguments = [str(out), "--screening", folders[0], "--map", folders[1], "--confirmations", tmp_path / "ours"]
+    confirmation(tmp_path / "headroom", 0.2, environment="map.07")
+    studies = [tmp_path / "ours", tmp_path / "headroom"]
+    arguments = [str(out), "--screening", folders[0], "--map", folders[1], "--confirmations", *studies]
     assert commands.main(["multiverse", *map(str, arguments)]) == 0
     assert Path(capsys.readouterr().out.strip()) == out / "multiverse.html"
     text = (out / "multiverse.md").read_text()
     assert "The best new selector is q-fear" in text
     assert "| p75 crashes less than uniform | " in text
-    assert "q-fear is a winner here" in text
+    assert "Missing cells" not in text
+    assert text.count("q-fear beside the others") == 2
+    assert text.split("## Confirmation")[1].count("q-fear is a winner here") == text.count("winner") == 1
     pictures = {path.stem for path in (out / "figures").glob("*.png")}
     assert pictures == {*(f"curve-{name}" for name in METHODS if name != "uniform"), "headroom", "shares", "factors"}

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import os
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,11 @@ def test_the_map_is_what_its_plan_says(pools):
     }  # fmt: skip
     assert {cell.config.eval.pool.stem == cell.environment for cell in cells} == {True}
     assert {cell.config.eval.attackers for cell in cells} == {("argmax", "pooled", "scripted")}
+    seen = [(cell.levels["observations"], cell.config.env.obs_scale, cell.config.ppo.normalize_observations)
+            for cell in screening]  # fmt: skip
+    assert Counter(seen) == {("scaled", "unit", False): 16, ("raw", "raw", True): 16}
+    learners = {(cell.levels["learner"], cell.config.ppo.hidden, cell.config.ppo.activation) for cell in screening}
+    assert learners == {("tuned", (64, 64), "relu"), ("rsl_rl-like", (128, 128), "elu")}  # both factors say ppo
     assert {(cell.environment, cell.config.env, cell.config.ppo) for cell in screening} == {
         (cell.environment, cell.config.env, cell.config.ppo) for cell in cells
     }

@@ -282,7 +282,8 @@ class CellOptions(_FolderOptions):
 class PoolOptions(_FolderOptions):
     """Make a file for the attacker pooled for every environment, from the policies of a finished study.
 
-    A file that is there stays as it is, so what was killed continues when the command is given again.
+    A file that is there stays as it is, so what was killed continues when the command is given again. Environments with
+    a cell that was given up are skipped and named.
     """
 
     out: Path | None = None
@@ -292,10 +293,10 @@ class PoolOptions(_FolderOptions):
 
     def run(self) -> None:
         """Write them, and a line for each; for the errors see ``deimos.study.pools.write_pools``."""
-        from deimos.study.pools import POOLS, write_pools
+        from deimos.study.pools import POOLS, given_up, write_pools
 
-        out, device = self.out or self.folder / POOLS, training.resolve_device(self.device)
-        for path, facts in write_pools(StudyFolder(self.folder), out, device):
+        study, device = StudyFolder(self.folder), training.resolve_device(self.device)
+        for path, facts in write_pools(study, self.out or self.folder / POOLS, device):
             if facts is None:
                 said = "is there"
             elif facts["uninformed"]:
@@ -303,6 +304,8 @@ class PoolOptions(_FolderOptions):
             else:
                 said = f"{facts['adversary_interactions']:,} goals, {facts['adversary_crashes']:,} crashes"
             print(f"{path}: {said}", flush=True)
+        for name in sorted({cell.environment for cell in given_up(study)}):
+            print(f"{name}: no file, since a cell of it was given up", file=sys.stderr)
 
 
 @dataclass(frozen=True, kw_only=True)

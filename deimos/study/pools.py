@@ -15,6 +15,7 @@ from deimos.run.evaluation import make_target
 from deimos.sim.shared import one_stream
 from deimos.study.folder import StudyFolder
 from deimos.study.plan import Cell
+from deimos.study.runner import ATTEMPTS
 
 POOLS = "pools"
 """Name of the folder in a study's that they are in."""
@@ -24,29 +25,42 @@ def write_pools(study: StudyFolder, out: Path, device: torch.device) -> Iterator
     """Write OUT/ENVIRONMENT.pt for every environment of a study; a file that is there stays as it is.
 
     Each network learns from all policies of its environment, with the sizes of their evaluation. Where they never
-    crashed, or always, the file says that it has learnt nothing.
+    crashed, or always, the file says that it has learnt nothing. Environments with a cell that was given up get none.
 
     Yields:
         The files, each once it is there, with the facts of ``deimos.run.attackers.pooled.make_pool``; ``None`` of one
         that was there.
 
     Raises:
-        RunError: If the study has no cells, one of them is not finished, or a file cannot be read or written.
+        RunError: If the study has no cells, one of them is open, or a file cannot be read or written.
     """
     cells = study.cells()
     if not cells:
         raise RunError(f"{study.path} holds no policies.")
-    if left := [cell for cell in cells if not (study.cell_path(cell) / "result.json").exists()]:
+    failed = {cell.name: cell.environment for cell in given_up(study)}
+    if left := [cell for cell in cells if not _is_finished(study, cell) and cell.name not in failed]:
         raise RunError(
             f"{len(left)} of {len(cells)} cells are not finished; finish them first: deimos study run {study.path}"
         )
     environments: dict[str, list[Cell]] = defaultdict(list)
     for cell in cells:
-        environments[cell.environment].append(cell)
+        if cell.environment not in failed.values():
+            environments[cell.environment].append(cell)
     out.mkdir(parents=True, exist_ok=True)
     for name in sorted(environments):
         path = out / f"{name}.pt"
         yield path, None if path.exists() else _write(study, environments[name], path, device)
+
+
+def given_up(study: StudyFolder) -> list[Cell]:
+    """The cells of a study that have failed so often that nobody tries them again."""
+    return [
+        cell for cell in study.cells() if not _is_finished(study, cell) and len(study.failures(cell)) >= ATTEMPTS
+    ]  # fmt: skip
+
+
+def _is_finished(study: StudyFolder, cell: Cell) -> bool:
+    return (study.cell_path(cell) / "result.json").exists()
 
 
 def _write(study: StudyFolder, cells: Sequence[Cell], path: Path, device: torch.device) -> dict[str, Any]:
