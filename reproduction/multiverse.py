@@ -72,8 +72,8 @@ class Setting:
 
     @property
     def compares_scores(self) -> bool:
-        """Whether scores can be measured in that of the map's Uniform: below 0 the lower one would seem the higher."""
-        return self.learnt and self.policies[UNIFORM].score > 0.0
+        """Whether scores can be measured in that of the map's Uniform: of one near 0 any ratio can come."""
+        return self.learnt and self.policies[UNIFORM].score >= LEARNT
 
     def score(self, method: str) -> float:
         """A method's score over Uniform's."""

@@ -348,12 +348,11 @@ def play(
         to end in time), ``crash_rate`` (share of those that crashed), those of worlds of even number (see ``worst``)
         apart, and steps and crashes under first goals.
         ``return_per_step`` is the mean over interactions of (sum of the rewards over the T steps, 0 from a crash on) /
-        T. Unlike the reward per transition it has nothing from the steps after a crash; but later interactions may gain
-        by it, where it puts a particle back to the origin, far from every wall. ``matching``, where goals have several
-        groups of components, is the same of their tracking, weighted by ``Env.goal_group_weights``. ``tracking`` has
-        the mean of every group over transitions, ``strata`` the same and more by kind of world, where there are kinds,
-        and ``errors`` the median of each of ``Env.errors`` over all goals that were survived, at the end of their
-        period.
+        T: unlike the reward per transition it has nothing from the steps after a crash, but later interactions may gain
+        by one, which puts a particle far from every wall. ``matching``, where goals have several groups of components,
+        is the same of their tracking, weighted by ``Env.goal_group_weights``. ``tracking`` has the mean of every group
+        over transitions, ``strata`` the same and more by kind of world, where there are kinds, and ``errors`` the
+        median of each of ``Env.errors`` over all goals that were survived, at the end of their period.
     """
     loop = GoalLoop(env, selector, window=steps, guard=guard)
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)

@@ -418,9 +418,6 @@ class Env(abc.ABC):
     def take_worlds(self, state: dict[str, Tensor]) -> None:
         """Continue where the worlds of another environment are, with draws of this one's own.
 
-        Where goals lasted longer there, they fall due here as if each had been issued again after every T: clocks that
-        were spread over a period stay so.
-
         Args:
             state: Its ``state_dict()``. What only one of the two has, since another engine simulates it, is left out.
 
@@ -433,8 +430,6 @@ class Env(abc.ABC):
                 if own.shape != tensor.shape:
                     raise ValueError(f"{name} must have the shape {tuple(tensor.shape)}, got {tuple(own.shape)}.")
                 tensor.copy_(own)
-        if "goal_clock" in self.tensors:
-            self.tensors["goal_clock"].remainder_(self.goal_period)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of all tensors that a bit-exact resume needs, with the worlds of all ranks; see ``Stateful``."""

@@ -226,6 +226,14 @@ class WarpEnv(Env):
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
 
+    def take_worlds(self, state: dict[str, Tensor]) -> None:
+        """See ``Env.take_worlds``. Goals that lasted longer there keep their place in a period of this T.
+
+        So goals that fell due evenly go on doing so, in place of most of them at the first step.
+        """
+        super().take_worlds(state)
+        self.tensors["goal_clock"].remainder_(self.goal_period)
+
     @final
     def check(self) -> None:
         """See ``Env.check``. An action that is not finite stops the run at once.
