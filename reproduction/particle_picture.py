@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAME = "particle"
-BLOCKS = (("the test: seeds 10 to 29", TESTING), ("every method: seeds 0 to 9", CHOOSING))
+BLOCKS = (("seeds 10 to 29", TESTING), ("every method: seeds 0 to 9", CHOOSING))
 Point = tuple[Interval, Interval]
 """Score beside Uniform's, and crashes per interaction [%]."""
 

@@ -8,7 +8,7 @@ import pytest
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, read_table
 from reproduction import beside, hypotheses, mechanism
 from reproduction.hypotheses import CHOOSING, TESTING, VARIANTS, samples
-from reproduction.measures import ATTACKED, Evidence, under
+from reproduction.measures import ATTACKED, SCORE, Evidence, under
 from reproduction.particle_picture import points
 
 HOME = Path(__file__).parent.parent
@@ -50,7 +50,7 @@ def test_the_readme_quotes_the_rows(evidence):
         f"{len(policies)} policies, all of them counted",
         f"crash in {rate(fresh, under('naive'), 'uniform'):.1f} % of these, but in {uniform:.0f} % of the worst",
         f"crash in {attacked.estimate:.1f} %, at {score.estimate:.2f} of the score",
-        f"do not help: {penalty:.0f} %",
+        f"does not help: {penalty:.0f} %",
         f"comes to {novel.estimate:.1f} % at {novel_score.estimate:.2f}",
     ], README)  # fmt: skip
 
@@ -72,6 +72,15 @@ def test_the_page_quotes_the_hypotheses(evidence):
         f"| {answers[2].corrected:.1g} | {100 * answers[2].detectable:.2f} |",
         f"at {float(answers[1].note.split()[3]):.2f} of the score",
     ], PAGE)  # fmt: skip
+
+
+def test_the_page_has_the_table_of_the_freeze(evidence):
+    """Crashes under ``argmax`` and the score of p75 by how fear learnt, in both variants."""
+    early = evidence.only(CHOOSING)
+    for title, method in (("its threshold today", "p75-threshold"), ("literal", "p75-literal"), ("memory", "p75")):
+        attacked, score = (samples(early, measure, method) for measure in (under("argmax"), SCORE))
+        cells = [f"{100 * attacked[name].mean():.1f}, {score[name].mean():.2f}" for name in VARIANTS]
+        assert f"| {title} | {' | '.join(cells)} |" in PAGE
 
 
 def test_the_lab_has_the_tables_of_the_rows(evidence):
