@@ -10,6 +10,7 @@ one-sided p-value of H1's test, uncorrected: exploratory.
 import argparse
 from pathlib import Path
 
+from deimos.checks import RunError
 from deimos.study.data import Data
 from deimos.study.plan import parse_seeds
 from reproduction.hypotheses import safer
@@ -19,12 +20,18 @@ from reproduction.particle_picture import points
 
 
 def table(evidence: Evidence, rival: str = "uniform") -> list[str]:
-    """Lines of Markdown: a row for each method that has policies in every variant."""
+    """Lines of Markdown: a row for each method that has policies in every variant, as the rival must have.
+
+    Raises:
+        RunError: If it has not.
+    """
+    found = points(evidence, ORDER)
+    if rival not in found:
+        raise RunError(f"The rival must be one of {', '.join(found) or 'no methods: there are none'}, got {rival}.")
     lines = [f"| method | `worst` [%] | score, Uniform = 1 | lower than `{rival}`'s by | p |", "|---" * 5 + "|"]
-    for name, (score, rate) in points(evidence, ORDER).items():
-        tested = "- | -"
-        if name != rival and (answer := safer(name, evidence, name, rival)).effect is not None:
-            tested = f"{answer.effect:.1%} | {answer.p:.3g}"
+    for name, (score, rate) in found.items():
+        answer = safer(name, evidence, name, rival)
+        tested = "- | -" if name == rival else f"{answer.effect:.1%} | {answer.p:.3g}"
         lines.append(f"| `{name}` | {rate:.1f} | {score:.2f} | {tested} |")
     return lines
 

@@ -171,12 +171,13 @@ def blocks(evidence: Evidence) -> list[Block]:
 
 def _of_walkers(evidence: Evidence, folder: Path = KEPT_IN) -> list[Block]:
     """The primary contrasts without bases that do not walk; nothing where all do."""
-    homes = {index + 1: RunFolder(folder / base_name("quad", index)) for index in range(len(ROBOTS["quad"].seeds))}
-    walking = {
-        number for number, home in homes.items() for row in home.read_rows("evaluation.json")
-        if row["goal_period"] == SHORT and row["score"] >= WALKS
+    scores = {
+        index + 1: row["score"] for index in range(len(ROBOTS["quad"].seeds))
+        for row in RunFolder(folder / base_name("quad", index)).read_rows("evaluation.json")
+        if row["goal_period"] == SHORT
     }  # fmt: skip
-    if not walking or len(walking) == len(homes):
+    walking = {base for base, score in scores.items() if score >= WALKS}
+    if len(walking) == len(scores):
         return []
     found = contrasts(evidence.only(walking), Place("quad", SHORT), PRIMARY)
     return _table(f"The same without bases whose score at T2 is below {WALKS:g}", found, judged=True)

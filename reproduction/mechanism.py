@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deimos.checks import RunError
 from deimos.study import stats
 from deimos.study.data import Data
 from deimos.study.plan import parse_seeds
@@ -52,7 +53,13 @@ def table(evidence: Evidence, environment: str, methods: Sequence[str] = ORDER) 
         evidence: Of a study, with the names that its methods have there.
         environment: Name of an environment; of several T the first counts.
         methods: In the order of the rows.
+
+    Raises:
+        RunError: If there is no such environment.
     """
+    if not evidence.places(environment):
+        there = sorted({name for _, _, name, _ in evidence.rows})
+        raise RunError(f"environment must be one of {', '.join(there) or 'none, for want of rows'}, got {environment}.")
     place = evidence.places(environment)[0]
     known = [name for name in methods if SCORE(evidence, place, name)]
     attackers = [goals for goals in evidence.goals(place) if all(evidence.evaluations(place, goals, m) for m in known)]

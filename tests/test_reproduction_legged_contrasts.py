@@ -186,6 +186,9 @@ def test_contrasts_without_bases_that_do_not_walk(tmp_path):
     """Where a base's score at T2 is low, the primary contrasts stand a second time without it; otherwise not."""
     evidence = simulated(NO_EFFECT)
     assert legged_contrasts._of_walkers(evidence, tmp_path) == []
+    some = legged_contrasts.RunFolder.create(tmp_path / "some" / legged_bases.base_name("quad", 1))
+    some.write_json("evaluation.json", [{"goal_period": 100, "score": 0.7}])
+    assert legged_contrasts._of_walkers(evidence, tmp_path / "some") == []
     for base in range(5):
         folder = legged_contrasts.RunFolder.create(tmp_path / legged_bases.base_name("quad", base))
         scores = {100: 0.7 if base else 0.1, 500: 0.0}

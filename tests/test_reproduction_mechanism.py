@@ -2,7 +2,8 @@
 
 import pytest
 
-from reproduction import mechanism
+from deimos.checks import RunError
+from reproduction import beside, mechanism
 from reproduction.measures import Evidence
 
 RATES = {"uniform": (0.10, 0.30), "oracle": (0.002, 0.004), "swapped": (0.10, 0.10)}
@@ -63,3 +64,11 @@ def test_who_is_better_in_both(evidence):
     assert {name: row["better in both"] for name, row in found.items()} == {
         "uniform": "oracle, swapped", "oracle": "-", "swapped": "oracle",
     }  # fmt: skip
+
+
+def test_what_is_not_there_is_named(evidence):
+    """An environment without rows, and a rival without policies in every variant, are errors that say what there is."""
+    with pytest.raises(RunError, match="environment must be one of directional, got relative"):
+        mechanism.table(evidence, "relative")
+    with pytest.raises(RunError, match="rival must be one of no methods: there are none, got uniform"):
+        beside.table(evidence)

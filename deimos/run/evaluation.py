@@ -376,8 +376,8 @@ def play(
     env.check()
     done = loop.outcomes()
     reward_sum, crash_count, first_count, first_crash_count = totals.sum(1).tolist()
-    transitions = steps * env.num_envs
-    crashed, even = int(done.crashed.sum()), _numbers(env).to(done.env.device)[done.env] % 2 == 0
+    transitions, kinds = steps * env.num_envs, env.strata()
+    crashed, even = int(done.crashed.sum()), _numbers(kinds or [""] * env.num_envs, done.env.device)[done.env] % 2 == 0
     return {
         "reward": reward_sum / transitions,
         "crashes": int(crash_count),
@@ -394,19 +394,19 @@ def play(
         "goal_groups": list(env.goal_group_names),
         "tracking": (tracking.mean(0) / steps).tolist(),
         "crashes_per_minute": 60 * crash_count / (transitions * env.dt) if env.has_seconds else math.nan,
-        "strata": _by_stratum(env.strata(), crashes, tracking / steps, done),
+        "strata": _by_stratum(kinds, crashes, tracking / steps, done),
         "errors": {name: values.nanmedian().item() for name, values in errors.items()},
     }
 
 
-def _numbers(env: Env) -> Tensor:
+def _numbers(kinds: Sequence[str], device: torch.device) -> Tensor:
     """Every world's number among those of its kind, from 0, int64, shape (num_envs,)."""
     counts: Counter[str] = Counter()
     numbers = []
-    for kind in env.strata() or [""] * env.num_envs:
+    for kind in kinds:
         numbers.append(counts[kind])
         counts[kind] += 1
-    return torch.tensor(numbers)
+    return torch.tensor(numbers, device=device)
 
 
 def _matching(env: Env, done: Resolved) -> float:

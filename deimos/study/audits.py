@@ -98,14 +98,15 @@ def _risk(trainer: Trainer) -> float:
     risky: list[Tensor] = []
     for _ in range(SPAWNS):
         contrast = env.risk_contrast()
-        if contrast is not None:
-            rows = torch.cat(contrast)
-            obs, candidates = env.obs[rows], env.sample_goals(rows, CANDIDATES).clone()
-            scores.append(afraid.score(env.state(obs), obs[:, env.goal_slice], candidates).flatten())
-            dangerous = torch.arange(len(rows), device=env.device) < len(contrast[0])
-            risky.append(dangerous.repeat_interleave(CANDIDATES))
+        if contrast is None:
+            return math.nan
+        rows = torch.cat(contrast)
+        obs, candidates = env.obs[rows], env.sample_goals(rows, CANDIDATES).clone()
+        scores.append(afraid.score(env.state(obs), obs[:, env.goal_slice], candidates).flatten())
+        dangerous = torch.arange(len(rows), device=env.device) < len(contrast[0])
+        risky.append(dangerous.repeat_interleave(CANDIDATES))
         env.reset(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-    return auroc(torch.cat(scores), torch.cat(risky)) if scores else math.nan
+    return auroc(torch.cat(scores), torch.cat(risky))
 
 
 def goal_map(place: Tensor, chosen: Tensor) -> list[int]:

@@ -282,17 +282,16 @@ class Locomotion(WarpEnv):
         Smooth slopes are flat on level 0. Whoever stands on stairs and sees no step, or on flat ground and sees one, is
         in neither place.
         """
-        seen = self.obs[:, self.obs_dim - len(self.points) :].aminmax(dim=1)
-        uneven = (seen.max - seen.min > HEIGHT_SCALE * STEP_IN_SIGHT).tolist()
         shapes = ["flat" if shape.startswith("slope") and not level else shape for shape, level in self.tiles()]
-        risky, safe = (
-            torch.tensor(
-                [i for i, shape in enumerate(shapes) if shape.startswith(kind) and uneven[i] == steps],
-                dtype=torch.int64, device=self.device,
-            )
-            for kind, steps in (("stairs", True), ("flat", False))
-        )  # fmt: skip
-        return (risky, safe) if len(risky) or len(safe) else None
+        stairs, flat = (
+            torch.tensor([i for i, shape in enumerate(shapes) if shape.startswith(kind)], device=self.device)
+            for kind in ("stairs", "flat")
+        )
+        if not len(stairs) or not len(flat):
+            return None
+        seen = self.obs[:, self.obs_dim - len(self.points) :].aminmax(dim=1)
+        uneven = seen.max - seen.min > HEIGHT_SCALE * STEP_IN_SIGHT
+        return stairs[uneven[stairs]], flat[~uneven[flat]]
 
     def tracking_at_rest(self) -> float | None:
         """See ``Env.tracking_at_rest``: of ``GOALS_AT_REST`` goals and more, by the robots once they stand.
