@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from deimos.run.trainer import TrainConfig
 from deimos.sim.envs.particle import Config
@@ -94,6 +95,31 @@ def test_a_legend_takes_names_of_any_length():
         figures.legend(figure, Data(study(methods=names)._results).style, names, "below")
         columns.append(figure.legends[0]._ncols)
     assert columns[0] >= 4 > columns[1] > columns[2] == 1
+
+
+def drawn(figure):
+    """A renderer that has drawn a figure, which places what is in it."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return canvas.get_renderer()
+
+
+def test_nothing_is_cut_off_where_methods_are_many():
+    """Legends lie within their figures however many methods there are, and titles of panels do not meet."""
+    data = study(methods=[name for name in thesis.STYLE.order if name not in ("directional", "absolute")])
+    assert len(data.methods("directional")) > 25
+    with figures.print_size():
+        for draw in (outcomes.pareto, outcomes.dose, outcomes.profiles):
+            figure = draw(data, "directional", 100)
+            renderer = drawn(figure)
+            legend = figure.legends[0].get_window_extent(renderer)
+            assert 0 <= legend.y0 < legend.y1 <= figure.bbox.y1, draw.__name__
+            assert 0 <= legend.x0 < legend.x1 <= figure.bbox.x1, draw.__name__
+    titles = [panel.title.get_window_extent(renderer) for panel in figure.axes if panel.get_title()]
+    assert len(titles) == 3
+    assert titles[0].x1 < titles[1].x0 < titles[1].x1 < titles[2].x0
+    labels = [panel.get_ylabel() for panel in figure.axes if panel.get_ylabel()]
+    assert [label.partition("under ")[2] for label in labels] == ["uniform goals", "the Adversary"]
 
 
 def test_boxes_say_how_many_policies_they_have():

@@ -27,6 +27,7 @@ TRAINING = (
 )
 DPI = 200
 WIDTH = 7.2  # [inch]: the text of an A4 page, at which every figure can be read
+ROW = 0.16  # [inch]: of a name in a legend
 WINDOW = 0.05  # of the training, for the rolling mean
 PRINT: dict[Any, Any] = {
     "font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5,
@@ -174,7 +175,7 @@ def line(
 def legend(
     figure: "Figure", style: Style, methods: Mapping[str, Any] | Sequence[str], place: Literal["beside", "below"]
 ) -> None:
-    """What belongs to whom, outside the axes."""
+    """What belongs to whom, outside the axes; beside them it makes the figure as high as it is itself."""
     from matplotlib.lines import Line2D
 
     handles = [
@@ -184,7 +185,10 @@ def legend(
     ]  # fmt: skip
     widest = 0.45 + 0.055 * max(map(len, methods), default=0)  # [inch]: of a handle, and of each letter
     columns = max(1, int(WIDTH / widest))
-    where = {"loc": "outside right center"} if place == "beside" else {"loc": "outside lower center", "ncols": columns}
+    where = {"loc": "outside lower center", "ncols": columns}
+    if place == "beside":
+        where = {"loc": "outside right center"}
+        figure.set_figheight(max(figure.get_figheight(), ROW * (len(handles) + 2)))
     figure.legend(handles=handles, frameon=False, **where)
 
 

@@ -206,14 +206,14 @@ def profiles(data: Data, environment: str, period: int) -> "Figure | None":
                     share, *band = stats.performance_profile([values], thresholds, resamples=2000)
                     line(panel, data.style, name, thresholds, share, band, every=12, alpha=0.1, step="post")
             panel.grid(alpha=0.3)
-            panel.set_title(f"{title}, under {each.by}")
+        row[0].set_ylabel(f"share of policies above,\nunder {each.by}")
         if not any(panel.lines for panel in row):
             for panel in row:
                 instead(panel, NOBODY)
+    for panel, title in zip(axes[0], titles, strict=True):
+        panel.set_title(title)
     for panel in axes[1]:
         as_rates(panel, "x", "crashes per interaction [%]")
-    for panel in axes[:, 0]:
-        panel.set_ylabel("share of policies above")
     legend(figure, data.style, data.methods(environment), "below")
     return figure if any(panel.lines for panel in axes.flat) else None
 
