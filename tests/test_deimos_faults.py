@@ -112,6 +112,26 @@ def test_rows_of_evaluations_at_the_same_time_are_all_kept(run):
     assert [row["worlds"] for row in read_evaluation(run)] == [4, 8]
 
 
+def test_evaluation_that_was_killed_keeps_its_rows(run):
+    """A row is written before the next is begun; the same command goes on from there, to what it would have been."""
+    config = EvalConfig(worlds=4, steps=16, attackers=("argmax", "scripted"), adversary_steps=16)
+    evaluate_run(run, CONFIG.env, config, CPU)
+    whole = read_evaluation(run)
+    (run.path / "evaluation.json").unlink()
+
+    def killed(stage, share):
+        if stage.startswith("scripted"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_run(run, CONFIG.env, config, CPU, killed)
+    assert read_evaluation(run) == whole[:2]
+    made = []
+    evaluate_run(run, CONFIG.env, config, CPU, lambda *at: made.append(at[0]), again=False)
+    assert read_evaluation(run) == whole
+    assert not any(stage.startswith(("naive", "argmax")) for stage in made)
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_signals_end_an_iteration_and_then_the_process(name):
     """The first signal is remembered; a second one meets what was there before, and afterwards all is as it was."""

@@ -188,10 +188,13 @@ def test_curve_of_fear_knows_where_it_stood_still():
     assert "goal_percentile" not in found
 
 
-def test_rows_have_the_rate_of_every_kind_of_ground():
-    """It is the share of goals that were not survived; a kind on which no goal has ended has none."""
-    strata = {"stairs-up 3": {"success": 0.75}, "slope 0": {"success": 1.0}, "waves 1": {"success": math.nan}}
-    assert results._by_kind({"strata": strata}) == {"stairs-up 3": 0.25, "slope 0": 0.0}
+def test_rows_have_the_crashes_on_every_kind_of_ground():
+    """They can be pooled over kinds, and one on which no goal has ended does not spoil a row."""
+    strata = {
+        kind: {"worlds": 2, "interaction_crashes": crashed, "interactions": goals}
+        for kind, crashed, goals in (("stairs-up 3", 5, 20), ("slope 0", 0, 18), ("waves 1", 0, 0))
+    }
+    assert results._by_kind({"strata": strata}) == {"stairs-up 3": [5, 20], "slope 0": [0, 18], "waves 1": [0, 0]}
     assert results._by_kind({}) == {}
 
 

@@ -123,14 +123,19 @@ def evaluate_run(
     same = [row for row in known if any(row.items() >= identity for identity in identities)]
     if len(same) == len(identities) and not again:
         return same
+
+    def keep(row: dict) -> None:
+        """Write a row as soon as it is made: a kill loses the one that is under way."""
+        made = row | weights
+        identity = next(identity for identity in identities if made.items() >= identity)
+        with folder.adding(EVALUATION):
+            others = [other for other in read_evaluation(folder) if not other.items() >= identity]
+            folder.write_json(EVALUATION, [*others, made])
+
     with torch_on_one():
         there = [] if again else same
-        rows = evaluate(policy.scaled, env_config, config, device, progress, known=there, once=once)
-        fresh = [row | weights for row in rows]
-    with folder.adding(EVALUATION):
-        others = [row for row in read_evaluation(folder) if row not in same]  # another process may have added some
-        folder.write_json(EVALUATION, others + fresh)
-    return fresh
+        rows = evaluate(policy.scaled, env_config, config, device, progress, known=there, keep=keep, once=once)
+    return [row | weights for row in rows]
 
 
 def read_evaluation(folder: RunFolder) -> list[dict]:
@@ -224,7 +229,8 @@ def _read(path: Path) -> bytes:
 @own_settings()
 def evaluate(
     policy: Policy, env_config: EnvConfig, config: EvalConfig, device: torch.device,
-    progress: Progress = lambda stage, share: None, *, known: Sequence[dict] = (), once: Once = _at_once,
+    progress: Progress = lambda stage, share: None, *, known: Sequence[dict] = (),
+    keep: Callable[[dict], None] = lambda row: None, once: Once = _at_once,
 ) -> list[dict]:  # fmt: skip
     """Evaluate a policy against uniform goals and against attackers.
 
@@ -235,6 +241,7 @@ def evaluate(
         device: Where to simulate.
         progress: Told how far it is.
         known: Rows of this policy that there are: they are given back and not made again.
+        keep: Called with each row that is made, before the next is begun.
         once: Gives the scale of the score, from what it depends on and a function that computes it; a study keeps it.
 
     Returns:
@@ -269,6 +276,7 @@ def evaluate(
         row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals)) | attack.facts
         row["score"] = (row[measure] - low) / (high - low)
         rows.append({"goals": goals} | row | identity)
+        keep(rows[-1])
     return rows
 
 
@@ -417,13 +425,14 @@ def _matching(env: Env, done: Resolved) -> float:
 
 
 def _by_stratum(strata: list[str], crashes: Tensor, tracking: Tensor, done: Resolved) -> dict[str, dict]:
-    """Worlds, crashes, mean tracking and the share of survived interactions of every kind of world."""
+    """Worlds, crashes, mean tracking, the share of survived interactions and their counts of every kind of world."""
     rows = {}
     for name in sorted(set(strata)):
         own = torch.tensor([stratum == name for stratum in strata], device=crashes.device)
-        success = 1.0 - done.crashed[own[done.env]].float().mean().item()  # NaN where no interaction has ended
+        crashed = done.crashed[own[done.env]]
+        success = 1.0 - crashed.float().mean().item()  # NaN where no interaction has ended
         rows[name] = {
-            "worlds": int(own.sum()), "crashes": int(crashes[own].sum()),
-            "tracking": tracking[own].mean(0).tolist(), "success": success,
+            "worlds": int(own.sum()), "crashes": int(crashes[own].sum()), "tracking": tracking[own].mean(0).tolist(),
+            "success": success, "interactions": len(crashed), "interaction_crashes": int(crashed.sum()),
         }  # fmt: skip
     return rows

@@ -41,7 +41,7 @@ RESULT_COLUMNS = _CELL | {
     # What came out.
     "reward": float, "score": float, "return_per_step": float, "crashes": int, "crashes_per_1000": float,
     "interactions": int, "interaction_crashes": int, "crash_rate": float, "tracking": tuple, "goal_groups": list,
-    "errors": dict, "crash_rate_by_kind": dict,
+    "errors": dict, "crashes_by_kind": dict,
     "first_goal_steps": int, "first_goal_crashes": int,
     "adversary_steps": int, "adversary_interactions": int, "adversary_crashes": int, "adversary_auroc": float,
     "weak_adversary": bool, "uninformed": bool, "even_interactions": int, "even_interaction_crashes": int,
@@ -69,7 +69,7 @@ LATER_COLUMNS = {
     "goal_groups", "uninformed", "even_interactions", "even_interaction_crashes", "base_environment", "levels", "code",
     "block",
     "worst", "worst_attacker", "worst_interactions", "goal_percentile", "fear_chosen", "fear_auroc", "fear_fitted",
-    "explained_variance", "level", "crash_rate_by_kind", *AUDITS,
+    "explained_variance", "level", "crashes_by_kind", *AUDITS,
 }  # fmt: skip
 """Columns that its tables lack."""
 
@@ -186,17 +186,16 @@ def evaluated(cell: Cell, run: RunFolder, rows: Iterable[Row], code: str | None)
     own = {"seed": cell.config.seed, "environment": cell.environment}
     full = [
         shared | row | {
-            "eval_seed": row["seed"], "code": _made_by(row["goals"], code), "crash_rate_by_kind": _by_kind(row),
+            "eval_seed": row["seed"], "code": _made_by(row["goals"], code), "crashes_by_kind": _by_kind(row),
         } | own for row in rows
     ]  # fmt: skip
     # Where a goal has one group of components, its tracking is the reward.
     return [row if len(row["tracking"]) > 1 else row | {"tracking": ()} for row in full]
 
 
-def _by_kind(row: Row) -> dict[str, float]:
-    """Crashes per interaction in worlds of every kind, where there are kinds."""
-    rates = {kind: round(1.0 - own["success"], 4) for kind, own in row.get("strata", {}).items()}
-    return {kind: rate for kind, rate in rates.items() if not math.isnan(rate)}
+def _by_kind(row: Row) -> dict[str, list[int]]:
+    """Interactions that crashed, and all, in worlds of every kind, where there are kinds."""
+    return {kind: [own["interaction_crashes"], own["interactions"]] for kind, own in row.get("strata", {}).items()}
 
 
 def _made_by(goals: str, code: str | None) -> str | None:
