@@ -234,7 +234,7 @@ for name in ("p75", "uniform", "rnd", "cl", "learnability", "band", "boltzmann",
     for t in range(50):
         crash = no.clone()
         crash[t % 4] = t % 3 == 0
-        goal = goals.step(torch.randn(4, 3), goal, crash, no, torch.rand(4, 9, 2) - 0.5).goal
+        goal = goals.step(torch.randn(4, 3), goal, crash, no, torch.rand(4, 9, 2) - 0.5, tracking=torch.rand(4)).goal
     goals.selector.check()
 loaded = {"deimos.kernels", "deimos.sim", "deimos.run", "terrain", "kernels"} & set(sys.modules)
 assert not loaded, loaded
