@@ -6,9 +6,12 @@ installed does it itself, when it is imported, by ``register``.
 
 import dataclasses
 import importlib
+import importlib.util
 import pkgutil
+import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import entry_points
 from types import ModuleType
 from typing import Any
@@ -26,34 +29,70 @@ _registered: dict[str, dict[str, str]] = {}  # by group: names of plug-ins and m
 
 
 def register(package: ModuleType, name: str, module: str) -> None:
-    """Make a module, by its full name, the plug-in ``name`` of ``package`` in this process."""
+    """Make a module, by its full name, the plug-in ``name`` of ``package`` in this process.
+
+    Raises:
+        ValueError: If another module is the plug-in of that name, or there is no such module.
+    """
+    taken = _found(package, name)
+    if taken and taken[0] != module:
+        raise ValueError(f"name must be free in {package.__name__}, got '{name}', which is {taken[0]}.")
+    if not _exists(module):
+        raise ValueError(f"module must be the full name of a module that can be imported, got '{module}'.")
     _registered.setdefault(_group(package), {})[name] = module
 
 
 def names(package: ModuleType) -> list[str]:
-    """Names of the plug-ins of ``package``, sorted: its public modules and what was registered."""
-    return sorted(_own(package) | set(entry_points(group=_group(package)).names) | set(_here(package)))
+    """Names of the plug-ins of ``package``, sorted: its public modules, what was registered, and entry points."""
+    return sorted(name for name, _, _ in _known(package))
 
 
 def has(package: ModuleType, name: str) -> bool:
-    """Whether ``package`` has a plug-in of this name; its own come first, for entry points take long to read."""
-    return name in _own(package) or name in _here(package) or name in names(package)
+    """Whether ``package`` has a plug-in of this name."""
+    return _found(package, name) is not None
 
 
 def _group(package: ModuleType) -> str:
     return "deimos." + package.__name__.rpartition(".")[2]
 
 
-def _here(package: ModuleType) -> dict[str, str]:
-    return _registered.get(_group(package), {})
+def _exists(module: str) -> bool:
+    """Whether a module is there; imports nothing but the packages that it lies in."""
+    if module in sys.modules:
+        return True
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # no such package, or no name of a module
+        return False
 
 
-def _own(package: ModuleType) -> set[str]:
-    return {module.name for module in pkgutil.iter_modules(package.__path__) if not module.name.startswith("_")}
+def _known(package: ModuleType) -> Iterator[tuple[str, str, Callable[[], ModuleType]]]:
+    """Name, module and importer of every plug-in of ``package``, each name once.
+
+    Its own come first, and entry points last: they take long to read, and who has found a name reads no further.
+    """
+    own = {
+        module.name: f"{package.__name__}.{module.name}"
+        for module in pkgutil.iter_modules(package.__path__)
+        if not module.name.startswith("_")
+    }
+    here = _registered.get(_group(package), {}) | own
+    for name, module in here.items():
+        yield name, module, partial(importlib.import_module, module)
+    told = set(here)
+    for entry in entry_points(group=_group(package)):
+        if entry.name not in told:
+            told.add(entry.name)
+            yield entry.name, entry.module, entry.load
+
+
+def _found(package: ModuleType, name: str) -> tuple[str, Callable[[], ModuleType]] | None:
+    """Module and importer of the plug-in of this name."""
+    return next(((module, importer) for known, module, importer in _known(package) if known == name), None)
 
 
 def load(package: ModuleType, name: str, use: Callable[[ModuleType], Any] = lambda module: module) -> Any:
-    """Import the plug-in ``name`` of ``package``; its own modules come before foreign ones of the same name.
+    """Import the plug-in ``name`` of ``package``; its own module comes before a foreign one of that name.
 
     Args:
         package: Where it is.
@@ -67,14 +106,13 @@ def load(package: ModuleType, name: str, use: Callable[[ModuleType], Any] = lamb
         ValueError: If there is none; the message lists those that there are.
         RunError: If it is broken.
     """
-    group, own = _group(package), name in _own(package)
-    entry = None if own else next(iter(entry_points(group=group, name=name)), None)
-    module = f"{package.__name__}.{name}" if own else entry.value if entry else _here(package).get(name)
-    if module is None:
+    plugin = _found(package, name)
+    if plugin is None:
         raise ValueError(f"{package.__name__} has no '{name}'; it has: {', '.join(names(package))}.")
+    group, (module, importer) = _group(package), plugin
     kind, held = HOLDS[group]
     try:
-        found = entry.load() if entry else importlib.import_module(module)
+        found = importer()
         thing = getattr(found, held, None)
         if not (callable(thing) if kind == "function" else dataclasses.is_dataclass(thing)):
             raise TypeError(f"it holds no {kind} {held}")
@@ -97,8 +135,4 @@ def load_all(package: ModuleType, use: Callable[[ModuleType], Any] = lambda modu
 
 def name_of(package: ModuleType, module: str) -> str | None:
     """Name of the plug-in of ``package`` that a module is, by its full name; ``None`` if of none. Imports nothing."""
-    parent, _, name = module.rpartition(".")
-    if parent == package.__name__ and name in _own(package):
-        return name
-    foreign = {entry.module: entry.name for entry in entry_points(group=_group(package))}
-    return (foreign | {value: key for key, value in _here(package).items()}).get(module)
+    return next((name for name, known, _ in _known(package) if known == module), None)

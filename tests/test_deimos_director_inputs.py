@@ -2,7 +2,6 @@
 
 import re
 from contextlib import nullcontext
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +9,7 @@ import torch
 
 from deimos import GoalDirector
 from deimos.goals.fear import FearConfig
-from deimos.goals.selector import Transitions
-from deimos.goals.selectors import cl, director, plr, vds
-from deimos.learn.rollout import Rollout
+from deimos.goals.selectors import director
 
 AFRAID = director.Config(percentile=75, candidates=20, fear=FearConfig(min_per_class=4))
 N = 64
@@ -139,61 +136,6 @@ def test_it_draws_from_the_box():
     np.testing.assert_array_equal(few.propose([7, 3], np.zeros((2, 1)), np.zeros((2, 2))), every[0][[7, 3]])
 
 
-def test_candidates_stay_within_the_announced_range():
-    """A curriculum's share shrinks the box around its middle: for what is drawn, and for what is given."""
-    goals = GoalDirector("cl", 1, goal_box=([0.0], [8.0]), num_envs=50, state_dim=1, goal_dim=1, device="cpu")
-    drawn = goals.propose(None, np.zeros((50, 1)), np.zeros((50, 1)))
-    assert 3.0 <= drawn.min() < 3.3
-    assert 4.7 < drawn.max() <= 5.0
-    for value in (2.5, 5.5):
-        with pytest.raises(
-            ValueError, match=rf"candidates must lie between \[3\.0\] and \[5\.0\], got \[{value}\] for world 4"
-        ):
-            goals.propose([4], np.zeros((1, 1)), np.zeros((1, 1)), np.full((1, 2, 1), value))
-    goals.propose([4], np.zeros((1, 1)), np.zeros((1, 1)), np.full((1, 2, 1), 4.9))
-
-
-def test_a_curriculum_follows_each_group_of_components():
-    """Only the range of the components that are met grows."""
-    config = cl.Config(min_interactions=10)
-    goals = GoalDirector(config, 2, groups=(slice(0, 2), slice(2, 3)), learn_every=4)
-    met = torch.tensor([1.0, 0.0]).expand(N, 2)
-    goal = torch.zeros(N, 3)
-    for _ in range(12):
-        goal = goals.step(torch.zeros(N, 1), goal, NO, NO, torch.zeros(N, 1, 3), tracking=met).goal
-    assert goals.goal_range[0] == goals.goal_range[1] > 0.25
-    assert goals.goal_range[2] == 0.25
-    with pytest.raises(ValueError, match=rf"tracking must have the shape \({N}, 2\), got \({N},\)"):
-        goals.step(torch.zeros(N, 1), goal, NO, NO, torch.zeros(N, 1, 3), tracking=met[:, 0])
-    goals.step(torch.zeros(N, 1), goal, NO, NO, torch.zeros(N, 1, 3))  # nobody tells: none is met
-
-
-@pytest.mark.parametrize("config", [vds.Config(hidden=(8,)), plr.Config(capacity=20, candidates=5)])
-def test_selectors_learn_from_the_learners_transitions(config, caplog):
-    """``learn`` hands them a rollout; until somebody calls it they say so once, and goals are chosen all the same."""
-    goals = GoalDirector(config, 3, learn_every=6, goal_box=([-1.0], [1.0]))
-    rollout, goal = Rollout(6, N, 3, 1, torch.device("cpu")), torch.zeros(N, 1)
-    before = None
-    for _ in range(5):
-        for t in range(6):
-            rollout.obs[t] = torch.cat([torch.zeros(N, 2), goal], dim=1)
-            goal = goals.step(torch.zeros(N, 2), goal, NO, NO).goal
-            rollout.reward[t] = goal[:, 0]
-        rollout.advantage.copy_(rollout.reward)
-        before = before or repr(goals.selector.state_dict())
-        found = goals.learn(rollout)
-    assert found == goals.metrics
-    assert repr(goals.selector.state_dict()) != before
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 1
-    assert "learns from the learner's transitions: call learn(rollout)" in said[0]
-    with pytest.raises(ValueError, match="needs the learner's rollout, got None"):
-        goals.learn()
-    parts = {name: None for name in Transitions.__annotations__}
-    with pytest.raises(ValueError, match=r"rollout must have num_steps, .*; it lacks cut_off\."):
-        goals.learn(SimpleNamespace(**parts))
-
-
 def test_a_risk_map_is_fear_over_a_grid():
     """Every cell is the fear of the new goal whose two components are the cell's, the others those of the goal."""
     goals = GoalDirector(AFRAID, 4, learn_every=12, goal_box=([-1, -1], [1, 1]))
@@ -239,6 +181,8 @@ NAN = torch.tensor([[0.0], [torch.nan]])
         ({"state": NAN.expand(2, 3)}, r"state of world 1 must be finite, got \[nan, nan, nan\]"),
         ({"goal": NAN}, r"goal of world 1 must be finite, got \[nan\]"),
         ({"tracking": NAN[:, 0]}, "tracking of world 1 must be finite, got nan"),
+        ({"tracking": [1.0, 7.0]}, r"tracking of world 1 must be in \[0, 1\], got 7.0"),
+        ({"tracking": [0.0, -0.1]}, r"tracking of world 1 must be in \[0, 1\], got -0.1"),
         ({"executed": NAN}, r"executed of world 1 must be finite, got \[nan\]"),
         ({"candidates": NAN.unsqueeze(1)}, r"candidates of world 1 must be finite, got \[\[nan\]\]"),
         ({"candidates": lambda rows: torch.zeros(len(rows), 4)}, r"candidates must have the shape .*, got \(2, 4\)"),
@@ -338,6 +282,12 @@ OPTIONS += [
     (KNOWN | {"goal_box": ([0], [np.inf])}, "goal_box must be the lowest and the highest goal, finite"),
     (KNOWN | {"goal_box": ([0, 0], [1, 1])}, r"goal_box must have the shape \(1,\), got \(2,\)"),
 ]
+OPTIONS += [
+    (KNOWN | {"goal_dim": 3, "groups": groups}, "groups must be slices that name each of the 3 components .* once, got")
+    for groups in (
+        (slice(0, 2), slice(1, 3)), (slice(0, 1), slice(2, 3)), (slice(0, 3), slice(3, 4)), (slice(0, 2), 2), (),
+    )
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("options", "message"), OPTIONS)

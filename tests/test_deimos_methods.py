@@ -65,7 +65,7 @@ def test_config_rejects(config, field, value, message):
 
 def test_an_unknown_method_lists_the_known_ones():
     """The message lists every method."""
-    for name in ("p101", "p1e1", "p07", "p-1", "p", "nope", ""):
+    for name in ("p101", "p1e1", "p07", "p-1", "p", "nope", "", "penalty-NN", "uniform-literal", "p75-"):
         with pytest.raises(ValueError, match=f"no method '{name}'; there are: uniform, coop, p10") as caught:
             method(name)
         assert all(known in str(caught.value) for known in [*METHODS, "pNN", "boltzmann", "schedule"])
@@ -76,6 +76,14 @@ def test_every_percentile_is_a_method(name, percentile):
     """A p and a percentile in [0, 100] is the Director at that percentile; the table stays what it is."""
     assert method(name) == director.Config(percentile=percentile)
     assert name not in METHODS
+
+
+@pytest.mark.parametrize("name", ["p75-literal-threshold", "p75-threshold-literal", "coop-literal-literal"])
+def test_a_fear_has_one_kind_of_data(name):
+    """A second suffix would quietly win over the first one, so there is no such method."""
+    assert method(name.rpartition("-")[0]).memory == 0
+    with pytest.raises(ValueError, match=f"no method '{name}'"):
+        method(name)
 
 
 def test_every_selector_is_a_method():

@@ -188,6 +188,37 @@ def test_a_broken_plugin_stops_no_other(install, tmp_path, capsys, group, kind, 
     assert capsys.readouterr().err == f"deimos: {message}\n"
 
 
+def test_a_plugin_is_registered_once(new_plugins, tmp_path, monkeypatch):
+    """A name that is taken, by a file or by another registration, and a module that is not there are refused."""
+    (tmp_path / "my_selector.py").write_text(SELECTOR)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = plugins.names(selectors)
+    plugins.register(selectors, "longest", "my_selector")
+    plugins.register(selectors, "longest", "my_selector")  # a module that is imported anew
+    assert plugins.names(selectors) == sorted([*before, "longest"])
+    for name, owner in (("director", "deimos.goals.selectors.director"), ("longest", "my_selector")):
+        with pytest.raises(ValueError, match=f"name must be free in .*, got '{name}', which is {re.escape(owner)}"):
+            plugins.register(selectors, name, "deimos.goals.selectors.uniform")
+    for module in ("no_such_module", "no_such_package.module", "json.no_such_module", ""):
+        with pytest.raises(ValueError, match=f"module must be .* that can be imported, got '{module}'"):
+            plugins.register(selectors, "other", module)
+    assert not plugins.has(selectors, "other")
+
+
+def test_every_lookup_finds_the_same_plugin(new_plugins, install, tmp_path):
+    """A registered module precedes an entry point of its name: when it is listed, loaded, and named again."""
+    (tmp_path / "my_selector.py").write_text(SELECTOR)
+    install("deimos.selectors", "longest", SELECTOR)
+    with pytest.raises(ValueError, match=r"name must be free in .*, got 'longest', which is other_module"):
+        plugins.register(selectors, "longest", "my_selector")
+    assert plugins.name_of(selectors, "other_module") == "longest"
+    plugins._registered["deimos.selectors"] = {"longest": "my_selector"}  # by a module that came before the package
+    assert plugins.names(selectors).count("longest") == 1
+    assert plugins.load(selectors, "longest").__name__ == "my_selector"
+    assert plugins.name_of(selectors, "my_selector") == "longest"
+    assert plugins.name_of(selectors, "other_module") is None
+
+
 def test_entry_point_is_a_robot(install):
     """A module of another distribution that is registered under ``deimos.robots`` can be asked for by its name."""
     before = plugins.names(robots)

@@ -37,6 +37,8 @@ class GoalClocks(Stateful):
         self._goal = torch.zeros(count, spaces.goal_dim, dtype=torch.float32, device=device)
         groups = () if spaces.groups == (slice(None),) else (len(spaces.groups),)
         self._untracked = torch.zeros(count, *groups, dtype=torch.float32, device=device)
+        self.tracked = False
+        """Whether anybody has told how well goals are met."""
         self._draws: Tensor | None = None  # for the next decision of every world, until the step _drawn_until
         self._drawn_until = 0
 
@@ -68,6 +70,7 @@ class GoalClocks(Stateful):
             due = self._age >= self.core.goal_period
         else:
             due = interactions.active & (interactions.now + 1 - interactions.issued_at >= interactions.horizon)
+        self.tracked |= tracking is not None
         tracking = self._untracked if tracking is None else tracking
         reward, columns = (tracking, None) if tracking.dim() == 1 else (torch.zeros_like(tracking[:, 0]), tracking)
         changes = self.core.advance(terminated, truncated, due, reward, columns)

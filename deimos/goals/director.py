@@ -282,10 +282,10 @@ class GoalDirector:
             ``metrics``.
 
         Raises:
-            ValueError: If the selector needs a rollout and gets none, or it lacks something.
+            ValueError: If the selector needs a rollout and gets none, or not that of all steps since the last call.
         """
         core = self._known.core
-        given.check_transitions(rollout)
+        given.check_transitions(rollout, core, self._learnt_at)
         self.metrics, self._learnt_at = core.learn(rollout), core.interactions.now
         return self.metrics
 
@@ -394,11 +394,11 @@ class GoalDirector:
     @own_settings()
     @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
     def _begin(self, inputs: Inputs) -> GoalClocks:
+        box = None if self._goal_box is None else GoalBox(*self._goal_box, inputs.goal_dim, inputs.device)
         spaces = Spaces(
             inputs.num_envs, inputs.state_dim + self._horizon_input, inputs.goal_dim, self.max_horizon, inputs.device,
-            groups=self._groups, total_steps=self._total_steps,
+            groups=self._groups, total_steps=self._total_steps, goal_middle=None if box is None else box.middle,
         )  # fmt: skip
-        box = None if self._goal_box is None else GoalBox(*self._goal_box, inputs.goal_dim, inputs.device)
         any_number = self._choose_first or self.goal_period is None  # of goals within 2 T steps
         core = GoalCore(self._config.build(spaces, self._seed), spaces, capacity=SPARE if any_number else None)
         self._clocks = GoalClocks(core, spaces, self._seed, self._choose_first, self._next_step)
@@ -440,11 +440,11 @@ class GoalDirector:
 
     def _learn_if_due(self) -> None:
         """The update of every ``learn_every`` steps, once."""
-        core = self._known.core
+        core, tracked = self._known.core, self._known.tracked
         now = core.interactions.now
         if now % self.learn_every or now == self._learnt_at:
             return
+        for lack in given.lacking(core.selector, self._learnt_at > 0, tracked) if now == self.learn_every else ():
+            _log.warning(lack)
         if not core.selector.needs_rollout:
             self.learn()
-        elif not self._learnt_at and now == self.learn_every:
-            _log.warning("%s learns from the learner's transitions: call learn(rollout).", self._made_with["selector"])

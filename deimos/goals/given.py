@@ -1,6 +1,6 @@
 """What other people's loops hand over, as tensors of ours: checked, without gradients, floats as float32."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.goals.selector import Transitions
+from deimos.goals.core import GoalCore
+from deimos.goals.selector import Delegate, GoalSelector, Transitions, with_parts
 from deimos.nn.random import Purpose, uniforms
 
 Array = Tensor | np.ndarray
@@ -124,6 +125,19 @@ def refuse_not_finite(
         raise ValueError(f"{name} of {what} {world} must be finite, got {numbers[row].tolist()}.")
 
 
+def refuse_outside_0_and_1(name: str, numbers: Tensor) -> None:
+    """Raise ``ValueError`` that names the first world in which a number lies outside, but for rounding.
+
+    Args:
+        name: What they are.
+        numbers: Finite, shape (num_envs, ...).
+    """
+    outside = (numbers - 0.5).abs() > 0.5 + 1e-5
+    if bool(outside.any()):
+        world = int(outside.nonzero()[0, 0])
+        raise ValueError(f"{name} of world {world} must be in [0, 1], got {numbers[world].tolist()}.")
+
+
 def like(values: Tensor, model: A) -> A:
     """Values as an array if ``model`` is one, else as a tensor; floats in its dtype, if it has floats."""
     if isinstance(model, Tensor):
@@ -186,6 +200,7 @@ class Inputs:
         if tracking is not None:
             met = floats("tracking", tracking, (self.num_envs, *self.columns), self.device)
             refuse_not_finite("tracking", met)
+            refuse_outside_0_and_1("tracking", met)
         if executed is not None:
             pursued = self.goals(executed, self.num_envs, "executed")
             refuse_not_finite("executed", pursued)
@@ -215,15 +230,58 @@ class Inputs:
         return steps.long().expand(count)
 
 
-def check_transitions(rollout: Transitions | None) -> None:
-    """Raise ``ValueError`` if something is missing in what a selector learns from."""
+def check_transitions(rollout: Transitions | None, core: GoalCore, since: int) -> None:
+    """Check what a selector learns from, if it is there.
+
+    Args:
+        rollout: Transitions.
+        core: The selector, and the interactions that it learns from as well.
+        since: Step of its last update.
+
+    Raises:
+        ValueError: If something is missing; or if the selector needs it, and it is not of all worlds in all steps since
+            then, or holds what is not finite.
+    """
+    if rollout is None:
+        return
     wanted = [*Transitions.__annotations__, "cut_off"]
-    missing = [name for name in wanted if rollout is not None and not hasattr(rollout, name)]
+    missing = [name for name in wanted if not hasattr(rollout, name)]
     if missing:
         raise ValueError(
             f"rollout must have {', '.join(wanted)}, as deimos.goals.selector.Transitions says; it lacks "
             f"{', '.join(missing)}."
         )
+    if not core.selector.needs_rollout:
+        return
+    steps, num_envs = core.interactions.now - since, len(core.weight)
+    if rollout.num_steps != steps:
+        raise ValueError(
+            f"rollout must hold the transitions since the last call of learn(), {steps} steps, got {rollout.num_steps}."
+        )
+    for name in ("obs", "reward", "terminated", "truncated", "weight", "advantage"):
+        values = tensor(f"rollout.{name}", getattr(rollout, name), core.weight.device)
+        expected = (steps + 1, num_envs, *values.shape[2:3]) if name == "obs" else (steps, num_envs)
+        if values.shape != expected:
+            raise ValueError(f"rollout.{name} must have the shape {expected}, got {tuple(values.shape)}.")
+        if not bool(values.isfinite().all()):
+            step, world = (~values.isfinite()).nonzero()[0, :2].tolist()
+            raise ValueError(f"rollout.{name} must be finite, got {values[step, world].tolist()} in world {world}.")
+
+
+def lacking(selector: GoalSelector, taught: bool, tracked: bool) -> Iterator[str]:
+    """What a selector needs and nobody has told it, a sentence each.
+
+    Args:
+        selector: Who chooses; what it is made of is asked too.
+        taught: Whether it has learnt yet.
+        tracked: Whether anybody has told how well goals are met.
+    """
+    for part in with_parts(selector):
+        who = type(part).__module__
+        if part.needs_rollout and not taught and not isinstance(part, Delegate):
+            yield f"{who} learns from the learner's transitions: call learn(rollout)."
+        if part.needs_tracking and not tracked:
+            yield f"{who} follows how well goals are met, and stays as it is until you give tracking."
 
 
 class GoalBox:
@@ -242,6 +300,8 @@ class GoalBox:
     def __init__(self, low: Bound, high: Bound, goal_dim: int, device: torch.device) -> None:
         below, above = (floats("goal_box", end, (goal_dim,), device) for end in (low, high))
         self._middle, self._half = (below + above) / 2, (above - below) / 2
+        self.middle: tuple[float, ...] = tuple(self._middle.tolist())
+        """Of every component."""
         if not bool(((self._half > 0) & self._half.isfinite()).all()):
             raise ValueError(
                 f"goal_box must be the lowest and the highest goal, finite, got {below.tolist()} and {above.tolist()}."

@@ -60,8 +60,8 @@ def method(name: str) -> SelectorConfig:
 
     Args:
         name: One of ``METHODS``; or ``pNN``, the Director at that percentile, in [0, 100], such as p33 or p12.5; or
-            any Director's name with one of ``DATA``, such as p75-literal or coop-threshold; or the name of a selector,
-            also one of another package, with its defaults.
+            any Director's name with one of ``DATA``, such as p75-literal or coop-threshold; or else the name of a
+            selector, also one of another package, with its defaults.
 
     Raises:
         ValueError: If there is no such method; the message lists those that there are.
@@ -77,16 +77,19 @@ def method(name: str) -> SelectorConfig:
 
 
 def _spelled_out(name: str) -> tuple[str, dict[str, Any]]:
-    """The selector that a name stands for, and its options."""
+    """The selector that a name stands for, and its options; a suffix is one of ``DATA``, once."""
+    base, _, data = name.rpartition("-")
+    kind, options = _without_suffix(base)
+    if data in DATA and kind == "director":
+        return kind, options | DATA[data]
+    return _without_suffix(name)
+
+
+def _without_suffix(name: str) -> tuple[str, dict[str, Any]]:
     if name in METHODS:
         return METHODS[name]
     if re.fullmatch(r"p\d{1,3}(\.\d+)?", name):
         percentile = float(name[1:])
         if percentile <= 100 and name == f"p{percentile:g}":  # no second spelling, such as p07
             return "director", {"percentile": percentile}
-    base, _, data = name.rpartition("-")
-    if data in DATA:
-        kind, options = _spelled_out(base)
-        if kind == "director":
-            return kind, options | DATA[data]
     return name, {}

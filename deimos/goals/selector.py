@@ -33,6 +33,17 @@ class Spaces:
     """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
     total_steps: int = 0
     """Steps of the whole training; 0 where nobody knows."""
+    goal_middle: tuple[float, ...] | None = None
+    """Middle of the range of every component of a goal; ``None`` for 0, as in the policy's scale."""
+
+    def __post_init__(self) -> None:
+        components = range(self.goal_dim)
+        named = [components[group] if isinstance(group, slice) else range(0) for group in self.groups]
+        if not all(named) or sorted(component for group in named for component in group) != list(components):
+            raise ValueError(
+                f"groups must be slices that name each of the {self.goal_dim} components of a goal once, got "
+                f"{self.groups}."
+            )
 
     def state_then_goal(self, obs: Tensor) -> Tensor:
         """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""
@@ -123,6 +134,8 @@ class GoalSelector(Stateful, abc.ABC):
     """The selectors that it is made of."""
     needs_rollout: bool = False
     """Whether ``learn`` needs the learner's transitions."""
+    needs_tracking: bool = False
+    """Whether ``learn`` follows how well goals are met, and does nothing where nobody tells."""
     first_goals_scaled: bool = False
     """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
     crash_penalty: float = 0.0

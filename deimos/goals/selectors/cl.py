@@ -40,6 +40,7 @@ class Config(SelectorConfig):
 class Curriculum(GoalSelector):
     """See ``Config``."""
 
+    needs_tracking = True
     first_goals_scaled = True
     dense = True
     saved = ("_range", "share", "_since", "_counted_at", "_sum", "_count")

@@ -15,7 +15,10 @@ from deimos.nn.ranks import max_over_ranks
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """Goals by the weights of grid cells, which rise around every cell whose goals are tracked well."""
+    """Goals by the weights of grid cells, which rise around every cell whose goals are tracked well.
+
+    The cells reach as far as goals do from the middle of their range; who gives no ``goal_box`` has goals around 0.
+    """
 
     bins: int = 8
     """Cells along every component of a goal, at least 2. Every group of components has a grid of its own."""
@@ -46,12 +49,13 @@ class Config(SelectorConfig):
 
 
 class Grid(GoalSelector):
-    """See ``Config``. Until it has learnt once, and so knows the range of goals, it is uniform.
+    """See ``Config``. Until it has learnt once, and so knows how far goals reach, it is uniform.
 
     Raises:
         ValueError: If a group's grid would have more than 2^20 cells.
     """
 
+    needs_tracking = True
     dense = True
     saved = ("_weights", "_seen", "_half", "_learnt_at", "fitted")
 
@@ -65,11 +69,12 @@ class Grid(GoalSelector):
         if largest > 2**20:
             raise ValueError(f"bins must give at most 2^20 cells per group, got {config.bins} bins: {largest} cells.")
         self._weights = tuple(self._initial(len(group), device) for group in self._groups)
-        self._seen = torch.zeros(spaces.goal_dim, dtype=torch.float32, device=device)  # largest candidate so far
-        self._half = torch.zeros(spaces.goal_dim, dtype=torch.float32, device=device)  # what the cells are cut from
+        # The cells are cut from ``_half`` below to ``_half`` above the middle: as far as candidates have been seen.
+        self._middle = torch.tensor(spaces.goal_middle or [0.0] * spaces.goal_dim, dtype=torch.float32, device=device)
+        self._seen, self._half = torch.zeros_like(self._middle), torch.zeros_like(self._middle)
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
-        """Whether the range of goals is known."""
+        """Whether it is known how far goals reach."""
 
     def _initial(self, dims: int, device: torch.device) -> Tensor:
         """Weight 1 in the middle of the range, shape (bins,) * dims."""
@@ -101,13 +106,13 @@ class Grid(GoalSelector):
         where: Tensor | None = None,
     ) -> None:  # fmt: skip
         """See ``GoalSelector.issued``."""
-        seen = candidates.abs().amax(1)
+        seen = (candidates - self._middle).abs().amax(1)
         seen = seen if where is None else seen.masked_fill_(~where.unsqueeze(1), 0.0)
         torch.maximum(self._seen, seen.amax(0), out=self._seen)
 
     def _cells(self, goal: Tensor) -> Tensor:
         """Cell of every component, int64, same shape."""
-        share = goal / (2 * self._half) + 0.5
+        share = (goal - self._middle) / (2 * self._half) + 0.5
         return (share * self.config.bins).long().clamp(0, self.config.bins - 1)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
