@@ -11,10 +11,10 @@ LONGEST_FILE, LONGEST_FUNCTION = 450, 60  # lines
 
 
 def test_wheel_holds_every_package():
-    """pyproject.toml lists every package of deimos, kernels and terrain, and nothing else."""
-    listed = tomllib.loads((HOME / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    """pyproject.toml lists every package of deimos, kernels and terrain and those that hold data, and nothing else."""
+    build = tomllib.loads((HOME / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
     there = {module_name(path) for path in sources("deimos", "kernels", "terrain") if path.endswith("__init__.py")}
-    assert sorted(listed) == sorted(there)
+    assert sorted(build["packages"]) == sorted(there | set(build["package-data"]))
 
 
 def test_readme_holds_two_setup_lines():
