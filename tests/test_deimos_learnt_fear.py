@@ -7,6 +7,9 @@ import torch
 from short_training import CONFIG
 from states import assert_same
 
+from deimos.app.view import caption
+from deimos.app.viewer_panel import Moment
+from deimos.app.viewer_scene import build_scene
 from deimos.app.viewer_session import BY_HAND, UNIFORM, Session
 from deimos.checks import RunError
 from deimos.goals.fear_selector import fear_selector
@@ -68,6 +71,8 @@ def test_the_viewer_shows_its_fear_and_lets_it_choose(run):
     assert session.names == [UNIFORM, label, BY_HAND]
     assert type(session.goals.choices[label]) is type(trainer.loop.selector)
     assert session.fear_map().probability.isfinite().all()
+    name = "predicted crash probability" if label != "q_fear" else "fear (no probability)"
+    assert f"\n{name} " in caption(Moment.of(session, build_scene(session)))
     session.choose(label)
     assert len(session.next_goal()) == 3
 
