@@ -77,6 +77,26 @@ def test_the_viewer_shows_its_fear_and_lets_it_choose(run):
     assert len(session.next_goal()) == 3
 
 
+def test_a_curriculum_keeps_its_range_in_the_viewer(tmp_path):
+    """Before its switch, a schedule that begins with a curriculum draws its goals from the curriculum's range."""
+    config = replace(CONFIG, selector=schedule.Config(first="cl", second="p75"))
+    trainer, folder = training.start(config, tmp_path / "run")
+    for _ in range(4):
+        trainer.iterate()
+    training.save(trainer, folder)
+    session = Session(SavedRun.open(tmp_path / "run"), 1, seed=0)
+    high = session.bounds()[1].tolist()
+    reach = {}
+    for name in (UNIFORM, "schedule"):
+        session.choose(name)
+        goals = []
+        for world in range(30):
+            session.go_to(world)
+            goals.append(session.next_goal())
+        reach[name] = max(abs(value) / side for goal in goals for value, side in zip(goal, high, strict=True))
+    assert reach["schedule"] <= 0.25 < reach[UNIFORM]
+
+
 def test_what_earlier_versions_saved_is_read(tmp_path):
     """What a state lacks is as in a new selector, a mix may be saved as its method, and networks alone are none."""
     path, config = tmp_path / "run", replace(CONFIG, selector=METHODS["boltzmann"], env_steps=120)
