@@ -175,8 +175,8 @@ def test_what_wants_to_know_who_is_due_waits(as_on_gpu):
 
 
 def test_probing_and_controls_do_not_wait_either(as_on_gpu):
-    """Nor do probes, a gate, shuffled scores and the thesis's literal fear."""
-    for changes in ({"probe": 0.3, "gate": True}, {"control": "shuffled", "memory": 0}, {"rule": "argmin"}):
+    """Nor do probes, shuffled scores and the thesis's literal fear."""
+    for changes in ({"probe": 0.3}, {"control": "shuffled", "memory": 0}, {"rule": "argmin"}):
         trainer = trained(replace(methods.method("p75"), **changes), 1)
         with counted() as calls:
             trainer.collect()

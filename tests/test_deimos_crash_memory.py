@@ -324,20 +324,6 @@ def test_literal_fear_learns_from_the_window_alone():
     assert (weight == 1).all()
 
 
-def test_the_gate_opens_and_closes():
-    """Behind a gate goals are uniform as long as forecasts rank no better than chance; without one they never are."""
-    spaces = Spaces(num_envs=4, state_dim=3, goal_dim=2, goal_period=5, device=CPU)
-    for gate in (True, False):
-        selector = director.Config(rule="argmax", candidates=9, gate=gate).build(spaces, 0)
-        selector.fear.fitted = True
-        arguments = torch.arange(4), torch.randn(4, 3), torch.randn(4, 2), torch.randn(4, 9, 2), torch.rand(4, 4)
-        for quality, chooses in ((math.nan, True), (0.7, True), (0.5, not gate), (0.3, not gate)):
-            selector._auroc = quality
-            assert selector.afraid == chooses
-            assert selector.propose(*arguments).score.isfinite().all() == chooses
-    assert not method("p75").gate
-
-
 def goals_of(director_, steps=60):
     """Let a GoalDirector serve four worlds, one of which crashes now and then."""
     no, goal = torch.zeros(4, dtype=torch.bool), torch.zeros(4, 2)

@@ -24,7 +24,7 @@ PARTICLES = particle.Config(
     variant="relative", goal_period=7, time_limit=33, stagger_goals=True, max_speed=150.0, max_force=150.0
 )
 SELECTORS = {name: methods.method(name) for name in methods.METHODS} | {
-    "probing": replace(methods.method("p75"), probe=0.3, gate=True), "literal": methods.method("p75-literal"),
+    "probing": replace(methods.method("p75"), probe=0.3), "literal": methods.method("p75-literal"),
     "some uniform": mix.Config(base="p75"), "rnd by chance": rnd.Config(rule="proportional"),
 }  # fmt: skip
 

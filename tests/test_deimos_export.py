@@ -5,6 +5,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +15,19 @@ import pytest
 import torch
 import yaml
 from deimos.terrain.shapes.stairs import Shape as Stairs
+from short_training import CONFIG
 
 from deimos import terrain
 from deimos.app import cli
 from deimos.app.export import check
 from deimos.checks import RunError
+from deimos.goals.methods import method
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import director
 from deimos.learn.policy import Policy
 from deimos.nn.layout import ObsField, seen_by
 from deimos.nn.networks import Actor
-from deimos.run import export, export_controller, export_robot
+from deimos.run import export, export_controller, export_robot, training
 from deimos.run.export_onnx import IR_VERSION, OPSET, fear_model, policy_model
 from deimos.run.folder import RunFolder
 from deimos.sim.envs import quad, quad_arm
@@ -143,6 +146,57 @@ def test_robots_walk_alone_as_they_did_at_the_export(walker, capfd):
     said = capfd.readouterr().out
     assert "16 robots walk 1 s: 0 fall, at the export 0" in said
     assert "It is what was exported." in said
+
+
+def some_measurements(controller):
+    """What robots measure that stand in their default position, under no goal."""
+    return {
+        entry["name"]: np.zeros((len(controller.action), entry["size"]))
+        for entry in controller.deploy["observation"] if entry["name"] != "last_action"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
+def test_a_controller_takes_no_number_that_is_none(walker, value):
+    """A measurement that is not finite, or leaves float32, is refused, and the next sound one is answered as ever."""
+    controller, other = (export_controller.Controller(walker, 2) for _ in range(2))
+    measured = some_measurements(controller)
+    for each in (controller, other):
+        each.targets(measured)
+    broken = measured | {"joint_velocity": measured["joint_velocity"].copy()}
+    broken["joint_velocity"][1, 4] = value
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match=r"must be finite, got \[.*\] of robot 1"):
+        controller.targets(broken)
+    assert controller.action.any()
+    targets = controller.targets(measured)
+    assert np.isfinite(targets).all()
+    np.testing.assert_array_equal(targets, other.targets(measured))
+
+
+def test_a_controller_begins_anew(walker):
+    """After a reset robots are controlled as at first, and those that it leaves out go on."""
+    controller = export_controller.Controller(walker, 2)
+    measured = some_measurements(controller)
+    first, second = (controller.targets(measured) for _ in range(2))
+    assert (first != second).any()
+    controller.reset()
+    np.testing.assert_array_equal(controller.targets(measured), first)
+    controller.reset([0])
+    third = controller.targets(measured)
+    np.testing.assert_array_equal(third[0], first[0])
+    np.testing.assert_array_equal(third[1], second[1])
+
+
+def test_a_controller_is_for_robots_and_their_sizes(walker, tmp_path):
+    """A measurement of another size, and an export without a robot, are named."""
+    controller = export_controller.Controller(walker, 2)
+    measured = some_measurements(controller) | {"gravity": np.zeros((1, 3))}
+    with pytest.raises(ValueError, match=r"gravity must have shape \(2, 3\), got \(1, 3\)"):
+        controller.targets(measured)
+    (tmp_path / "deploy.json").write_text(json.dumps({"environment": "particle", "robot": None}))
+    for make in (export_controller.Controller, lambda folder: export_controller.Simulation(folder, (), ())):
+        with pytest.raises(ValueError, match="must be an export of a legged robot, got one of particle"):
+            make(tmp_path)
 
 
 def test_numbers_are_those_of_the_robot(walker):
@@ -285,6 +339,7 @@ def test_particles_with_fear_and_shield(particles, tmp_path, capsys):
     assert deploy["robot"] is None
     assert not (out / "robot.xml").exists()
     assert deploy["fear"]["goal_period"] == 10
+    assert deploy["fear"]["outputs"] == ["logit", "probability"]
     assert [entry["name"] for entry in deploy["fear"]["state"]] == ["velocity", "position", "last_action"]
     assert deploy["shield"] == json.loads((particles / "shield.json").read_text())["deploy"]
     example = HOME / "examples" / "deploy" / "shield.py"
@@ -301,6 +356,20 @@ def test_particles_with_fear_and_shield(particles, tmp_path, capsys):
             ).stdout.splitlines()
             assert word in first
             assert second == f"pursue {goal}"
+
+
+def test_fear_that_is_no_probability_is_not_exported_as_one(tmp_path, capsys):
+    """The fear of Q-fear looks beyond T steps: its file gives logits alone, and the check holds."""
+    config = replace(CONFIG, selector=method("q-fear"), env_steps=120)
+    trainer, folder = training.start(config, tmp_path / "run")
+    assert training.train(trainer, folder)
+    out = tmp_path / "out"
+    export.export_run(folder, out, check=True)
+    fear = json.loads((out / "deploy.json").read_text())["fear"]
+    assert (fear["outputs"], fear["calibration"]) == (["logit"], None)
+    assert [output.name for output in onnx.load(out / "fear.onnx").graph.output] == ["logit"]
+    assert export_controller.main(out)
+    assert "fear.onnx, batches of" in capsys.readouterr().out
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsys):

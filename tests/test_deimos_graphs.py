@@ -38,7 +38,7 @@ SELECTORS = {
     name: replace(selector, epochs=1) if isinstance(selector, vds.Config) else selector  # which learns at length
     for name, selector in zip(methods.METHODS, map(methods.method, methods.METHODS), strict=True)
 } | {
-    "probing": replace(methods.method("p75"), probe=0.3, gate=True), "some uniform": mix.Config(base="p75"),
+    "probing": replace(methods.method("p75"), probe=0.3), "some uniform": mix.Config(base="p75"),
     "plr that replays": plr.Config(capacity=20), "boltzmann": boltzmann.Config(), "swapped": swapped.Config(),
     "learnability": learnability.Config(), "vds, then p75": methods.method("vds+p75"),
 }  # fmt: skip
@@ -163,13 +163,13 @@ def test_a_graph_is_recorded_once_for_every_choice_of_python(monkeypatch):
     class Noted(Replay):
         def __init__(self, work, device):
             super().__init__(work, device)
-            recorded.append((trainer.iteration, trainer.loop.selector.afraid))
+            recorded.append((trainer.iteration, trainer.loop.selector.fear.fitted))
 
     monkeypatch.setitem(graphs.RECORDERS, "cpu", Noted)
     trainer = Trainer(replace(CONFIG, method="p25", critic_warmup=3), CPU)
     afraid = []
     for _ in range(7):
-        afraid.append(trainer.loop.selector.afraid)
+        afraid.append(trainer.loop.selector.fear.fitted)
         trainer.iterate()
     assert afraid == [False] + [True] * 6
     # Rollouts when the next iteration has not been counted yet, updates when it has: of values alone, and of both.

@@ -45,6 +45,16 @@ def test_a_file_is_read_as_it_is_written(scout):
     assert {(joint.stiffness, joint.damping) for joint in robot.joints} == {(21.0, 0.9)}
 
 
+def test_the_order_of_legs_is_always_the_same(scout):
+    """Whatever the order of the tables in the file, policies get front left, front right, rear left, rear right."""
+    head, *tables = re.split(r"(?m)^(?=\[)", scout.read_text())
+    assert len(tables) == 4
+    scout.write_text(head + "".join(reversed(tables)))
+    with robot_file.opened(scout) as (read, folder):
+        names = [joint.name for joint in read.build(folder).joints]
+    assert [name[-2:] for name in names] == [side for side in ("fl", "fr", "rl", "rr") for _ in range(3)]
+
+
 FILES = {
     'mjcf = "scout.xml"': [
         ('mjcf = "none.xml"', "mjcf must be an MJCF file, but there is no .*none.xml"),

@@ -1,14 +1,16 @@
 """Methods made of others: one after the other, and one with some uniform goals."""
 
+import copy
 import io
 import math
 
 import pytest
 import torch
+from states import assert_same
 
 from deimos.goals.methods import method
 from deimos.goals.selector import GoalSelector, Proposal, SelectorConfig, Spaces
-from deimos.goals.selectors import director, mix, plr, schedule, uniform
+from deimos.goals.selectors import director, mix, penalty, plr, schedule, uniform
 from deimos.learn.ppo import PPOConfig
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs import particle
@@ -168,7 +170,7 @@ def test_a_mix_is_its_method_in_all_else():
     """It asks for what the method asks for, learns what it learns and saves what it saves."""
     wrapped, own = (config.build(SPACES, 0) for config in (mix.Config(base="plr-robust"), plr.Config(robust=True)))
     assert (wrapped.num_candidates, wrapped.needs_rollout) == (own.num_candidates, own.needs_rollout)
-    assert wrapped.state_dict().keys() == own.state_dict().keys()
+    assert wrapped.state_dict()["parts"][0].keys() == own.state_dict().keys()
     assert mix.Config(base="cl").build(SPACES, 0).first_goals_scaled
     assert mix.Config(base="cl").build(SPACES, 0).goal_range().tolist() == [0.25] * 3
     critic = mix.Config(base="vds").build(SPACES, 0)
@@ -176,6 +178,32 @@ def test_a_mix_is_its_method_in_all_else():
     alone, mixed = (trainer(config) for config in (director.Config(percentile=75), mix.Config(base="p75", share=0.0)))
     for _ in range(4):
         assert repr(alone.iterate()) == repr(mixed.iterate())
+
+
+@pytest.mark.parametrize(
+    "config", [mix.Config(base="p75"), penalty.Config(base="p75"), schedule.Config(first="rnd", second="p75")],
+    ids=["mix", "penalty", "schedule"],
+)  # fmt: skip
+def test_what_is_made_of_methods_saves_them_as_its_parts(config):
+    """Whoever delegates has one layout of its state: those of its parts, in their order."""
+    run = trainer(config)
+    run.iterate()
+    selector = run.loop.selector
+    assert selector.parts[-1].fear.fitted
+    assert_same(selector.state_dict()["parts"], [part.state_dict() for part in selector.parts])
+
+
+def test_a_mix_goes_on_from_what_earlier_versions_saved():
+    """A state that is its method's alone continues bit for bit as one with parts."""
+    config = mix.Config(base="p75")
+    straight, resumed = trainer(config), trainer(config)
+    for _ in range(2):
+        straight.iterate()
+    state = copy.deepcopy(straight.state_dict())
+    (state["loop"]["selector"],) = state["loop"]["selector"]["parts"]
+    resumed.load_state_dict(state)
+    for _ in range(2):
+        assert repr(resumed.iterate()) == repr(straight.iterate())
 
 
 def test_the_baseline_stays_with_the_first():

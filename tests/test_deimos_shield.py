@@ -122,8 +122,35 @@ def test_a_shield_of_other_sizes_is_refused():
         Shield(0.0, "stop", (0.0,), (1.0, 1.0))
     with pytest.raises(ValueError, match="mode must be one of ignore, project, stop, got 'run'"):
         Shield(0.0, "run", (0.0,), (1.0,))
-    with pytest.raises(ValueError, match="goal_range must be positive"):
-        Shield(0.0, "stop", (0.0,), (0.0,))
+    for side in (0.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"goal_range must be finite and positive, got {side}"):
+            Shield(0.0, "stop", (0.0, 0.0), (1.0, side))
+    with pytest.raises(ValueError, match=r"safe_goal must be finite, got \(nan,\)"):
+        Shield(0.0, "stop", (float("nan"),), (1.0,))
+    for limit in (float("nan"), float("inf"), -float("inf")):
+        with pytest.raises(ValueError, match=f"threshold must be finite, or all goals pass, or none, got {limit}"):
+            Shield(limit, "stop", (0.0,), (1.0,))
+
+
+def test_goals_of_other_sizes_are_refused():
+    """Goals of another number of components, and scores of another shape, are named; nothing is broadcast."""
+    goal, one = torch.ones(2, 3), Shield(0.0, "project", (0.0,), (1.0,))
+    with pytest.raises(ValueError, match=r"wanted must have shape \(2, 1\), got \(2, 3\)"):
+        one.choose(total, goal, goal)
+    shield = Shield(0.0, "project", (0.0,) * 3, (1.0,) * 3)
+    with pytest.raises(ValueError, match=r"goal must have shape \(2, 3\), got \(1, 3\)"):
+        shield.choose(total, goal[:1], goal)
+    for shape in ((2, 4, 1), (1, 4, 3), (2, 3)):
+        with pytest.raises(ValueError, match=r"candidates must have shape \(2, \d, 3\), got"):
+            shield.choose(total, goal, goal, torch.ones(shape))
+    with pytest.raises(ValueError, match=r"score of \(B, 1\) goals must have shape \(2, 1\), got \(2,\)"):
+        shield.choose(lambda goals: goals.sum((1, 2)), goal, goal)
+
+
+def test_no_shield_is_said():
+    """The entry of an export without a shield is refused with the way to one."""
+    with pytest.raises(ValueError, match="There is no shield: make one by deimos shield, and export the run after"):
+        Shield.from_dict(None)
 
 
 def test_a_drift_is_told_once(caplog):

@@ -1,10 +1,11 @@
 """A run's configuration: it comes back from its file whole, and what it does not know is refused."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from deimos import plugins
 from deimos.goals.fear import FearConfig
@@ -16,7 +17,7 @@ from deimos.run import presets, training
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
-from deimos.run.trainer import TrainConfig
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
@@ -32,7 +33,7 @@ CONFIGS = {
             obs_scale="raw", crash_penalty=2.5,
         ),
         selector=director.Config(
-            percentile=33.3, rule="argmin", candidates=17, probe=0.05, control="shuffled", memory=3, gate=True,
+            percentile=33.3, rule="argmin", candidates=17, probe=0.05, control="shuffled", memory=3,
             fear=FearConfig(
                 hidden=(5,), activation="tanh", learning_rate=0.1, epochs=3, minibatches=2, min_per_class=2, workspace=3
             ),
@@ -72,9 +73,9 @@ def test_config_differs_from_the_default_in_every_field():
     """The configuration that shall round-trip leaves no field at its default."""
 
     def same(config, default, name):
-        if hasattr(config, "__dataclass_fields__") and type(config) is type(default):
-            for field in config.__dataclass_fields__:
-                yield from same(getattr(config, field), getattr(default, field), f"{name}.{field}")
+        if is_dataclass(config) and type(config) is type(default):
+            for field in fields(config):
+                yield from same(getattr(config, field.name), getattr(default, field.name), f"{name}.{field.name}")
         elif config == default:
             yield name
 
@@ -95,6 +96,23 @@ def test_config_refuses_what_it_does_not_know(cls, data, message):
     """An unknown field, plugin or value in a stored configuration is named, not skipped."""
     with pytest.raises(ValueError, match=message):
         from_dict(cls, data)
+
+
+def test_a_field_that_is_gone_is_read_with_the_value_that_it_has_today():
+    """A stored Director without a gate is one of today; one behind a gate, and a gate that is not stored, are refused.
+
+    The checkpoint of the former resumes.
+    """
+    plain = to_dict(director.Config()) | {"gate": False}
+    assert from_dict(SelectorConfig, plain, stored=True) == director.Config()
+    with pytest.raises(ValueError, match="Config has no gate; it has: candidates"):
+        from_dict(SelectorConfig, plain | {"gate": True}, stored=True)
+    with pytest.raises(ValueError, match="Config has no gate; it has: candidates"):
+        from_dict(SelectorConfig, plain)
+    trainer = Trainer(TrainConfig(num_envs=4, evaluation=False, device="cpu"), torch.device("cpu"))
+    state = trainer.state_dict()
+    state["made_for"]["selector"]["gate"] = False
+    trainer.load_state_dict(state)
 
 
 def test_a_preset_is_a_training_configuration():

@@ -20,7 +20,7 @@ from deimos.app.viewer_session import BY_HAND, SIDE, UNIFORM, Session, prepare
 from deimos.checks import RunError
 from deimos.learn.policy import load_policy, save_policy
 from deimos.run import saved
-from deimos.run.fear import load_fear
+from deimos.run.fear import load_selector
 from deimos.run.saved import SavedRun
 
 WALK = Path(__file__).parent.parent / "docs" / "results" / "quad_flat"
@@ -43,6 +43,28 @@ def bold(tmp_path_factory):
     budget = "--no-evaluation --num-envs 16 --env-steps 24 --threads 1 --device cpu --ppo.hidden 8 --method uniform"
     assert cli.main(["train", *budget.split(), "--env.goal-period", "10", "--out", str(path)]) == 0
     return path
+
+
+@pytest.fixture(scope="module")
+def shielded(scared, tmp_path_factory):
+    """Folder of the first run, with a shield."""
+    path = Path(shutil.copytree(scared, tmp_path_factory.mktemp("view") / "shielded"))
+    small = "--alpha 0.3 --worlds 3000 --attackers scripted --eval.worlds 16 --eval.steps 100 --alphas 0.3 --device cpu"
+    assert cli.main(["shield", str(path), *small.split()]) == 0
+    return path
+
+
+def write_another_policy(path):
+    """Write a policy and a checkpoint as a training does that goes on: with iteration 7, and the log is ahead of it."""
+    policy = load_policy(path)
+    with torch.no_grad():
+        for weights in policy.actor.parameters():
+            weights.add_(1.0)
+    save_policy(path / "policy.pt", policy)
+    state = torch.load(path / "checkpoint.pt", weights_only=True)
+    for weights in state["loop"]["selector"]["fear"]["network"].values():
+        weights.add_(1.0)
+    torch.save(state | {"iteration": 7}, path / "checkpoint.pt")
 
 
 def session_of(path, worlds=3, world=0, **options):
@@ -85,16 +107,13 @@ def test_a_goal_by_hand_stays(scared):
     assert session.goal != pytest.approx([20.0, -30.0, 10.0])
 
 
-def test_the_shield_looks_at_every_goal(scared, tmp_path, monkeypatch):
+def test_the_shield_looks_at_every_goal(shielded, monkeypatch):
     """What the run's shield refuses, by whomever it was asked for, the policy does not get; each file is read once."""
-    path = Path(shutil.copytree(scared, tmp_path / "run"))
-    small = "--alpha 0.3 --worlds 3000 --attackers scripted --eval.worlds 16 --eval.steps 100 --alphas 0.3 --device cpu"
-    assert cli.main(["shield", str(path), *small.split()]) == 0
     read = []
     monkeypatch.setattr(saved, "load_policy", lambda path: read.append("policy") or load_policy(path))
-    monkeypatch.setattr(saved, "load_fear", lambda *run: read.append("fear") or load_fear(*run))
-    session = Session(SavedRun.open(path), 3, seed=5, shield="stop")
-    assert sorted(read) == ["fear", "policy"]
+    monkeypatch.setattr(saved, "load_selector", lambda *run: read.append("selector") or load_selector(*run))
+    session = Session(SavedRun.open(shielded), 3, seed=5, shield="stop")
+    assert sorted(read) == ["policy", "selector"]
     corners = [[x, y, z] for x in (-200.0, 200.0) for y in (-200.0, 200.0) for z in (-200.0, 200.0)]
     for goal, refused in ((min(corners, key=session.risk), 0.0), (max(corners, key=session.risk), 0.5)):
         session.ask(goal)
@@ -103,6 +122,31 @@ def test_the_shield_looks_at_every_goal(scared, tmp_path, monkeypatch):
     assert session.refused == 0.5
     shown = Moment.of(session, build_scene(session))
     assert "the shield has refused 50 % of the goals" in caption(shown)
+
+
+def test_a_policy_stays_with_its_shield(shielded, tmp_path, caplog):
+    """Beside a training whose policy has outgrown the shield, the policy and the fear that it fits stay; said once."""
+    path = Path(shutil.copytree(shielded, tmp_path / "run"))
+    session = Session(SavedRun.open(path), 3, seed=5, shield="stop")
+    session.step()
+    acted, feared = session._policy.scaled(session.env.obs), session.risk([200.0, 0.0, 0.0])
+    for _ in range(2):
+        write_another_policy(path)
+        assert not session.reload()
+    assert [record.message for record in caplog.records] == [
+        "The run has written another policy, which its shield is not made for: the one of iteration 4 stays."
+    ]
+    assert torch.equal(session._policy.scaled(session.env.obs), acted)
+    assert session.risk([200.0, 0.0, 0.0]) == feared
+    session.go_to(7)  # and in other worlds
+    session.ask([200.0, 200.0, 200.0])
+    other = Session(SavedRun.open(shielded), 3, seed=5, world=7, shield="stop")
+    other.ask([200.0, 200.0, 200.0])
+    for each in (session, other):
+        each.step()
+    assert torch.equal(session.env.obs, other.env.obs)
+    with pytest.raises(RunError, match="was made for an earlier policy; make it again by deimos shield"):
+        Session(SavedRun.open(path), 1, seed=5, shield="stop")
 
 
 def test_a_shield_that_is_not_there_is_one_line(bold):
@@ -215,13 +259,7 @@ def test_a_new_checkpoint_is_loaded_where_the_worlds_are(scared, tmp_path):
         session.step()
     assert not session.reload()
     place, before = session.env.obs.clone(), session._policy.scaled(session.env.obs)
-    policy = load_policy(run)
-    with torch.no_grad():
-        for weights in policy.actor.parameters():
-            weights.add_(1.0)
-    save_policy(run / "policy.pt", policy)
-    state = torch.load(run / "checkpoint.pt", weights_only=True)
-    torch.save(state | {"iteration": 7}, run / "checkpoint.pt")  # the log is ahead of it
+    write_another_policy(run)
     assert session.reload()
     assert (session.steps, session.goals.current) == (5, "p75")
     assert session.iteration == 7

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from deimos.app.console import number, table
+from deimos.goals.fear_selector import FearSelector
 from deimos.run.evaluation import worst
 
 _LINES = (
@@ -118,6 +119,11 @@ def wilson(share: Any, count: Any) -> tuple[Any, Any]:
     z = 1.959964  # of the normal distribution, two-sided
     middle, spread = share + z * z / (2 * count), z * np.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
     return (middle - spread) / (1 + z * z / count), (middle + spread) / (1 + z * z / count)
+
+
+def risk_name(afraid: FearSelector) -> str:
+    """What the numbers in (0, 1) are called that a fear network's calibration makes of its scores."""
+    return "predicted crash probability" if afraid.is_calibrated else "fear (no probability)"
 
 
 def percent(share: float | None) -> str:

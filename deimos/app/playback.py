@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 
 from deimos.app import console
-from deimos.app.findings import percent
+from deimos.app.findings import percent, risk_name
 from deimos.checks import check_at_least, check_positive, check_range
 from deimos.goals.fear_selector import FearSelector
 from deimos.learn.policy import Policy
@@ -101,4 +101,4 @@ def _risk(env: Env, afraid: FearSelector | None) -> str:
         return ""
     goal = env.obs[:, env.goal_slice]
     score = afraid.score(env.state(env.obs), goal, goal.unsqueeze(1))[:, 0]
-    return f"\npredicted crash probability of this goal {percent(afraid.calibration.probability(score).item())}"
+    return f"\n{risk_name(afraid)} of this goal {percent(afraid.calibration.probability(score).item())}"

@@ -217,5 +217,5 @@ def caption(moment: Moment) -> str:
     goal = "  ".join(f"{value + 0.0:+.2f}" for value in np.round(moment.goal, 2))
     lines = [moment.text[0], f"goals: {moment.current}   {goal}", *moment.text[2:]]
     if moment.risk is not None:
-        lines.append(f"predicted crash probability {percent(moment.risk)}")
+        lines.append(f"{moment.risk_name} {percent(moment.risk)}")
     return "\n".join(lines)

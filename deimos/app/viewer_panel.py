@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deimos.app.findings import percent
+from deimos.app.findings import percent, risk_name
 from deimos.app.viewer_scene import Scene, palette, shades
 from deimos.app.viewer_session import FearMap, Session
 from deimos.nn.layout import GoalComponent
@@ -49,6 +49,8 @@ class Moment:
     """The active goal, in physical units."""
     next_goal: list[float]
     """What would come if the next goal were due now, in physical units."""
+    risk_name: str
+    """What ``risk``, ``next_risk`` and ``fear`` are called."""
     risk: float | None
     """Predicted probability that asking for the active goal now ends in a crash, in (0, 1)."""
     next_risk: float | None
@@ -76,8 +78,8 @@ class Moment:
         return cls(
             text=text, names=session.names, current=session.goals.current, world=session.world, paused=session.paused,
             components=session.components, low=low.tolist(), high=high.tolist(), goal=goal, next_goal=next_goal,
-            risk=session.risk(goal), next_risk=session.risk(next_goal), fear=fear, axes=session.axes,
-            shapes=scene.shapes(fear),
+            risk_name="fear" if session.fear is None else risk_name(session.fear), risk=session.risk(goal),
+            next_risk=session.risk(next_goal), fear=fear, axes=session.axes, shapes=scene.shapes(fear),
         )  # fmt: skip
 
 
@@ -196,11 +198,11 @@ class Panel:
         if is_moved:
             self.ask(lambda session: session.ask(goal))
         if shown.risk is not None and shown.next_risk is not None:
-            imgui.TextUnformatted(f"crash within T: this goal {percent(shown.risk)}, next {percent(shown.next_risk)}")
+            imgui.TextUnformatted(f"fear: this goal {percent(shown.risk)}, next {percent(shown.next_risk)}")
 
     def _draw_map(self, imgui: Any, shown: Moment, viewer: Any) -> None:
         """The map of fear, with the active goal in white and the next one in cyan; a click chooses by hand."""
-        imgui.SeparatorText("predicted probability of a crash within T")
+        imgui.SeparatorText(shown.risk_name)
         if shown.fear is None:
             imgui.TextUnformatted("There is no fear network.")
             return

@@ -1,5 +1,6 @@
 """A policy at work in a few worlds, steered by a person: who chooses its goals, pause, step, reset, new checkpoints."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,6 +15,7 @@ from deimos.goals.shield import Mode
 from deimos.nn.layout import goal_components
 from deimos.run.attack import Attack, argmax_director, attacker, uniform_goals
 from deimos.run.evaluation import make_target
+from deimos.run.fear import learnt_fear
 from deimos.run.film import seconds_per_step
 from deimos.run.loop import GoalLoop
 from deimos.run.saved import SavedRun
@@ -24,6 +26,8 @@ UNIFORM, BY_HAND = "uniform", "by hand"
 EXTENT = 512  # goals that tell how far goals reach where they fill no box
 SIDE = 21  # points of the map of fear along each of its axes
 WATCHED = ("policy.pt", "checkpoint.pt")  # written one after the other, whole
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,10 @@ class Steered(GoalSelector):
         """See ``GoalSelector.num_candidates``."""
         return 1 if self.current == BY_HAND else self.choices[self.current].num_candidates
 
+    def goal_range(self) -> Tensor | None:
+        """See ``GoalSelector.goal_range``."""
+        return None if self.current == BY_HAND else self.choices[self.current].goal_range()
+
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
         if self.current == BY_HAND:
@@ -94,14 +102,16 @@ class Session:
         self._run, self._worlds, self._seed = run, worlds, seed
         self._attacks, self._fallback, self._shield = dict(attacks or {}), afraid, shield
         self.paused = False
+        self._stays = False  # the policy, for the shield's sake
         self.axes = (0, 1)
         self.crashes = self.steps = self.episodes = 0
         self.restarts = 0
         """How often ``reset`` and ``go_to`` have begun everything anew."""
         self.goals = Steered({})
-        self._go_to(world)
+        self._build(world)
+        self._load()
 
-    def _go_to(self, world: int) -> None:
+    def _build(self, world: int) -> None:
         """Make the worlds, the first of a global number."""
         self.world = world
         self.env = self._run.build(self._worlds, self._seed, world)
@@ -109,24 +119,27 @@ class Session:
         self._scale = torch.tensor([component.scale for component in self.components])
         self._rows = torch.zeros(1, dtype=torch.int64)
         self._extent: tuple[Tensor, Tensor] | None = None
-        self._load()
 
     def _load(self) -> None:
-        """Load the policy and the fear network as they are now; the worlds go on."""
-        current, own = self.goals.current, self.goals.own
+        """Load the policy and who chose the goals as they are now; the worlds go on."""
         self._stamp = self._stamps()
         self._policy, self.iteration = self._run.policy(self.env), self._run.iteration()
-        trained = self._run.fear(self.env)
-        self.fear = trained or (self._fallback(self.env) if self._fallback else None)
+        self._trained, self._guard = self._run.selector(self.env), None
+        if self._shield:
+            afraid = learnt_fear(self._trained)
+            self._guard = stored_guard(self._run.folder, self._policy, self.env, afraid, self._shield)
+        self._join()
+
+    def _join(self) -> None:
+        """Let those who can choose goals serve the worlds."""
+        current, own = self.goals.current, self.goals.own
+        self.fear = learnt_fear(self._trained) or (self._fallback(self.env) if self._fallback else None)
         choices = {UNIFORM: uniform_goals(self.env)}
-        if trained is not None:
-            choices[self._run.config.label] = trained
+        if self._trained is not None:
+            choices[self._run.config.label] = self._trained
         choices |= {name: attack.selector(self.env) for name, attack in self._attacks.items()}
         self.goals = Steered(choices)
         self.goals.current, self.goals.own = current if current in (*choices, BY_HAND) else UNIFORM, own
-        self._guard = None
-        if self._shield:
-            self._guard = stored_guard(self._run.folder, self._policy, self.env, trained, self._shield)
         self._loop = GoalLoop(self.env, self.goals, guard=self._guard)
 
     def _stamps(self) -> list[tuple[int, int]]:
@@ -138,9 +151,19 @@ class Session:
         return [(file.st_mtime_ns, file.st_ino) for file in found]
 
     def reload(self) -> bool:
-        """Load the policy and the fear network again if the run has written new ones; whether it has."""
+        """Load the policy and the fear network again if the run has written new ones; gives whether it has loaded them.
+
+        A shield is made for one policy and one fear network, so with a shield those that were loaded stay.
+        """
         stamp = self._stamps()
-        if not stamp or stamp == self._stamp:
+        if self._stays or not stamp or stamp == self._stamp:
+            return False
+        if self._shield:
+            self._stays = True
+            _log.warning(
+                "The run has written another policy, which its shield is not made for: the one of iteration %d stays.",
+                self.iteration,
+            )
             return False
         self._load()
         return True
@@ -199,7 +222,8 @@ class Session:
         """
         if world < 0:
             raise ValueError(f"world must be at least 0, got {world}.")
-        self._go_to(world)
+        self._build(world)
+        self._join()
         self._count_anew()
 
     def _count_anew(self) -> None:
@@ -223,7 +247,8 @@ class Session:
     def next_goal(self) -> list[float]:
         """What the first world would get if its next goal were due now, in physical units."""
         env, obs = self.env, self.env.obs[self._rows]
-        candidates = env.sample_goals(self._rows, self.goals.num_candidates)  # drawing again gives the same goals
+        # Drawing again gives the same goals.
+        candidates = env.sample_goals(self._rows, self.goals.num_candidates, self.goals.goal_range())
         proposal = self.goals.propose(
             self._rows, env.state(obs), obs[:, env.goal_slice], candidates, env.draw(self._rows)
         )

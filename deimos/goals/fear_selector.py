@@ -5,7 +5,7 @@ import logging
 import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -17,13 +17,13 @@ from deimos.goals.crash_memory import CrashMemory
 from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Interactions, Resolved
 from deimos.goals.selector import (
+    Delegate,
     GoalSelector,
     Proposal,
     SelectorConfig,
     Spaces,
     Transitions,
     uniform_proposal,
-    with_parts,
 )
 from deimos.nn.ranks import largest
 
@@ -47,10 +47,10 @@ class FearSelectorConfig(SelectorConfig):
     """Crashes that are remembered with survivals of the same time, at least 0, so that learning goes on where crashes
     have become rare. 0 is the thesis's literal method: a fit learns from the interactions resolved in the last 2 T
     steps, and is left out where they lack a class."""
-    gate: bool = False
-    """Whether goals are uniform as long as the network ranks the last outcomes no better than chance."""
     fear: FearConfig = field(default_factory=FearConfig)
     """The fear network."""
+    former: ClassVar[dict[str, Any]] = {"gate": False}
+    """Fields that earlier versions had, with the value that is the only one today."""
 
     def __post_init__(self) -> None:
         check_at_least("candidates", self.candidates, 1)
@@ -64,7 +64,8 @@ class FearEstimate:
     """What a fear network thinks of some goals, and how far it can be trusted."""
 
     probability: Tensor
-    """Calibrated probability that the policy crashes within T steps, in (0, 1), shape (B,)."""
+    """Calibrated probability that the policy crashes within T steps, in (0, 1), shape (B,); of a selector that is not
+    ``is_calibrated``, its fear on that scale."""
     auroc: float
     """How often it ranked a crash of the last 2 T steps above a survival before it knew, in [0, 1]; 0.5 is chance,
     NaN where a class is empty."""
@@ -79,6 +80,8 @@ class FearSelector(GoalSelector):
     dense = True
     inputs_per_row: ClassVar[int] = 1
     """Inputs of the network in a row of ``rows``."""
+    is_calibrated: ClassVar[bool] = True
+    """Whether ``calibration`` makes of a score the probability of a crash within T steps."""
     saved: ClassVar[tuple[str, ...]] = (
         "fear", "memory", "calibration", "_learnt_at", "_age", "_auroc", "_issued",
     )  # fmt: skip
@@ -102,14 +105,9 @@ class FearSelector(GoalSelector):
         self._issued = torch.zeros((), dtype=torch.int64, device=spaces.device)
         self._said = False  # that there is no fear yet
 
-    @property
-    def afraid(self) -> bool:
-        """Whether fear chooses: the network has learnt something and, behind a gate, ranks better than chance."""
-        return self.fear.fitted and not (self.config.gate and self._auroc <= 0.5)
-
     def graph_key(self) -> Hashable:
         """See ``GoalSelector.graph_key``."""
-        return self.afraid, self.fear.fitted
+        return self.fear.fitted
 
     @abc.abstractmethod
     def choose(self, score: Tensor, draw: Tensor) -> Tensor:
@@ -125,7 +123,7 @@ class FearSelector(GoalSelector):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``; scores are log odds before the temperature."""
-        if not self.afraid:
+        if not self.fear.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         score = self.score(state, goal, candidates)
         pick, probe = self.choose(self.ranking(state, goal, candidates, score, draws), draws[:, 0]), None
@@ -159,7 +157,7 @@ class FearSelector(GoalSelector):
         """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
         (issued,) = largest(int(self._issued))
         self._issued.zero_()
-        chosen = float(self.afraid) if issued else math.nan  # it has not changed since the last time
+        chosen = float(self.fear.fitted) if issued else math.nan  # it has not changed since the last time
         window = interactions.resolved()
         recent = window.resolved > self._learnt_at
         self._learnt_at = interactions.now
@@ -247,8 +245,12 @@ class FearSelector(GoalSelector):
 
 
 def fear_selector(selector: GoalSelector) -> FearSelector | None:
-    """The selector with a fear network in ``selector``: itself, or the first of its parts that is one."""
-    return next((part for part in with_parts(selector) if isinstance(part, FearSelector)), None)
+    """The selector with a fear network in ``selector``: itself, or who chooses in it, or the first of its parts."""
+    if isinstance(selector, FearSelector):
+        return selector
+    chooser = (selector.current,) if isinstance(selector, Delegate) else ()
+    found = (fear_selector(part) for part in (*chooser, *selector.parts))
+    return next((part for part in found if part is not None), None)
 
 
 def _rolled(score: Tensor, draw: Tensor) -> Tensor:

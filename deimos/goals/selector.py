@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -216,7 +216,9 @@ def with_parts(selector: GoalSelector) -> Iterator[GoalSelector]:
 
 
 class Delegate(GoalSelector):
-    """Leaves everything to another selector, ``current``, but for what it overrides."""
+    """Leaves everything to one of its ``parts``, ``current``, but for what it overrides; saves all of them."""
+
+    saved: ClassVar[tuple[str, ...]] = ("parts",)
 
     @property
     @abc.abstractmethod

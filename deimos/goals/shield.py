@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice
+from deimos.checks import check_at_least, check_choice, check_positive
 from deimos.goals import picks
 
 Mode = Literal["ignore", "project", "stop"]
@@ -38,6 +38,11 @@ SCORES = 1001  # of the calibration that are kept to tell a drift by
 DRIFTED = 1e-3  # chance of a false word on drift, as if scores were independent, over all tests together
 
 _log = logging.getLogger(__name__)
+
+
+def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:  # broadcasting would make a goal of it all the same
+        raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}.")
 
 
 def rank(crashes: int, alpha: float, guarantee: Guarantee, confidence: float = CONFIDENCE) -> int:
@@ -103,12 +108,13 @@ class Shield:
     """Lets goals of acceptable fear pass and replaces the others.
 
     Args:
-        threshold: Goals with this score or a higher one are refused; see ``threshold``.
+        threshold: Goals with this score or a higher one are refused, finite; see ``threshold``.
         mode: What becomes of them. ``ignore``: the active goal stays. ``stop``: the safe goal. ``project``: the nearest
             goal of acceptable fear among the candidates and those between the wanted goal and the safe one; where none
             is acceptable, the safe goal.
-        safe_goal: A goal that nobody has to fear, such as no speed; ``None`` for components that stay as they are.
-        goal_range: Half side of the box of goals along every component: the unit of distances, positive.
+        safe_goal: A goal that nobody has to fear, such as no speed, finite; ``None`` for components that stay as they
+            are.
+        goal_range: Half side of the box of goals along every component: the unit of distances, finite and positive.
         reference: Scores of the calibration's goals, in any order; empty for no word on drift.
         window: Goals that a drift is told by, at least 1.
     """
@@ -123,8 +129,12 @@ class Shield:
             raise ValueError(
                 f"safe_goal must have {len(goal_range)} components as goal_range has, got {len(safe_goal)}."
             )
-        if not min(goal_range) > 0.0:
-            raise ValueError(f"goal_range must be positive, got {tuple(goal_range)}.")
+        if not math.isfinite(threshold):
+            raise ValueError(f"threshold must be finite, or all goals pass, or none, got {threshold}.")
+        if not all(value is None or math.isfinite(value) for value in safe_goal):
+            raise ValueError(f"safe_goal must be finite, got {tuple(safe_goal)}.")
+        for value in goal_range:
+            check_positive("goal_range", value, finite=True)
         self.threshold, self.mode, self.window = threshold, mode, window
         self._fixed = torch.tensor([value is not None for value in safe_goal], dtype=torch.bool)
         self._safe = torch.tensor([value or 0.0 for value in safe_goal], dtype=torch.float32)
@@ -134,18 +144,22 @@ class Shield:
         self._untested, self._tests, self._warned = 0, 0, False
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any], mode: Mode | None = None, guarantee: Guarantee | None = None) -> "Shield":
+    def from_dict(
+        cls, data: dict[str, Any] | None, mode: Mode | None = None, guarantee: Guarantee | None = None
+    ) -> "Shield":
         """The shield that ``deimos shield`` has stored in a run or in an export.
 
         Args:
-            data: The entry ``shield`` of ``deploy.json``.
+            data: The entry ``shield`` of ``deploy.json``; ``None`` in that of a run without a shield.
             mode: Another mode than the one that it was tried in.
             guarantee: Another of its two thresholds than the one that it was tried with.
 
         Raises:
             KeyError: If something is missing in it.
-            ValueError: If it was calibrated on too few crashes for the guarantee.
+            ValueError: If there is no shield, or it was calibrated on too few crashes for the guarantee.
         """
+        if data is None:
+            raise ValueError("There is no shield: make one by deimos shield, and export the run after that.")
         guarantee = guarantee or data["guarantee"]
         if data["threshold"][guarantee] is None:
             raise ValueError(
@@ -171,8 +185,18 @@ class Shield:
             wanted: The goals that are asked for, shape (B, goal_dim).
             candidates: Valid goals that ``project`` may take, shape (B, N, goal_dim); ``None`` for those on the way to
                 the safe goal alone.
+
+        Raises:
+            ValueError: If a shape is another one.
         """
-        fear = score(wanted.unsqueeze(1)).squeeze(1)
+        count, dim = len(wanted), len(self._safe)
+        _check_shape("wanted", wanted, (count, dim))
+        _check_shape("goal", goal, (count, dim))
+        if candidates is not None:
+            _check_shape("candidates", candidates, (count, candidates.shape[1] if candidates.dim() > 1 else 0, dim))
+        fear = score(wanted.unsqueeze(1))
+        _check_shape("score of (B, 1) goals", fear, (count, 1))
+        fear = fear.squeeze(1)
         self._watch(fear)
         refused = ~(fear < self.threshold)  # what is not a number is refused
         fixed, safe = self._fixed.to(goal.device), self._safe.to(goal)

@@ -73,7 +73,8 @@ def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
         cls: Its class.
         data: Its fields. A missing one takes its default.
         stored: Whether an earlier version may have written them. Then a missing field takes the value that was the only
-            one before there was the field, ``before`` in its metadata, where that is not the default.
+            one before there was the field, ``before`` in its metadata, where that is not the default. A field that
+            there was before is left out where it has the value that is the only one today, in the class's ``former``.
 
     Raises:
         ValueError: If a field is unknown or a value is not allowed.
@@ -87,6 +88,8 @@ def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
         cls = plugins.load(_PLUGINS[cls], data.pop("kind")).Config
     if stored:
         data = {f.name: f.metadata["before"] for f in dataclasses.fields(cls) if "before" in f.metadata} | data
+        former = getattr(cls, "former", {})
+        data = {name: value for name, value in data.items() if (name, value) not in former.items()}
     hints = typing.get_type_hints(cls)
     _check_fields(cls, data)
     return cls(**{name: _typed(name, hints[name], value, stored) for name, value in data.items()})

@@ -109,8 +109,10 @@ def _describe(
     fear = None
     if afraid is not None:
         state = [_entry(field) for field in policy.layout if field.name != "goal"]
-        calibration = afraid.calibration.state_dict()
-        fear = files["fear"] | {"goal_period": config.env.goal_period, "calibration": calibration, "state": state}
+        fear = files["fear"] | {
+            "goal_period": config.env.goal_period, "outputs": list(export_onnx.fear_outputs(afraid)),
+            "calibration": afraid.calibration.state_dict() if afraid.is_calibrated else None, "state": state,
+        }  # fmt: skip
     return {
         "schema": SCHEMA,
         "environment": kind(config.env),
@@ -177,8 +179,9 @@ def _play(env: Env, policy: Policy, afraid: FearSelector | None, steps: int) -> 
     if afraid is not None:
         goals = candidates / goal_scale
         logit = afraid.score(env.state(seen), seen[:, policy.goal_slice], goals * goal_scale)
+        said = {"logit": logit, "probability": afraid.calibration.probability(logit)}
         facts |= {
             "fear.state": env.state(physical), "fear.goal": physical[:, policy.goal_slice], "fear.candidates": goals,
-            "fear.logit": logit, "fear.probability": afraid.calibration.probability(logit),
+            **{f"fear.{name}": said[name] for name in export_onnx.fear_outputs(afraid)},
         }  # fmt: skip
     return {name: value.numpy() for name, value in facts.items()} | (walk.facts() if walk else {})

@@ -47,40 +47,79 @@ class Network:
         return self.session.run(None, {name: value.astype(np.float32) for name, value in inputs.items()})
 
 
+def read(folder: Path) -> dict:
+    """``deploy.json`` of a legged robot.
+
+    Raises:
+        ValueError: If it is that of another environment.
+    """
+    deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
+    if deploy["robot"] is None:
+        raise ValueError(f"{folder} must be an export of a legged robot, got one of {deploy['environment']}.")
+    return deploy
+
+
 class Controller:
     """From what one or several robots measure to the target angles of their joints.
 
     Args:
         folder: What ``deimos export`` has written.
         robots: How many robots it controls at a time.
+
+    Raises:
+        ValueError: If the export is not that of a legged robot.
     """
 
     def __init__(self, folder: Path, robots: int = 1) -> None:
-        self.deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
+        self.deploy = read(folder)
         self.policy = Network(folder, self.deploy["policy"])
         self.action = np.zeros((robots, self.deploy["action"]["size"]))
         """The last action as the joints took it, shape (robots, joints)."""
 
+    def reset(self, robots: Any = slice(None)) -> None:
+        """Begin an episode, as those of the training began: with a last action of zero.
+
+        Args:
+            robots: Which robots, an index of NumPy; by default all.
+        """
+        self.action[robots] = 0.0
+
     def targets(self, measured: dict[str, np.ndarray]) -> np.ndarray:
         """Target angles of the joints [rad], shape (robots, joints), in the order of ``deploy.json``.
 
+        Where it raises, the controller is as it was before the call: a program that goes on must keep its last targets,
+        or damp the joints, until what it measures is sound.
+
         Args:
-            measured: By name, the entries of ``deploy.json``'s observation in the units that it says, shape
+            measured: By name, the entries of ``deploy.json``'s observation in the units that it says, finite, shape
                 (robots, size) each; all but ``last_action``, which the controller knows.
 
         Raises:
             KeyError: If one is missing.
+            ValueError: If one has another shape or is not finite, or the action would not be.
         """
         measured = measured | {"last_action": self.action}
         parts = []
         for entry in self.deploy["observation"]:
+            value, shape = np.asarray(measured[entry["name"]]), (len(self.action), entry["size"])
+            if value.shape != shape:
+                raise ValueError(f"{entry['name']} must have shape {shape}, got {value.shape}.")
+            _require_finite(entry["name"], value)
             low, high = entry["clip"] or (-np.inf, np.inf)
-            parts.append(np.clip(measured[entry["name"]], low, high))
+            parts.append(np.clip(value, low, high))
         (action,) = self.policy(observation=np.concatenate(parts, axis=1))
+        _require_finite("the policy's action", action)
         self.action = np.clip(action, self.deploy["action"]["low"], self.deploy["action"]["high"])
         joints = self.deploy["robot"]["joints"]
         pose, scale = (np.array([joint[key] for joint in joints]) for key in ("default_position", "action_scale"))
         return pose + scale * self.action
+
+
+def _require_finite(name: str, value: np.ndarray) -> None:
+    """Raise ``ValueError`` unless all is finite; np.clip keeps NaN, and the next observation would hold it too."""
+    if not np.isfinite(value).all():
+        robot = int(np.argwhere(~np.isfinite(value))[0, 0])
+        raise ValueError(f"{name} must be finite, got {value[robot].tolist()} of robot {robot}.")
 
 
 class Simulation:
@@ -90,12 +129,15 @@ class Simulation:
         folder: What ``deimos export`` has written.
         qpos: Where they start, shape (robots, nq).
         qvel: Shape (robots, nv).
+
+    Raises:
+        ValueError: If the export is not that of a legged robot.
     """
 
     def __init__(self, folder: Path, qpos: np.ndarray, qvel: np.ndarray) -> None:
         import mujoco
 
-        self.mujoco, self.robot = mujoco, json.loads((folder / "deploy.json").read_text(encoding="utf-8"))["robot"]
+        self.mujoco, self.robot = mujoco, read(folder)["robot"]
         self.model = mujoco.MjModel.from_xml_path(str(folder / self.robot["model"]))
         self.ground = self.model.geom("ground").id
         self.base = {self.model.geom(name).id for name in self.robot["base_geoms"]}
@@ -221,7 +263,7 @@ def compare_networks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -
     """Print how far the networks' outputs are from those of the export; gives whether all are the same."""
     jobs: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = [("policy", ("observation",), ("action",))]
     if deploy["fear"]:
-        jobs.append(("fear", ("state", "goal", "candidates"), ("logit", "probability")))
+        jobs.append(("fear", ("state", "goal", "candidates"), tuple(deploy["fear"]["outputs"])))
     passed = True
     for name, inputs, outputs in jobs:
         network, worst = Network(folder, deploy[name]), 0.0

@@ -101,12 +101,17 @@ def policy_model(policy: Policy, facts: dict[str, str]) -> bytes:
     return graph.model("policy", {"observation": ["batch", len(seen)]}, {"action": ["batch", len(actor.std)]}, facts)
 
 
+def fear_outputs(afraid: FearSelector) -> tuple[str, ...]:
+    """What the file of a fear network says of goals: ``logit``, and ``probability`` where that is what it is."""
+    return ("logit", "probability") if afraid.is_calibrated else ("logit",)
+
+
 def fear_model(afraid: FearSelector, scale: Tensor, goal_scale: Tensor, facts: dict[str, str]) -> bytes:
     """A fear network: how likely the policy crashes within T steps of getting each of N goals.
 
     Inputs are ``state`` (batch, state_dim), the active ``goal`` (batch, goal_dim) and ``candidates``
-    (batch, N, goal_dim), outputs ``logit`` and ``probability`` (batch, N). As in training, the part of the first layer
-    that candidates share is computed once.
+    (batch, N, goal_dim), outputs (batch, N) those of ``fear_outputs``. As in training, the part of the first layer that
+    candidates share is computed once.
 
     Args:
         afraid: The selector that the network belongs to.
@@ -130,12 +135,13 @@ def fear_model(afraid: FearSelector, scale: Tensor, goal_scale: Tensor, facts: d
     hidden = graph.add("MatMul", shown, graph.constant("candidates.weight", weight[state_dim + goal_dim :]))
     x = graph.layers(graph.add("Add", hidden, context), others, "fear", "logit_column")
     graph.add("Squeeze", x, graph.constant("last_axis", np.array([2])), out="logit")
-    calibration = afraid.calibration
-    odds = graph.add("Add", "logit", graph.constant("prior", calibration.prior))
-    odds = graph.add("Div", odds, graph.constant("temperature", calibration.temperature))
-    graph.add("Sigmoid", odds, out="probability")
+    if afraid.is_calibrated:
+        calibration = afraid.calibration
+        odds = graph.add("Add", "logit", graph.constant("prior", calibration.prior))
+        odds = graph.add("Div", odds, graph.constant("temperature", calibration.temperature))
+        graph.add("Sigmoid", odds, out="probability")
     inputs = {
         "state": ["batch", state_dim], "goal": ["batch", goal_dim], "candidates": ["batch", "candidates", goal_dim],
     }  # fmt: skip
-    outputs = {name: ["batch", "candidates"] for name in ("logit", "probability")}
+    outputs = {name: ["batch", "candidates"] for name in fear_outputs(afraid)}
     return graph.model("fear", inputs, outputs, facts)

@@ -1,6 +1,10 @@
-"""The fear network that a run has learnt, for whoever asks it after the training."""
+"""Who chose the goals of a run, as it has learnt, for whoever asks it after the training."""
 
+from dataclasses import replace
+
+from deimos.checks import RunError, one_line
 from deimos.goals.fear_selector import FearSelector, fear_selector
+from deimos.goals.selector import GoalSelector
 from deimos.run.folder import RunFolder
 from deimos.run.loop import spaces
 from deimos.run.trainer import TrainConfig
@@ -8,20 +12,47 @@ from deimos.run.training import load_checkpoint
 from deimos.sim.env import Env
 
 
-def load_fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | None:
-    """The selector with a run's fear network and its calibration; ``None`` where there is none that has learnt.
+def load_selector(folder: RunFolder, config: TrainConfig, env: Env) -> GoalSelector | None:
+    """The selector of a run with all that it has learnt; ``None`` where it has no fear network that has learnt.
+
+    It may be asked to propose, but must not be told what it issued: it is one for the worlds of the training.
 
     Args:
         folder: The run.
         config: Its configuration.
-        env: Worlds of its environment, where the network shall be.
+        env: Worlds of its environment, where the networks shall be.
+
+    Raises:
+        RunError: If there is no checkpoint, or it does not fit.
     """
-    afraid = fear_selector(config.goals.build(spaces(env, config.env_steps), config.seed))
-    if afraid is None or afraid.parts:
+    worlds = replace(spaces(env, config.env_steps), num_envs=config.num_envs)
+    selector = config.goals.build(worlds, config.seed)
+    afraid = fear_selector(selector)
+    if afraid is None:
         return None
-    state = load_checkpoint(folder)["loop"]["selector"]
-    if "fear" not in state:  # it is a part of another selector
-        return None
-    for name in ("fear", "calibration"):  # what else there is depends on the version that wrote it
-        getattr(afraid, name).load_state_dict(state[name])
-    return afraid if afraid.fear.fitted else None
+    state = load_checkpoint(folder).get("loop", {}).get("selector", {})  # some hold networks alone
+    try:
+        _restore(selector, state)
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        what = f"What the selector of {folder.path} has learnt does not fit it"
+        raise RunError(f"{what}: {one_line(error)}") from error
+    return selector if learnt_fear(selector) else None
+
+
+def _restore(selector: GoalSelector, state: dict) -> None:
+    """Continue from a state of any version: what it lacks stays as it is."""
+    for part, saved in zip(selector.parts, state.get("parts", [state]), strict=False):  # a Mix was saved as its method
+        _restore(part, saved)
+    own = {name: value for name, value in state.items() if name != "parts"}
+    selector.load_state_dict(selector.state_dict() | own)
+
+
+def learnt_fear(selector: GoalSelector | None) -> FearSelector | None:
+    """The selector with a fear network that has learnt, of those that ``selector`` is made of."""
+    afraid = None if selector is None else fear_selector(selector)
+    return afraid if afraid is not None and afraid.fear.fitted else None
+
+
+def load_fear(folder: RunFolder, config: TrainConfig, env: Env) -> FearSelector | None:
+    """The selector with a run's fear network and its calibration; for the arguments see ``load_selector``."""
+    return learnt_fear(load_selector(folder, config, env))

@@ -7,8 +7,9 @@ import torch
 
 from deimos.checks import RunError
 from deimos.goals.fear_selector import FearSelector
+from deimos.goals.selector import GoalSelector
 from deimos.learn.policy import Policy, load_policy
-from deimos.run.fear import load_fear
+from deimos.run.fear import learnt_fear, load_selector
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
 from deimos.run.training import load_checkpoint, read_config
@@ -90,6 +91,10 @@ class SavedRun:
         except ValueError as error:
             raise RunError(str(error)) from error
 
+    def selector(self, env: Env) -> GoalSelector | None:
+        """Who chooses the goals of the run, as it is now, if it has a fear network that has learnt."""
+        return load_selector(self.folder, self.config, env)
+
     def fear(self, env: Env) -> FearSelector | None:
         """The selector with the fear network that the run has learnt by now, if it has one."""
-        return load_fear(self.folder, self.config, env)
+        return learnt_fear(self.selector(env))

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, check_at_least, check_choice
+from deimos.checks import RunError, check_at_least, check_choice, one_line
 from deimos.goals.fear_selector import FearSelector
 from deimos.goals.shield import (
     GUARANTEES,
@@ -423,10 +423,10 @@ def stored_guard(folder: RunFolder, policy: Policy, env: Env, afraid: FearSelect
     if stored is None or afraid is None:
         raise RunError(f"{folder.path} has no shield; make one by deimos shield.")
     scale = _goal_scale(env).tolist()
-    safe = [None if value is None else value * each for value, each in zip(stored["safe_goal"], scale, strict=True)]
-    reach = [value * each for value, each in zip(stored["goal_range"], scale, strict=True)]
     try:
+        safe = [None if value is None else value * each for value, each in zip(stored["safe_goal"], scale, strict=True)]
+        reach = [value * each for value, each in zip(stored["goal_range"], scale, strict=True)]
         shield = Shield.from_dict(stored | {"safe_goal": safe, "goal_range": reach}, mode)
-    except ValueError as error:
-        raise RunError(f"{folder.path / SHIELD}: {error}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{folder.path / SHIELD} is not that of a shield for these goals: {one_line(error)}") from error
     return Guard(shield, fear_rule(afraid), ShieldConfig.candidates)

@@ -162,7 +162,7 @@ def read_cell(path: Path) -> Cell:
         if (found := data.pop("schema")) != SCHEMA:
             raise ValueError(f"its schema is {found}, not {SCHEMA}")
         import_plugins(data["plugins"])
-        return from_dict(Cell, data)
+        return from_dict(Cell, data, stored=True)
     except (AttributeError, KeyError, RunError, TypeError, ValueError) as error:
         raise RunError(f"{path} does not describe a cell ({error}).") from error
 

@@ -1,8 +1,6 @@
 """Some uniform goals among a method's own."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -57,14 +55,6 @@ class Mix(Delegate):
             note=None if own.note is None else own.note * ~free,
         )
 
-    def state_dict(self) -> dict:
-        """See ``GoalSelector.state_dict``."""
-        return self.current.state_dict()
-
-    def must_be_sound(self) -> Mapping[str, Any]:
-        """See ``GoalSelector.must_be_sound``."""
-        return self.current.must_be_sound()
-
     def load_state_dict(self, state: dict) -> None:
-        """See ``GoalSelector.load_state_dict``."""
-        self.current.load_state_dict(state)
+        """See ``GoalSelector.load_state_dict``; earlier versions saved the method alone."""
+        super().load_state_dict(state if "parts" in state else {"parts": [state]})

@@ -32,8 +32,6 @@ class Config(SelectorConfig):
 class Penalty(Delegate):
     """See ``Config``. Rewards in logs and evaluations are without it."""
 
-    saved = ("parts",)
-
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config = config
         self.parts = (method(config.base).build(spaces, seed),)

@@ -44,6 +44,7 @@ class QFear(director.Director):
     """
 
     config: Config
+    is_calibrated = False
     inputs_per_row: ClassVar[int] = 2  # an interaction, and the worst that could follow it: NaN where nobody knows
     saved = (*director.Director.saved, "_worst")
     unknown = (*director.Director.unknown, "_worst")

@@ -40,7 +40,7 @@ class Schedule(Delegate):
     """See ``Config``."""
 
     # A run that is resumed with a larger budget keeps the schedule that it began with.
-    saved = ("parts", "switched", "_switch", "_keys")
+    saved = (*Delegate.saved, "switched", "_switch", "_keys")
 
     def __init__(self, config: Config, spaces: Spaces, seed: int) -> None:
         self.config = config

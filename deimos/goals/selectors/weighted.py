@@ -72,7 +72,7 @@ class Weighted(FearSelector):
         chosen = super().propose(rows, state, goal, candidates, draws)
         weight = torch.ones_like(draws[:, 0])
         top = torch.zeros_like(weight, dtype=torch.bool)
-        if self.afraid:
+        if self.fear.fitted:
             assert chosen.percentile is not None
             count = candidates.shape[1]
             kept = picks.kept_above(self.config.percentile, count)
