@@ -122,9 +122,9 @@ class GoalCore(Stateful):
             assign(self.percentile, everybody, 50.0, done)
             return Changes(everybody, everybody, everybody, done, changing ^ done)
         changes = changes or self.changes(terminated, truncated, due)
-        rows = torch.cat([changes.due, changes.done])
-        if not len(rows):
+        if not (len(changes.due) or len(changes.done)):
             return changes
+        rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])
         assign(self.percentile, changes.done, 50.0)
         return changes
