@@ -114,7 +114,7 @@ def test_every_outcome_is_shown_to_the_selector(learn_every, options):
         assert torch.equal(given, goal)
         done = plain.interactions.resolved(step)
         expected += zip(done.env.tolist(), done.resolved.tolist(), done.crashed.tolist(), strict=True)
-    assert len(expected) > 500
+    assert len(expected) > 250
     last = 300 // learn_every * learn_every
     assert sorted(shown.selector.seen) == sorted(row for row in expected if row[1] <= last)
 
