@@ -44,7 +44,7 @@ class GoalSlot:
         self.director, self._next_step = director, next_step
         self.where: Any = where  # a key of dictionaries, else a slice of arrays
         self._space, self._spaces = space, batch_space(space, num_envs)
-        self.goal = self.read(create_empty_array(space, num_envs)).copy()  # type: ignore[arg-type]
+        self.goal = self.read(create_empty_array(space, num_envs)).copy()
         """The goals in force, shape (num_envs, goal_dim); zeros before the first reset."""
 
     def begin(self, obs: Observation, where: np.ndarray | None = None) -> Observation:

@@ -11,7 +11,7 @@ from deimos.goals.selector import GoalSelector, Spaces, Transitions
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.stateful import Stateful
 
-RING = 64 * 2**20  # bytes for resolved interactions where a world may have any number of them,
+RING = 32 * 2**20  # bytes for resolved interactions where a world may have any number of them,
 SPARE = 8  # but at least so many of each world
 
 
@@ -51,7 +51,8 @@ class GoalCore(Stateful):
         spaces: The worlds.
         window: Steps that resolved interactions are kept for; ``None`` for 2 T.
         any_number: Whether a world may resolve one in every step: where goals last fewer than T steps, or first ones
-            are chosen. Of those the newest are kept that fit into ``RING``, and ``SPARE`` of each world in any case.
+            are chosen. Of those the newest are kept that fit into ``RING``, and ``SPARE`` of each world in any case:
+            where that forgets crashes, the calibration counts too few.
     """
 
     saved = ("selector", "interactions", "weight", "percentile", "_delivered", "_steps")

@@ -72,7 +72,7 @@ class GoalDirector:
         learn_every: Steps between two updates of the selector, at least 1; a rollout of the learner is a good choice.
             Selectors that learn from transitions (``vds``, ``plr``) are updated by ``learn`` alone: say how often.
             Outcomes are kept for 2 T steps or, if more, ``learn_every + T``: ``4 (state_dim + 2 goal_dim + 12)`` bytes
-            per world for every T. Where goals may be shorter, of what exceeds 64 MiB in all, and 8 per world, the
+            per world for every T. Where goals may be shorter, of what exceeds 32 MiB in all, and 8 per world, the
             oldest are forgotten.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
         seed: Seed of the selector's networks and of every choice, in [0, 2^32).

@@ -63,7 +63,7 @@ def _numbers(end: Bound) -> list[float]:
 
 
 def _plain_fields(config: Any) -> dict[str, Any]:
-    found = {}
+    found: dict[str, Any] = {}
     for name in [field.name for field in fields(config)] if is_dataclass(config) else ():
         value = getattr(config, name)
         if is_dataclass(value):
