@@ -34,7 +34,7 @@ class DirectedCommand(abc.ABC):
         super().compute(*args, **options)  # type: ignore[misc]  # it is the term's
 
     def reset(self, env_ids: Rows = None) -> dict[str, float]:
-        """See the term; robots that are reset within a step have had their outcome, and begin an episode all."""
+        """See the term; an episode begins, after the outcome of the last one where a step has ended it."""
         self._observe()
         self.director.reset(env_ids)
         return super().reset(env_ids)  # type: ignore[misc]
