@@ -1,6 +1,7 @@
 """A GoalDirector's state: saved and refused, dropped by a reset, unchanged by a call that fails, kept for an update."""
 
 import copy
+import io
 import math
 from dataclasses import dataclass
 
@@ -177,6 +178,18 @@ def test_the_state_of_another_director_is_refused(other):
     with pytest.raises(ValueError, match=f"state must come from a GoalDirector with .*{message}"):
         goals.load_state_dict(state)
     assert_same(goals.state_dict(), before)
+
+
+def test_options_of_numpy_are_saved_as_pythons():
+    """A state can be read as ``torch.load`` reads by default, whatever kind of number the options were."""
+    options = {"goal_period": np.int64(PERIOD), "seed": np.uint32(0), "num_envs": np.int64(N), "state_dim": np.int64(2)}
+    goals, _ = made(selector=director.Config(percentile=np.float64(75), candidates=np.int64(8)), **options)
+    saved = io.BytesIO()
+    torch.save(goals.state_dict(), saved)
+    saved.seek(0)
+    other, _ = made(selector=director.Config(percentile=75, candidates=8))
+    other.load_state_dict(torch.load(saved, weights_only=True))
+    assert_same(other.state_dict(), goals.state_dict())
 
 
 def test_a_state_that_is_damaged_is_refused():

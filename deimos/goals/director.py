@@ -72,8 +72,7 @@ class GoalDirector:
         learn_every: Steps between two updates of the selector, at least 1; a rollout of the learner is a good choice.
             Selectors that learn from transitions (``vds``, ``plr``) are updated by ``learn`` alone: say how often.
             Outcomes are kept for 2 T steps or, if more, ``learn_every + T``: ``4 (state_dim + 2 goal_dim + 12)`` bytes
-            per world for every T. Where goals may be shorter, of what exceeds 32 MiB in all, and 8 per world, the
-            oldest are forgotten.
+            per world for every T; where goals may be shorter, the newest, up to 32 MiB in all or 8 per world.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
         seed: Seed of the selector's networks and of every choice, in [0, 2^32).
 
@@ -93,20 +92,21 @@ class GoalDirector:
         sizes = {"num_envs": num_envs, "state_dim": state_dim, "goal_dim": goal_dim}
         mode = str(getattr(autoreset, "value", autoreset))
         check_options(periods | sizes, mode, first_goals, learn_every, total_steps, seed)
-        self.goal_period, self.learn_every = goal_period, learn_every
-        self.max_horizon: int = goal_period or max_horizon  # type: ignore[assignment]  # one of them is given
+        periods, sizes = ({name: n if n is None else int(n) for name, n in of.items()} for of in (periods, sizes))
+        self.goal_period, self.learn_every, seed = periods["goal_period"], int(learn_every), int(seed)
+        self.max_horizon: int = self.goal_period or periods["max_horizon"]  # type: ignore[assignment]  # one is given
         self.metrics: dict[str, float] = {}
         """What the selector's last update had to say."""
         self._config = method(selector) if isinstance(selector, str) else selector
         self._choose_first, self._next_step = first_goals == "chosen", mode == "NextStep"
-        self._horizons, self._goal_box = Horizons(goal_period, self.max_horizon, horizon_input), goal_box
+        self._horizons, self._goal_box = Horizons(self.goal_period, self.max_horizon, horizon_input), goal_box
         self._groups, self._total_steps, self._seed = tuple(groups), total_steps, seed
         self._made_with = settings(
             self._config, goal_box, **periods, horizon_input=horizon_input, first_goals=first_goals, seed=seed,
             next_step=self._next_step, groups=[[part.start, part.stop, part.step] for part in self._groups],
         )  # fmt: skip
         known = None if device is None else torch.empty(0, dtype=torch.float32, device=device).device
-        self._told = (num_envs, state_dim, goal_dim), known
+        self._told = [*sizes.values()], known
         self._start_anew()
 
     def _start_anew(self) -> None:
@@ -421,7 +421,7 @@ class GoalDirector:
         any_number = self._choose_first or self.goal_period is None
         core = GoalCore(self._config.build(spaces, self._seed), spaces, window, any_number)
         self._clocks = GoalClocks(core, spaces, self._seed, self._choose_first, self._next_step)
-        self._device, self._sizes = inputs.device, (inputs.num_envs, inputs.state_dim, inputs.goal_dim)
+        self._device, self._sizes = inputs.device, [inputs.num_envs, inputs.state_dim, inputs.goal_dim]
         return self._clocks
 
     def _candidates(self, candidates: Candidates, rows: Tensor, model: A) -> Tensor:

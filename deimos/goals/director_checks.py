@@ -58,6 +58,11 @@ def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **oth
     return {"selector": kind, **_plain_fields(config), **others, "goal_box": box}
 
 
+def _own(value: Any) -> Any:
+    """Python's number instead of NumPy's, which ``torch.load(weights_only=True)`` does not read."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def _numbers(end: Bound) -> list[float]:
     return np.asarray(end.detach().cpu() if isinstance(end, Tensor) else end).astype(np.float32).tolist()
 
@@ -65,7 +70,7 @@ def _numbers(end: Bound) -> list[float]:
 def _plain_fields(config: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in [field.name for field in fields(config)] if is_dataclass(config) else ():
-        value = getattr(config, name)
+        value = _own(getattr(config, name))
         if is_dataclass(value):
             found |= {f"{name}.{inner}": plain for inner, plain in _plain_fields(value).items()}
         elif isinstance(value, PLAIN) or (isinstance(value, tuple) and all(isinstance(part, PLAIN) for part in value)):
