@@ -62,6 +62,16 @@ class Counter(gymnasium.Env):
         return -np.abs(achieved - desired)[..., 0]
 
 
+class Whole(gymnasium.ObservationWrapper):
+    """Observations in whole numbers, which cut off a goal's fraction."""
+
+    observation_space = Box(-100, 100, (3,), np.int64)
+
+    def observation(self, observation):
+        """See ``gymnasium.ObservationWrapper``."""
+        return observation.astype(np.int64)
+
+
 def directed(parted, num_envs=5):
     """Counters whose goals a Director chooses."""
     venv = DummyVecEnv([lambda: Counter(parted)] * num_envs)
@@ -131,6 +141,70 @@ def test_a_reset_drops_what_is_pending():
     assert len(interactions.resolved()) == before
 
 
+def test_a_reset_is_no_step_and_no_outcome():
+    """Between two resets of the worlds nothing is counted: neither steps of the Director's clock nor interactions."""
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
+        envs = wrapped(mode)
+        play(envs, PERIOD + 1)
+        interactions = envs.slot.director.interactions
+        now, known = interactions.now, len(interactions.resolved())
+        envs.reset(seed=1)
+        envs.reset(seed=2)
+        assert (interactions.now, len(interactions.resolved())) == (now, known)
+        play(envs, LIMIT + 2)  # with ends of episodes: it still knows how these worlds are reset
+
+
+def wrapped(mode, state=None, num_envs=4):
+    """Counters in gymnasium's vector, whose Director has loaded a state."""
+    director = GoalDirector("p75", PERIOD, goal_box=BOX, autoreset=mode)
+    if state is not None:
+        director.load_state_dict(state)
+    return DirectedVectorEnv(SyncVectorEnv([Counter] * num_envs, autoreset_mode=mode), director, slice(2, 3), closeness)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_a_director_that_was_resumed_begins_with_a_reset(mode):
+    """A wrapper made for worlds that begin anew takes a Director from a state in which goals were pending."""
+    envs = wrapped(mode)
+    play(envs, PERIOD + 1)
+    assert envs.slot.director.interactions.active.any()
+    second = wrapped(mode, envs.slot.director.state_dict())
+    obs, _ = second.reset(seed=0)
+    assert not second.slot.director.interactions.active.any()
+    assert np.array_equal(obs[:, 2:], second.slot.goal)
+    play(second, LIMIT + 2)
+
+    first = directed(parted=False)
+    first.reset()
+    for _ in range(PERIOD + 1):
+        first.step(np.zeros((5, 1)))
+    other = directed(parted=False)
+    other.slot.director.load_state_dict(first.slot.director.state_dict())
+    other.reset()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_a_reset_of_some_worlds_leaves_the_others_alone(mode):
+    """Under gymnasium's mask the others keep their goals, their clocks and what is pending."""
+    envs = wrapped(mode)
+    envs.reset(seed=0)
+    for world in envs.env.envs:
+        world.crash = LIMIT + 1
+    for _ in range(PERIOD + 1):
+        obs, *_ = envs.step(np.zeros((4, 1), np.float32))
+    director, goal = envs.slot.director, obs[:, 2].copy()
+    assert director.interactions.active.all()
+    mask = np.array([False, True, False, False])
+    obs, _ = envs.reset(options={"reset_mask": mask})
+    assert np.array_equal(obs[:, 2] != goal, mask)
+    envs.env.envs[1].crash = LIMIT + 1
+    assert director.interactions.active.tolist() == [True, False, True, True]
+    for _ in range(PERIOD - 1):
+        last, (obs, *_) = obs, envs.step(np.zeros((4, 1), np.float32))
+    assert np.array_equal(obs[:, 2] != last[:, 2], ~mask)  # due, but for the world whose goal began later
+    assert len(director.interactions.resolved()) == 3
+
+
 def test_equal_seeds_give_equal_goals():
     """Nothing of a directed loop depends on a generator that it shares with others."""
     found = []
@@ -158,6 +232,9 @@ def test_refuses_what_does_not_fit():
     for envs, where in ((flat, "desired_goal"), (parted, slice(2, 3)), (parted, "goal")):
         with pytest.raises(ValueError, match="where must be a key of a Dict or a slice of a Box, got"):
             DirectedVecEnv(envs, director, where, reward=lambda obs, own: own)
+    whole = DummyVecEnv([lambda: Whole(Counter())])
+    with pytest.raises(ValueError, match=r"where must be a place for fractions, which goals have, got .* of int64"):
+        DirectedVecEnv(whole, director, slice(2, 3), reward=lambda obs, own: own)
     with pytest.raises(
         ValueError, match="reward must be a function where observations have no achieved_goal, got None"
     ):
@@ -290,6 +367,58 @@ def test_interactions_are_those_of_the_commands(isaac_lab):
     state, speeds = torch.zeros(15), np.array([0.0, 0.95])
     slow, fast = director.risk_map(state, torch.zeros(3), {0: speeds, 1: [0.0]}).probability[0]
     assert fast > slow + 0.2
+
+
+def test_a_reset_between_two_steps_begins_episodes(isaac_lab):
+    """Whatever the modes made of commands meanwhile: pending goals are dropped, and the next ones are first ones."""
+    torch.manual_seed(0)
+    worlds = isaac_lab(standing=0.5)
+    interactions = worlds.term.director.interactions
+    for _ in range(4):
+        for _ in range(10):
+            worlds.step()
+        now, known = interactions.now, len(interactions.resolved())
+        half = torch.arange(32)
+        worlds.term.reset(half)
+        assert not interactions.active[half].any()
+        assert interactions.active[32:].any()
+        worlds.term.reset(None)
+        assert not interactions.active.any()
+        assert (interactions.now, len(interactions.resolved())) == (now, known)
+    worlds.step()
+    assert interactions.now == 41
+
+
+def test_a_term_goes_on_from_a_state(isaac_lab):
+    """The Director's state in another environment, and a counter of steps from a checkpoint, before the first step."""
+    torch.manual_seed(0)
+    first, second = isaac_lab(standing=0.5), isaac_lab(standing=0.5)
+    for _ in range(30):
+        first.step()
+    director = second.term.director
+    director.load_state_dict(first.term.director.state_dict())
+    second.common_step_counter = 1000
+    second.term.reset(torch.arange(64))
+    assert not director.interactions.active.any()
+    assert director.interactions.now == 30
+    for _ in range(30):
+        second.step()
+    assert director.interactions.now == 60
+
+
+def test_a_robot_that_has_diverged_does_not_stop_the_others(isaac_lab):
+    """It is done, its data may be NaN until the next step, and its first command is drawn whatever its state."""
+    torch.manual_seed(0)
+    worlds = isaac_lab()
+    for _ in range(10):
+        worlds.step()
+    worlds.scene["robot"].data.joint_pos[5] = torch.nan
+    worlds.term.reset(torch.tensor([5]))
+    assert worlds.term.command.isfinite().all()
+    alive = int((~(worlds.reset_terminated | worlds.reset_time_outs)).nonzero()[-1])
+    worlds.scene["robot"].data.joint_pos[alive] = torch.nan
+    with pytest.raises(ValueError, match=f"state of world {alive} must be finite"):
+        worlds.term._resample(torch.tensor([alive]))
 
 
 def test_what_is_executed_is_what_is_learnt(isaac_lab):

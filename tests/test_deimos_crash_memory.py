@@ -262,7 +262,7 @@ def test_fear_never_freezes():
         for parameter in run.ppo.actor.parameters():
             parameter.data.mul_(1e-3)
         run.ppo.optimizer.step = lambda: None
-        rows = [run.iterate() for _ in range(6)]
+        rows = [run.iterate() for _ in range(7)]
         assert rows[-1]["fear/crash_rate"] == 0
         assert all(row["fear/chosen"] == 1 for row in rows)
         last[name] = rows

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from deimos import GoalDirector
+from deimos.goals.core import window_between
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
 from deimos.goals.selectors import director
@@ -48,7 +49,7 @@ def test_it_does_what_the_loop_does(candidates):
     """On the same worlds it issues the same goals and keeps the same interactions, labels, scores and fear."""
     config = director.Config(percentile=75, candidates=candidates, fear=FearConfig(min_per_class=8))
     env = CONFIG.build(N, CPU, 0)
-    ours = GoalLoop(env, config.build(spaces(env), seed=0))
+    ours = GoalLoop(env, config.build(spaces(env), seed=0), window_between(PERIOD, 12))
     theirs = Theirs(GoalDirector(config, PERIOD, learn_every=12, seed=0), candidates)
     labels = []
     for now in range(96):

@@ -244,6 +244,19 @@ assert not loaded, loaded
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+def test_it_says_nothing_of_the_tools_beneath_it():
+    """Where Warp is installed its networks use it, and what Warp reports of its start is not our host's business."""
+    code = """
+import numpy as np
+import deimos
+director = deimos.GoalDirector("p75", goal_period=2, goal_box=([-1.0], [1.0]))
+director.step(np.zeros((4, 2)), np.zeros((4, 1)), np.zeros(4), np.zeros(4))
+"""
+    home = Path(__file__).resolve().parent.parent
+    done = subprocess.run([sys.executable, "-c", code], cwd=home, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
 def test_nothing_that_it_keeps_carries_a_gradient():
     """In a loop that records gradients, as a differentiable simulator's does, it keeps copies without them."""
     goals, no = GoalDirector(AFRAID, 2), torch.zeros(4, dtype=torch.bool)

@@ -128,6 +128,14 @@ def test_exploration_is_addressed_by_world_and_step():
         assert torch.equal(trainer.rollout.noise, expected)
 
 
+@pytest.mark.parametrize(("period", "window"), [(24, 48), (100, 200), (8, 32)])
+def test_outcomes_last_from_one_update_to_the_next(period, window):
+    """They are kept for 2 T steps, and where a rollout is longer than T for the rollout and T more."""
+    config = replace(CONFIG, env=replace(CONFIG.env, goal_period=period))
+    assert config.ppo.num_steps == 24
+    assert training.Trainer(config, torch.device("cpu")).loop.interactions.window == window
+
+
 def test_a_rollout_keeps_no_graph():
     """What an environment or a caller hands over with gradients is recorded without."""
     rollout = Rollout(2, 3, 4, 1, torch.device("cpu"))

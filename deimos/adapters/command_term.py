@@ -6,14 +6,15 @@ from typing import Any
 from torch import Tensor
 
 from deimos.goals.director import GoalDirector
+from deimos.goals.given import Rows
 
 
 class DirectedCommand(abc.ABC):
     """Mix it in before the class of a command term, such as either's ``UniformVelocityCommand``.
 
     The term resamples as before, by its own timers and at resets, and draws its modes (headings, standing robots); the
-    commands come from the Director, which learns from what the modes made of them. A ``reset`` of the whole environment
-    between two steps counts as a resampling.
+    commands come from the Director, which learns from what the modes made of them. A reset between two steps, as after
+    the Director or the environment has loaded a state, drops what is pending and is no outcome.
     """
 
     director: GoalDirector
@@ -32,8 +33,13 @@ class DirectedCommand(abc.ABC):
         self._observe()
         super().compute(*args, **options)  # type: ignore[misc]  # it is the term's
 
-    def _resample_command(self, env_ids: Tensor) -> None:
+    def reset(self, env_ids: Rows = None) -> dict[str, float]:
+        """See the term; an episode begins, after the outcome of the last one where a step has ended it."""
         self._observe()
+        self.director.reset(env_ids)
+        return super().reset(env_ids)  # type: ignore[misc]
+
+    def _resample_command(self, env_ids: Tensor) -> None:
         before = self.command[env_ids].clone()
         super()._resample_command(env_ids)  # type: ignore[misc]
         self.command[env_ids] = self.director.propose(env_ids, self.state()[env_ids], before)
@@ -41,6 +47,8 @@ class DirectedCommand(abc.ABC):
     def _observe(self) -> None:
         """Tell the Director how the last step ended; in a step, worlds are reset before commands are computed."""
         env = self._env
-        if env.common_step_counter != self._observed:
-            self._observed = env.common_step_counter
+        if env.common_step_counter == self._observed:
+            return
+        self._observed = env.common_step_counter
+        if hasattr(env, "reset_terminated"):  # or the counter is a checkpoint's, and nothing has been stepped yet
             self.director.observe(env.reset_terminated, env.reset_time_outs, executed=self.command)

@@ -25,11 +25,11 @@ class GoalSlot:
         director: Who chooses the goals, on its own clock; it must have a ``goal_box``.
         space: Observation space of one world: a ``Box`` of one axis, or a ``Dict``.
         num_envs: Number of worlds.
-        where: The goal's components of a ``Box``, or its key in a ``Dict``.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``, of a type that holds fractions.
         next_step: Whether a world that is done is reset in a step of its own.
 
     Raises:
-        ValueError: If the space has no such place.
+        ValueError: If the space has no such place, or holds whole numbers there.
     """
 
     def __init__(
@@ -38,21 +38,26 @@ class GoalSlot:
         parted = isinstance(space, Dict)
         if not isinstance(where, str if parted else slice) or (parted and where not in space.spaces):
             raise ValueError(f"where must be a key of a Dict or a slice of a Box, got {where!r} for {space}.")
-        self.director, self._next_step, self._begun = director, next_step, False
+        kind = space[where].dtype if isinstance(space, Dict) else space.dtype
+        if kind is None or not np.issubdtype(kind, np.floating):
+            raise ValueError(f"where must be a place for fractions, which goals have, got {where!r} of {kind}.")
+        self.director, self._next_step = director, next_step
         self.where: Any = where  # a key of dictionaries, else a slice of arrays
-        self.goal: np.ndarray
-        """The goals in force, shape (num_envs, goal_dim), from the first reset on."""
         self._space, self._spaces = space, batch_space(space, num_envs)
+        self.goal = self.read(create_empty_array(space, num_envs)).copy()
+        """The goals in force, shape (num_envs, goal_dim); zeros before the first reset."""
 
-    def begin(self, obs: Observation) -> Observation:
-        """First goals for all worlds, which begin an episode, in their observations; what is pending is dropped."""
-        if self._begun:
-            everybody = np.ones(len(self.goal), dtype=bool)
-            self.director.observe(~everybody, everybody)
-            if self._next_step:  # the step that a reset takes
-                self.director.observe(~everybody, ~everybody)
-        self._begun = True
-        self.goal = self.director.propose(None, self.state(obs), self.read(obs))
+    def begin(self, obs: Observation, where: np.ndarray | None = None) -> Observation:
+        """First goals in the observations of worlds that begin an episode; what is pending there is dropped.
+
+        Args:
+            obs: Observations of all worlds.
+            where: Which of them begin an episode, bool, shape (num_envs,); ``None`` for all.
+        """
+        rows = slice(None) if where is None else where
+        self.director.reset(where)
+        self.goal = self.goal.copy()  # observations may share it
+        self.goal[rows] = self.director.propose(where, self.state(obs)[rows], self.read(obs)[rows])
         return self.write(obs)
 
     def ended(self, obs: Observation, last: dict[int, Observation]) -> Observation:
@@ -134,11 +139,14 @@ class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
         self.slot = GoalSlot(director, env.single_observation_space, env.num_envs, where, next_step)
         self._reward, self._over = reward, np.zeros(env.num_envs, dtype=bool)
 
-    def reset(self, **options: Any) -> tuple[Observation, dict[str, Any]]:
-        """See ``VectorEnv.reset``; every world gets a first goal."""
-        obs, infos = self.env.reset(**options)
-        self._over[:] = False
-        return self.slot.begin(obs), infos
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """See ``VectorEnv.reset``; every world, or those of a ``reset_mask`` in the options, get a first goal."""
+        where = (options or {}).get("reset_mask")  # the worlds take it out
+        obs, infos = self.env.reset(seed=seed, options=options)
+        self._over[slice(None) if where is None else where] = False
+        return self.slot.begin(obs, where), infos
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """See ``VectorEnv.step``; what an episode ended in, and its reward, are of the goal that was in force."""

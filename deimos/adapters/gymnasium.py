@@ -43,6 +43,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """Many worlds, with NumPy arrays in and copies out; goals are issued within ``step``.
 
     ``loop`` leads to the environment, the selector and the interactions; every ``reset`` with a seed makes another one.
+    On CUDA make it and call it within ``deimos.sim.shared.one_stream(device)``; outside, it is refused.
 
     Args:
         config: The environment.

@@ -20,7 +20,8 @@ class RslRlVecEnv(VecEnv):
 
     Everything that it returns is a copy that later steps leave alone. rsl_rl asks a selector for goals but
     does not let it learn: a Director stays uniform until its owner calls, say after every iteration,
-    ``loop.selector.learn(loop.interactions, None)``.
+    ``loop.selector.learn(loop.interactions, None)``. On CUDA make it and call it within
+    ``deimos.sim.shared.one_stream(device)``; outside, it is refused.
 
     Args:
         env: The worlds, as they were built.

@@ -17,7 +17,7 @@ class DirectedVecEnv(VecEnvWrapper):
     Args:
         venv: The worlds. What terminates is a crash; ``TimeLimit.truncated`` in an info is not.
         director: Who chooses the goals, on its own clock; it must have a ``goal_box``.
-        where: The goal's components of a ``Box``, or its key in a ``Dict``.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``, of a type that holds fractions.
         reward: Rewards for the goals in force; see ``Reward``. ``None`` asks the worlds' own ``compute_reward``, which
             takes achieved goals, desired goals and infos, as in gymnasium-robotics.
 

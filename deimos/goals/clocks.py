@@ -1,18 +1,35 @@
 """When goals are due in other people's loops, by our clock or by theirs; tensors only, one per world."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from deimos.goals.core import GoalCore
+from deimos.goals.core import Changes, GoalCore
 from deimos.goals.selector import Spaces
 from deimos.nn.random import Purpose, uniforms
 from deimos.nn.stateful import Stateful
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What a step of all worlds has ended."""
+
+    terminated: Tensor
+    """True where the world crashed, bool, shape (num_envs,)."""
+    truncated: Tensor
+    """True where its episode was cut off without a crash, bool, shape (num_envs,)."""
+    due: Tensor
+    """True where the goal's time is up, bool, shape (num_envs,)."""
+    changes: Changes
+    rows: Tensor
+    """Worlds that need a goal now, int64, shape (m,): those that are due, then those that begin an episode."""
+
+
 class GoalClocks(Stateful):
     """The goal core of somebody else's worlds, and what tells it when a goal ends.
 
-    Whoever owns the worlds calls ``advance`` after every step, and ``propose`` for the worlds that get a goal.
+    Whoever owns the worlds calls ``outcome`` and ``advance`` after every step, and ``propose`` where a goal is due.
 
     Args:
         core: Who chooses, and the interactions.
@@ -42,47 +59,63 @@ class GoalClocks(Stateful):
         self._draws: Tensor | None = None  # for the next decision of every world, until the step _drawn_until
         self._drawn_until = 0
 
-    def advance(
-        self, terminated: Tensor, truncated: Tensor, tracking: Tensor | None, executed: Tensor | None, own: bool
-    ) -> Tensor:
-        """Count a step of all worlds and resolve what it decided.
+    def outcome(self, terminated: Tensor, truncated: Tensor, own: bool) -> Outcome:
+        """What the last step has ended; nothing is counted yet, so whoever fails now may call again.
 
         Args:
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
+            own: Whether goals are due after T steps. If not, they last until the next proposal, and an interaction
+                at most for its horizon.
+        """
+        interactions = self.core.interactions
+        if own:
+            due = self._age + ~self._over >= self.core.goal_period
+        else:
+            due = interactions.active & (interactions.now + 1 - interactions.issued_at >= interactions.horizon)
+        changes = self.core.changes(terminated, truncated, due)
+        begin = self._over.nonzero().squeeze(1) if self._next_step else changes.done
+        return Outcome(terminated, truncated, due, changes, torch.cat([changes.due, begin]))
+
+    def advance(self, step: Outcome, tracking: Tensor | None, executed: Tensor | None) -> None:
+        """Count a step of all worlds and resolve what it decided.
+
+        Args:
+            step: What ``outcome`` says of it.
             tracking: How well a goal is met, in [0, 1], shape (num_envs,) for the whole of it or (num_envs, groups);
                 ``None`` for 0.
             executed: Goals that were pursued, shape (num_envs, goal_dim); ``None`` for those that were given.
-            own: Whether goals are due after T steps. If not, they last until the next proposal, and an interaction
-                at most for its horizon.
-
-        Returns:
-            Worlds that need a goal now, int64, shape (m,): those that are due, then those that begin an episode.
         """
-        interactions = self.core.interactions
+        interactions, done = self.core.interactions, step.changes.ended
         if executed is not None:  # what a goal turned into at once: its first step tells
             begun = (interactions.active & (interactions.issued_at == interactions.now)).nonzero().squeeze(1)
             interactions.execute(begun, executed[begun])
             self._given.zero_()
-        begins = self._over.clone()  # this step was their reset alone
-        self._age += ~begins
-        if own:
-            due = self._age >= self.core.goal_period
-        else:
-            due = interactions.active & (interactions.now + 1 - interactions.issued_at >= interactions.horizon)
+        self._age += ~self._over  # where an episode was over, this step was the reset alone
         self.tracked |= tracking is not None
         tracking = self._untracked if tracking is None else tracking
         reward, columns = (tracking, None) if tracking.dim() == 1 else (torch.zeros_like(tracking[:, 0]), tracking)
-        changes = self.core.advance(terminated, truncated, due, reward, columns)
-        done = terminated | truncated
-        self._first.copy_(done | begins)
+        self.core.advance(step.terminated, step.truncated, step.due, reward, columns, changes=step.changes)
+        self._first.copy_(done | self._over)
         self._given &= ~done
         self._age.masked_fill_(done, 0)
         self.core.weight.masked_fill_(done, 1.0)
-        if not self._next_step:
-            return torch.cat([changes.due, changes.done])
-        self._over.copy_(done)
-        return torch.cat([changes.due, begins.nonzero().squeeze(1)])
+        if self._next_step:
+            self._over.copy_(done)
+
+    def reset(self, rows: Tensor) -> None:
+        """Begin an episode in the listed worlds, int64, shape (m,): what is pending there is dropped."""
+        core = self.core
+        for flags in (core.interactions.active, self._given, self._over):
+            flags.index_fill_(0, rows, False)
+        self._first.index_fill_(0, rows, True)
+        self._age.index_fill_(0, rows, 0)
+        core.weight.index_fill_(0, rows, 1.0)
+        core.percentile.index_fill_(0, rows, 50.0)
+
+    def uniform(self, rows: Tensor) -> Tensor:
+        """True where the next goal is a uniform one, whatever the state, bool, shape (m,); ``rows`` are worlds."""
+        return (self._over if self._choose_first else self._first)[rows]
 
     def end(self, rows: Tensor) -> None:
         """End what is pending in the listed worlds, int64, shape (m,), before its time.
@@ -115,7 +148,7 @@ class GoalClocks(Stateful):
             Goals, shape (m, goal_dim). First goals are the first candidates, unless they are chosen.
         """
         first = self._first[rows]
-        ours = ~(self._over[rows] if self._choose_first else first)
+        ours = ~self.uniform(rows)
         goals = candidates[:, 0].clone()
         chosen = ours.nonzero().squeeze(1)
         if len(chosen):

@@ -6,10 +6,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deimos.goals.interactions import Interactions, assign
+from deimos.goals.interactions import Interactions, assign, bytes_of
 from deimos.goals.selector import GoalSelector, Spaces, Transitions
 from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.stateful import Stateful
+
+RING = 32 * 2**20  # bytes for resolved interactions where a world may have any number of them,
+SPARE = 8  # but at least so many of each world
+
+
+def window_between(goal_period: int, steps: int) -> int:
+    """Steps that outcomes are kept for, so that each is learnt from where a selector learns every ``steps`` steps.
+
+    The method learns from the last 2 T. The crash memory takes over what was issued T steps ago, once all of that time
+    is known: what was resolved up to T steps before the last update must still be there.
+    """
+    return max(2 * goal_period, steps + goal_period)
 
 
 @dataclass(frozen=True)
@@ -38,8 +50,9 @@ class GoalCore(Stateful):
         selector: Who chooses.
         spaces: The worlds.
         window: Steps that resolved interactions are kept for; ``None`` for 2 T.
-        capacity: Resolved interactions that are kept per world within the window, at least 1; ``None`` for as many as
-            there can be where every goal lasts T steps and first goals are not chosen.
+        any_number: Whether a world may resolve one in every step: where goals last fewer than T steps, or first ones
+            are chosen. Of those the newest are kept that fit into ``RING``, and ``SPARE`` of each world in any case:
+            where that forgets crashes, the calibration counts too few.
     """
 
     saved = ("selector", "interactions", "weight", "percentile", "_delivered", "_steps")
@@ -47,17 +60,20 @@ class GoalCore(Stateful):
     by_world = ("weight", "percentile", "_delivered")
 
     def __init__(
-        self, selector: GoalSelector, spaces: Spaces, window: int | None = None, capacity: int | None = None
+        self, selector: GoalSelector, spaces: Spaces, window: int | None = None, any_number: bool = False
     ) -> None:
         self.selector = selector
         self.goal_period = spaces.goal_period
         window = window or 2 * self.goal_period
+        groups = 0 if spaces.groups == (slice(None),) else len(spaces.groups)
         # No world resolves more within the window, since a crash is followed by a first goal of T steps.
-        capacity = capacity or math.ceil(window / self.goal_period) + 1
+        capacity = math.ceil(window / self.goal_period) + 1
+        if any_number:
+            row = spaces.num_envs * bytes_of(spaces.state_dim, spaces.goal_dim, groups)
+            capacity = min(window, max(SPARE, RING // row))
         self.interactions = Interactions(
-            spaces.num_envs, spaces.state_dim, spaces.goal_dim, capacity, window, spaces.device,
-            groups=0 if spaces.groups == (slice(None),) else len(spaces.groups),
-        )  # fmt: skip
+            spaces.num_envs, spaces.state_dim, spaces.goal_dim, capacity, window, spaces.device, groups
+        )
         self.weight = torch.ones(spaces.num_envs, dtype=torch.float32, device=spaces.device)
         """Weight of the transitions under the active goal in everything learnt, at least 0, shape (num_envs,)."""
         self.percentile = torch.full_like(self.weight, 50.0)
@@ -67,9 +83,20 @@ class GoalCore(Stateful):
         self._everybody = torch.arange(spaces.num_envs, dtype=torch.int64, device=spaces.device)
         self._nobody = self._everybody[:0]
 
+    def changes(self, terminated: Tensor, truncated: Tensor, due: Tensor) -> Changes:
+        """What ``advance`` will return for a step; nothing is counted yet."""
+        done = terminated | truncated
+        masks = torch.stack([due & ~done, done, truncated])
+        # A known count spares the device another wait.
+        due_rows, done_rows, cut_off = (
+            torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nobody
+            for mask, count in zip(masks, masks.sum(1).tolist(), strict=True)
+        )
+        return Changes(due_rows, done_rows, cut_off, done)
+
     def advance(
         self, terminated: Tensor, truncated: Tensor, due: Tensor, reward: Tensor, tracking: Tensor | None = None, *,
-        dense: bool = False,
+        dense: bool = False, changes: Changes | None = None,
     ) -> Changes:  # fmt: skip
         """Count a step, and resolve the interactions that it ended.
 
@@ -84,25 +111,19 @@ class GoalCore(Stateful):
                 where there is one group and the reward says it.
             dense: Whether the changes shall be in dense form, which reads nothing from the device. Otherwise three
                 counts are read at once, and what follows is done for those worlds alone.
+            changes: What ``changes`` has said of this step; ``None`` to find it out.
         """
         self.interactions.advance(reward, terminated, tracking)
         self._delivered += self.percentile
         self._steps += 1
-        done = terminated | truncated
         if dense:
+            done = terminated | truncated
             everybody, changing = self._everybody, due | done
             self.interactions.resolve(everybody, terminated, due, changing)
             assign(self.percentile, everybody, 50.0, done)
             return Changes(everybody, everybody, everybody, done, changing ^ done)
-        masks = torch.stack([due & ~done, done, truncated])
-        counts = masks.sum(1).tolist()
-        # A known count spares the device another wait.
-        due_rows, done_rows, cut_off = (
-            torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nobody
-            for mask, count in zip(masks, counts, strict=True)
-        )
-        changes = Changes(due_rows, done_rows, cut_off, done)
-        if not any(counts):
+        changes = changes or self.changes(terminated, truncated, due)
+        if not (len(changes.due) or len(changes.done)):
             return changes
         rows = torch.cat([changes.due, changes.done])
         self.interactions.resolve(rows, terminated[rows], due[rows])

@@ -1,5 +1,6 @@
 """A goal selector in other people's loops: one object, which needs only torch and NumPy."""
 
+import copy
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,21 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice, check_range
+from deimos.checks import check_at_least
 from deimos.goals import given
 from deimos.goals.clocks import GoalClocks
-from deimos.goals.core import GoalCore
+from deimos.goals.core import GoalCore, window_between
+from deimos.goals.director_checks import check_candidates, check_options, refuse_unsound, settings, unpacked
 from deimos.goals.fear_selector import FearEstimate, fear_selector
 from deimos.goals.given import A, Array, Bound, Candidates, GoalBox, Inputs, Rows
+from deimos.goals.horizons import Horizons
 from deimos.goals.interactions import Interactions
 from deimos.goals.methods import method
 from deimos.goals.risk_map import RiskMap, grid
 from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces, Transitions
 from deimos.nn.host import own_settings
-
-# Resolved interactions that are kept per world where there may be any number within 2 T steps. Of more the oldest are
-# forgotten, and where that happens to worlds that soon crash, the calibration counts too few crashes.
-SPARE = 8
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +70,9 @@ class GoalDirector:
         autoreset: gymnasium's ``AutoresetMode`` or its value: ``SameStep``, also for loops that reset before the next
             step by hand (``Disabled``), or ``NextStep``, where a step of its own resets a world after its end.
         learn_every: Steps between two updates of the selector, at least 1; a rollout of the learner is a good choice.
-            Selectors that learn from transitions (``vds``, ``plr``) are updated by ``learn`` alone.
+            Selectors that learn from transitions (``vds``, ``plr``) are updated by ``learn`` alone: say how often.
+            Outcomes are kept for 2 T steps or, if more, ``learn_every + T``: ``4 (state_dim + 2 goal_dim + 12)`` bytes
+            per world for every T; where goals may be shorter, the newest, up to 32 MiB in all or 8 per world.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
         seed: Seed of the selector's networks and of every choice, in [0, 2^32).
 
@@ -87,38 +88,33 @@ class GoalDirector:
         groups: Sequence[slice] = (slice(None),), autoreset: object = "SameStep", learn_every: int = 24,
         total_steps: int = 0, seed: int = 0,
     ) -> None:  # fmt: skip
-        counts = {"goal_period": goal_period, "max_horizon": max_horizon}
-        for name, value in (counts | {"num_envs": num_envs, "state_dim": state_dim, "goal_dim": goal_dim}).items():
-            if value is not None:
-                check_at_least(name, value, 1)
-        if (goal_period is None) == (max_horizon is None):
-            raise ValueError(
-                "goal_period must be the steps that a goal is active or, where these vary, max_horizon the most that "
-                f"they can be; got {goal_period} and {max_horizon}."
-            )
+        periods = {"goal_period": goal_period, "max_horizon": max_horizon}
+        sizes = {"num_envs": num_envs, "state_dim": state_dim, "goal_dim": goal_dim}
         mode = str(getattr(autoreset, "value", autoreset))
-        check_choice("autoreset", mode, ["SameStep", "NextStep", "Disabled"])
-        check_choice("first_goals", first_goals, ["uniform", "chosen"])
-        check_at_least("learn_every", learn_every, 1)
-        check_at_least("total_steps", total_steps, 0)
-        check_range("seed", seed, 0, 2**32 - 1)
-        self.goal_period, self.learn_every = goal_period, learn_every
-        self.max_horizon: int = goal_period or max_horizon  # type: ignore[assignment]  # one of them is given
+        check_options(periods | sizes, mode, first_goals, learn_every, total_steps, seed)
+        periods, sizes = ({name: n if n is None else int(n) for name, n in of.items()} for of in (periods, sizes))
+        self.goal_period, self.learn_every, seed = periods["goal_period"], int(learn_every), int(seed)
+        self.max_horizon: int = self.goal_period or periods["max_horizon"]  # type: ignore[assignment]  # one is given
         self.metrics: dict[str, float] = {}
         """What the selector's last update had to say."""
         self._config = method(selector) if isinstance(selector, str) else selector
         self._choose_first, self._next_step = first_goals == "chosen", mode == "NextStep"
-        self._horizon_input, self._goal_box = horizon_input, goal_box
-        self._box: GoalBox | None = None
+        self._horizons, self._goal_box = Horizons(self.goal_period, self.max_horizon, horizon_input), goal_box
         self._groups, self._total_steps, self._seed = tuple(groups), total_steps, seed
-        self._made_with = {
-            "selector": type(self._config).__module__, **counts, "horizon_input": horizon_input,
-            "first_goals": first_goals, "next_step": self._next_step, "groups": len(self._groups),
-        }  # fmt: skip
-        self._learnt_at = 0  # step of the last update
-        self._device = None if device is None else torch.empty(0, dtype=torch.float32, device=device).device
+        self._made_with = settings(
+            self._config, goal_box, **periods, horizon_input=horizon_input, first_goals=first_goals, seed=seed,
+            next_step=self._next_step, groups=[[part.start, part.stop, part.step] for part in self._groups],
+        )  # fmt: skip
+        known = None if device is None else torch.empty(0, dtype=torch.float32, device=device).device
+        self._told = [*sizes.values()], known
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        """Know what the constructor was told and have learnt nothing."""
+        self._sizes, self._device = self._told
         self._clocks: GoalClocks | None = None
-        self._sizes: tuple[int | None, int | None, int | None] = (num_envs, state_dim, goal_dim)
+        self._box: GoalBox | None = None
+        self._learnt_at = 0  # step of the last update
         if self._device is not None and None not in self._sizes:
             self._begin(self._expected(np.zeros(0), None, None, None))
 
@@ -176,14 +172,16 @@ class GoalDirector:
             truncated: True where its episode was cut off without a crash, shape (num_envs,): bool, or 0 and 1.
             candidates: Independent uniform valid goals, from within ``goal_range``: shape (num_envs, N, goal_dim), N at
                 least 1, or a function that returns (m, N, goal_dim) for the m worlds that need one, whose indices it is
-                given; ``None`` to draw them from ``goal_box``.
+                given; ``None`` to draw them from ``goal_box``. If it raises, nothing has happened yet: call again.
             tracking: How well the goal is met, in [0, 1], for curricula: shape (num_envs,), or (num_envs, groups);
                 ``None`` for 0.
             executed: What the worlds really pursued where that was not ``goal`` (headings, standing, limits), shape
                 (num_envs, goal_dim): fear is learnt of what a goal became in its first step. ``None`` for ``goal``.
 
         Raises:
-            ValueError: If a shape, a device or a number does not fit, or a goal is another one than was given.
+            ValueError: If a shape, a device or a number does not fit, or a goal is another one than was given. Nothing
+                is counted then.
+            SimulationError: If a network is not finite after an update.
         """
         if self.goal_period is None:
             raise ValueError(
@@ -192,18 +190,20 @@ class GoalDirector:
         num_envs, state_dim = given.matrix("state", state, "state_dim")
         inputs = self._expected(state, num_envs, state_dim, given.matrix("goal", goal, "goal_dim")[1])
         states, goals = inputs.states(state, inputs.num_envs), inputs.goals(goal, inputs.num_envs)
-        ends = inputs.ends(terminated, truncated, tracking, executed)
-        inputs.check_candidates(candidates, inputs.num_envs)
+        crashed, cut_off, met, pursued = inputs.ends(terminated, truncated, tracking, executed)
+        check_candidates(candidates, inputs.num_envs, inputs, self._goal_box is not None)
         clocks = self._clocks or self._begin(inputs)
-        unseen = None if self._choose_first and not self._next_step else ends[0] | ends[1]
-        given.refuse_not_finite("state", states, but=unseen)
-        given.refuse_not_finite("goal", goals)
+        unseen = None if self._choose_first and not self._next_step else crashed | cut_off
+        refuse_unsound("state", states, but=unseen)
+        refuse_unsound("goal", goals)
         if executed is None:
             clocks.refuse_other_goals(goals)
-        rows, new = clocks.advance(*ends, own=True), goals[:0]
-        if len(rows):
-            offered = self._candidates(given.taken(candidates, rows), rows, goal)
-            new = clocks.propose(rows, self._seen(states[rows], None), goals[rows], offered, own=True)
+        step = clocks.outcome(crashed, cut_off, own=True)
+        rows, new = step.rows, goals[:0]
+        offered = self._candidates(given.taken(candidates, rows), rows, goal) if len(rows) else None
+        clocks.advance(step, met, pursued)
+        if offered is not None:
+            new = clocks.propose(rows, self._horizons.behind(states[rows]), goals[rows], offered, own=True)
         self._learn_if_due()
         changed = torch.zeros(inputs.num_envs, dtype=torch.bool, device=inputs.device).index_fill_(0, rows, True)
         weight = given.like(clocks.core.weight.clone(), goal)
@@ -220,10 +220,27 @@ class GoalDirector:
         """
         shape = np.shape(terminated)
         inputs = self._expected(terminated, shape[0] if len(shape) == 1 else None, None, None)
-        ends = inputs.ends(terminated, truncated, tracking, executed)
+        crashed, cut_off, met, pursued = inputs.ends(terminated, truncated, tracking, executed)
         clocks = self._clocks or self._begin(inputs)
         self._learn_if_due()  # all proposals of the step before have been made by now
-        clocks.advance(*ends, own=False)
+        clocks.advance(clocks.outcome(crashed, cut_off, own=False), met, pursued)
+
+    @own_settings()
+    @torch.no_grad()
+    def reset(self, rows: Rows = None) -> None:
+        """Begin episodes in worlds that were reset by hand; then ``propose`` first goals for them.
+
+        What is pending there is dropped; what was learnt stays, and no step is counted. Call it for all worlds after
+        ``load_state_dict`` unless they go on where they were, too. Before the first call it changes nothing.
+
+        Args:
+            rows: Worlds: indices, each once, a mask, a slice, or ``None`` for all.
+
+        Raises:
+            ValueError: If a world does not exist or is listed twice.
+        """
+        if self._clocks is not None:
+            self._clocks.reset(given.worlds(rows, len(self.weight), self.weight.device))
 
     @own_settings()
     @torch.no_grad()
@@ -237,7 +254,7 @@ class GoalDirector:
 
         Args:
             rows: Worlds: indices, each once, a mask, a slice, or ``None`` for all.
-            state: Their states, shape (m, state_dim).
+            state: Their states, shape (m, state_dim); whatever they are where a first goal is not chosen.
             goal: Their active goals, shape (m, goal_dim).
             candidates: As in ``step``, for these worlds: shape (m, N, goal_dim), a function or ``None``.
             horizon: Steps that each goal is to last, at least 1 and at most ``max_horizon``, one number or shape (m,);
@@ -255,18 +272,19 @@ class GoalDirector:
         inputs = self._expected(state, num_envs, state_dim, given.matrix("goal", goal, "goal_dim")[1])
         listed = given.worlds(rows, inputs.num_envs, inputs.device)
         states, goals = inputs.states(state, len(listed)), inputs.goals(goal, len(listed))
-        lasts = self._lasts(horizon, len(listed), inputs)
-        inputs.check_candidates(candidates, len(listed))
+        lasts = self._horizons.steps(horizon, len(listed), inputs)
+        check_candidates(candidates, len(listed), inputs, self._goal_box is not None)
         clocks = self._clocks or self._begin(inputs)
         if not len(listed):
             return given.like(goals, goal)
-        given.refuse_not_finite("state", states, listed)
-        given.refuse_not_finite("goal", goals, listed)
+        refuse_unsound("state", states, listed, but=clocks.uniform(listed))
+        refuse_unsound("goal", goals, listed)
         clocks.refuse_other_goals(goals, listed)
         offered = self._candidates(candidates, listed, goal)
         clocks.end(listed)
         open_ended = horizon is None and self.goal_period is None
-        new = clocks.propose(listed, self._seen(states, lasts), goals, offered, lasts, open_ended=open_ended)
+        seen = self._horizons.behind(states, lasts)
+        new = clocks.propose(listed, seen, goals, offered, lasts, open_ended=open_ended)
         return given.like(new, goal)
 
     @own_settings()
@@ -283,10 +301,12 @@ class GoalDirector:
 
         Raises:
             ValueError: If the selector needs a rollout and gets none, or not that of all steps since the last call.
+            SimulationError: If a network is not finite any more.
         """
         core = self._known.core
         given.check_transitions(rollout, core, self._learnt_at)
         self.metrics, self._learnt_at = core.learn(rollout), core.interactions.now
+        core.selector.check()
         return self.metrics
 
     @own_settings()
@@ -315,8 +335,8 @@ class GoalDirector:
         new_goals = inputs.goals(new_goal, count, "new_goal")
         for name, numbers in (("state", states), ("goal", goals), ("new_goal", new_goals)):
             given.refuse_not_finite(name, numbers, what="row")
-        lasts = self._lasts(self.max_horizon if horizon is None else horizon, count, inputs)
-        return afraid.estimate(self._seen(states, lasts), goals, new_goals)
+        lasts = self._horizons.steps(self.max_horizon if horizon is None else horizon, count, inputs)
+        return afraid.estimate(self._horizons.behind(states, lasts), goals, new_goals)
 
     def risk_map(
         self, state: Array, goal: Array, axes: Mapping[int, Array] | tuple[int, int], horizon: int | None = None
@@ -350,30 +370,28 @@ class GoalDirector:
         }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
-        """Continue from ``state_dict()``, before the first call or later.
+        """Continue from ``state_dict()``, before the first call or later; see ``reset`` for worlds that do not.
 
         Args:
-            state: What it returned, for a GoalDirector that was made with the same options.
+            state: What it returned, for a GoalDirector that was made with the same options; ``learn_every``,
+                ``total_steps`` and the device may be others.
 
         Raises:
-            ValueError: If it belongs to another selector or to worlds of another number or size.
+            ValueError: If it belongs to a Director with other options or to worlds of another number or size. Nothing
+                is changed then.
         """
-        try:
-            made_with, sizes, goals, learnt_at = (state[name] for name in ("made_with", "sizes", "goals", "learnt_at"))
-        except KeyError as error:
-            raise ValueError(f"state must be what state_dict() of this version returned; it lacks {error}.") from error
-        if made_with != self._made_with:
-            raise ValueError(f"state must come from a GoalDirector with {self._made_with}, got one with {made_with}.")
+        sizes, goals, learnt_at = unpacked(state, self._made_with)
         if sizes is None:  # it had not begun
-            self._clocks, self._learnt_at = None, learnt_at
+            self._start_anew()
             return
+        if not all(ours in (None, theirs) for ours, theirs in zip(self._sizes, sizes, strict=True)):
+            raise ValueError(f"state must be that of {[*self._sizes]} worlds and components, got {sizes}.")
         try:
-            clocks = self._clocks or self._begin(self._expected(goals["goal"], *sizes))
-            if [*self._sizes] != sizes:
-                raise ValueError(f"state must be that of {[*self._sizes]} worlds and components, got {sizes}.")
-            clocks.load_state_dict(goals)
-        except KeyError as error:
-            raise ValueError(f"state must be what state_dict() of this version returned; it lacks {error}.") from error
+            inputs = self._expected(goals["goal"], *sizes)
+            copy.copy(self)._begin(inputs).load_state_dict(goals)  # what does not fit shows in another one
+        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise ValueError(f"state must be what state_dict() of this version returned, got {error!r}.") from error
+        (self._clocks or self._begin(inputs)).load_state_dict(goals)
         self._learnt_at = learnt_at
 
     def _expected(self, sample: Array, num_envs: int | None, state_dim: int | None, goal_dim: int | None) -> Inputs:
@@ -394,25 +412,24 @@ class GoalDirector:
     @own_settings()
     @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
     def _begin(self, inputs: Inputs) -> GoalClocks:
-        box = None if self._goal_box is None else GoalBox(*self._goal_box, inputs.goal_dim, inputs.device)
+        box = self._box = None if self._goal_box is None else GoalBox(*self._goal_box, inputs.goal_dim, inputs.device)
         spaces = Spaces(
-            inputs.num_envs, inputs.state_dim + self._horizon_input, inputs.goal_dim, self.max_horizon, inputs.device,
+            inputs.num_envs, inputs.state_dim + self._horizons.seen, inputs.goal_dim, self.max_horizon, inputs.device,
             groups=self._groups, total_steps=self._total_steps, goal_middle=None if box is None else box.middle,
         )  # fmt: skip
-        any_number = self._choose_first or self.goal_period is None  # of goals within 2 T steps
-        core = GoalCore(self._config.build(spaces, self._seed), spaces, capacity=SPARE if any_number else None)
+        window = window_between(self.max_horizon, self.learn_every)
+        any_number = self._choose_first or self.goal_period is None
+        core = GoalCore(self._config.build(spaces, self._seed), spaces, window, any_number)
         self._clocks = GoalClocks(core, spaces, self._seed, self._choose_first, self._next_step)
-        self._box, self._device = box, inputs.device
-        self._sizes = inputs.num_envs, inputs.state_dim, inputs.goal_dim
+        self._device, self._sizes = inputs.device, [inputs.num_envs, inputs.state_dim, inputs.goal_dim]
         return self._clocks
 
     def _candidates(self, candidates: Candidates, rows: Tensor, model: A) -> Tensor:
         """Candidates of the listed worlds, shape (m, N, goal_dim): the given ones, made or drawn."""
         clocks, share = self._known, self.goal_range
         if candidates is None:
-            if self._box is None:
-                raise ValueError("candidates must be given where GoalDirector was made without a goal_box, got None.")
-            return self._box.draw(self._seed, rows, clocks.asked[rows], clocks.core.selector.num_candidates, share)
+            box: GoalBox = self._box  # type: ignore[assignment]  # or ``check_candidates`` has refused
+            return box.draw(self._seed, rows, clocks.asked[rows], clocks.core.selector.num_candidates, share)
         if callable(candidates):
             candidates = candidates(given.like(rows, model))
         offered = self._expected(rows, None, None, None).candidates(candidates, len(rows))
@@ -420,23 +437,6 @@ class GoalDirector:
         if self._box is not None:
             self._box.check(offered, rows, share)
         return offered
-
-    def _lasts(self, horizon: Array | int | None, count: int, inputs: Inputs) -> Tensor | None:
-        """Announced steps, int64, shape (count,); the most where nobody knows, ``None`` where it is always T."""
-        if horizon is None:
-            if self.goal_period is not None:
-                return None
-            if self._horizon_input:
-                raise ValueError("horizon must be given where it is an input of the fear network, got None.")
-            horizon = self.max_horizon
-        return inputs.horizons(horizon, count, self.max_horizon)
-
-    def _seen(self, states: Tensor, lasts: Tensor | None) -> Tensor:
-        """What the selector sees of states, shape (m, state_dim): also how long the goal is to last, if it may."""
-        if not self._horizon_input:
-            return states
-        share = torch.ones_like(states[:, :1]) if lasts is None else lasts.unsqueeze(1) / self.max_horizon
-        return torch.cat([states, share], dim=1)
 
     def _learn_if_due(self) -> None:
         """The update of every ``learn_every`` steps, once."""

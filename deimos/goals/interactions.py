@@ -55,6 +55,11 @@ class Resolved:
         return Resolved(**{name: getattr(self, name)[mask] for name in self.__dataclass_fields__})
 
 
+def bytes_of(state_dim: int, goal_dim: int, groups: int = 0) -> int:
+    """Memory of one resolved interaction [bytes]; for the arguments see ``Interactions``."""
+    return 4 * (state_dim + 2 * goal_dim + 4 + groups) + 8 * 4
+
+
 def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | None = None) -> None:
     """Write a value into rows without a wait for the device.
 
@@ -128,6 +133,11 @@ class Interactions(Stateful):
         self._ring = torch.zeros(num_envs, capacity, width, dtype=torch.float32, device=device)
         self._marks = torch.zeros(num_envs, capacity, 4, dtype=torch.int64, device=device)
         """Crashed, issued, resolved, horizon; steps count from 1, so a resolved step of 0 marks a free slot."""
+
+    def load_state_dict(self, state: dict) -> None:
+        """See ``Stateful.load_state_dict``; of a state that holds more or fewer per world, the newest are kept."""
+        resized = {name: _resized(state[name], state["cursor"], self._capacity) for name in ("ring", "marks")}
+        super().load_state_dict(state | resized)
 
     @property
     def now(self) -> int:
@@ -259,3 +269,16 @@ class Interactions(Stateful):
         view = copy.copy(self)
         view._scored = False
         return view
+
+
+def _resized(ring: Tensor, cursor: Tensor, capacity: int) -> Tensor:
+    """Ring buffers, shape (num_envs, any, ...), with another capacity; ``cursor`` counts what each has been given."""
+    old = ring.shape[1]
+    if old == capacity:
+        return ring
+    newest = torch.arange(1, min(old, capacity) + 1, dtype=torch.int64, device=ring.device)
+    entry = cursor.unsqueeze(1) - newest  # below 0 a free slot of the old one becomes one of the new one
+    world = torch.arange(len(ring), dtype=torch.int64, device=ring.device).unsqueeze(1)
+    new = ring.new_zeros(len(ring), capacity, *ring.shape[2:])
+    new[world, entry % capacity] = ring[world, entry % old]
+    return new

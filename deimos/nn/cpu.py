@@ -2,7 +2,8 @@
 
 import ctypes
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -20,6 +21,17 @@ PARTS = 16  # of the rows of all networks together, each with a gradient of its 
 MIN_OPERATIONS = 1e7  # operations that are worth waking a thread for, about 100 us
 
 
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Keep Warp's report of its start, and of what it loads, off the terminal: its host may not know that we use it."""
+    level = wp.config.log_level
+    wp.config.log_level = max(level, wp.LOG_WARNING)
+    try:
+        yield
+    finally:
+        wp.config.log_level = level
+
+
 class Kernel:
     """The kernel for some networks. What it computes depends on their shape and the rows, never on the threads.
 
@@ -32,6 +44,7 @@ class Kernel:
         grad: The same of the gradient, which ``gradients`` writes.
     """
 
+    @_quietly()
     @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
     def __init__(
         self, units: Sequence[int], activation: str, weights: Sequence[int], free: slice,

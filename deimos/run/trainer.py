@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_device, check_range, one_line
+from deimos.goals.core import window_between
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
 from deimos.learn.ppo import PPO, PPOConfig
@@ -126,7 +127,8 @@ class Trainer:
         self._first_world = ranks.place().rank * num_envs
         self.env = config.env.build(num_envs, device, config.seed, self._first_world)
         total_steps = config.iterations * config.ppo.num_steps
-        self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed))
+        window = window_between(self.env.goal_period, config.ppo.num_steps)
+        self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed), window)
         record = recorder(config.graph, device)
         actor_sees, critic_sees = (seen_by(who, self.env.layout, device) for who in ("actor", "critic"))
         self.ppo = PPO(

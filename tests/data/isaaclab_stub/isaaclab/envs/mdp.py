@@ -33,9 +33,10 @@ class UniformVelocityCommand:
         """The active commands."""
         return self.vel_command_b
 
-    def reset(self, env_ids):
-        """Resample where an episode begins."""
-        self._resample(env_ids)
+    def reset(self, env_ids=None):
+        """Resample where an episode begins; returns what was measured."""
+        self._resample(torch.arange(self.num_envs) if env_ids is None else env_ids)
+        return {}
 
     def compute(self, dt):
         """Let time go by."""

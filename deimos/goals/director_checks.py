@@ -1,0 +1,133 @@
+"""What a ``GoalDirector`` refuses: options, states of other Directors, numbers that would spoil its networks."""
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deimos.checks import check_at_least, check_choice, check_range
+from deimos.goals import given
+from deimos.goals.given import Bound, Candidates, Inputs
+from deimos.goals.selector import SelectorConfig
+from deimos.nn.stateful import LARGEST, is_sound
+
+PLAIN = (bool, int, float, str, type(None))
+
+
+def check_options(
+    counts: Mapping[str, int | None], mode: str, first_goals: str, learn_every: int, total_steps: int, seed: int
+) -> None:
+    """Raise ``ValueError`` if an option is not valid; for their names see ``GoalDirector``.
+
+    Args:
+        counts: By name, what is at least 1 or ``None``: ``goal_period`` or ``max_horizon``, and sizes.
+        mode: The value of ``autoreset``.
+        first_goals: As it was given, like the others.
+        learn_every: See above.
+        total_steps: See above.
+        seed: See above.
+    """
+    for name, value in counts.items():
+        if value is not None:
+            check_at_least(name, value, 1)
+    if (counts["goal_period"] is None) == (counts["max_horizon"] is None):
+        raise ValueError(
+            "goal_period must be the steps that a goal is active or, where these vary, max_horizon the most that "
+            f"they can be; got {counts['goal_period']} and {counts['max_horizon']}."
+        )
+    check_choice("autoreset", mode, ["SameStep", "NextStep", "Disabled"])
+    check_choice("first_goals", first_goals, ["uniform", "chosen"])
+    check_at_least("learn_every", learn_every, 1)
+    check_at_least("total_steps", total_steps, 0)
+    check_range("seed", seed, 0, 2**32 - 1)
+
+
+def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **others: Any) -> dict[str, Any]:
+    """What two Directors must have in common where one continues from the other's state: plain values by name.
+
+    Args:
+        config: The selector's; its plain fields count, and those of the dataclasses in it.
+        goal_box: Lowest and highest goal.
+        **others: What else counts, plain.
+    """
+    box = None if goal_box is None else [_numbers(end) for end in goal_box]
+    kind = f"{type(config).__module__}.{type(config).__qualname__}"
+    return {"selector": kind, **_plain_fields(config), **others, "goal_box": box}
+
+
+def _own(value: Any) -> Any:
+    """Python's number instead of NumPy's, which ``torch.load(weights_only=True)`` does not read."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _numbers(end: Bound) -> list[float]:
+    return np.asarray(end.detach().cpu() if isinstance(end, Tensor) else end).astype(np.float32).tolist()
+
+
+def _plain_fields(config: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name in [field.name for field in fields(config)] if is_dataclass(config) else ():
+        value = _own(getattr(config, name))
+        if is_dataclass(value):
+            found |= {f"{name}.{inner}": plain for inner, plain in _plain_fields(value).items()}
+        elif isinstance(value, PLAIN) or (isinstance(value, tuple) and all(isinstance(part, PLAIN) for part in value)):
+            found[name] = value
+    return found
+
+
+def unpacked(state: Mapping[str, Any], own: Mapping[str, Any]) -> tuple[list[int] | None, Any, int]:
+    """Sizes, goals and the step of the last update in a saved state.
+
+    Args:
+        state: What ``GoalDirector.state_dict`` returned.
+        own: Settings of the Director that shall continue from it.
+
+    Raises:
+        ValueError: If something is missing, or it is of a Director with other settings, which are named.
+    """
+    try:
+        made_with, sizes, goals, learnt_at = (state[name] for name in ("made_with", "sizes", "goals", "learnt_at"))
+    except KeyError as error:
+        raise ValueError(f"state must be what state_dict() of this version returned; it lacks {error}.") from error
+    differ = [name for name in {**own, **made_with} if own.get(name, ...) != made_with.get(name, ...)]
+    if "selector" in differ:  # then so do its fields
+        differ = ["selector"]
+    if differ:
+        ours, theirs = (", ".join(f"{name}={all_.get(name)!r}" for name in differ) for all_ in (own, made_with))
+        raise ValueError(f"state must come from a GoalDirector with {ours}, got one with {theirs}.")
+    return sizes, goals, learnt_at
+
+
+def check_candidates(candidates: Candidates, count: int, inputs: Inputs, drawn: bool) -> None:
+    """Raise ``ValueError`` if candidates of ``count`` worlds do not fit, or there are none that could be ``drawn``.
+
+    What a function makes, and the numbers themselves, are looked at where they are needed.
+    """
+    inputs.check_candidates(candidates, count)
+    if candidates is None and not drawn:
+        raise ValueError("candidates must be given where GoalDirector was made without a goal_box, got None.")
+    if isinstance(candidates, Tensor):
+        given.tensor("candidates", candidates, inputs.device)
+
+
+def refuse_unsound(name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None) -> None:
+    """Raise ``ValueError`` where a number is not finite, or so large that what is learnt from it would not be.
+
+    Args:
+        name: What they are.
+        numbers: Shape (m, n), m and n at least 1.
+        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
+        but: Rows that do not matter, bool, shape (m,).
+    """
+    if bool(is_sound(torch.stack(numbers.aminmax())).all()):
+        return
+    given.refuse_not_finite(name, numbers, rows, but)
+    large = ~is_sound(numbers).all(1)
+    large = large if but is None else large & ~but
+    if bool(large.any()):
+        row = int(large.nonzero()[0])
+        world = row if rows is None else int(rows[row])
+        raise ValueError(f"{name} of world {world} must be at most {LARGEST:g} in size, got {numbers[row].tolist()}.")

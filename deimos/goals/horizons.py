@@ -1,0 +1,41 @@
+"""How long the goals of other people's loops last, and what the fear network sees of that."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from deimos.goals.given import Array, Inputs
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """Steps that goals last."""
+
+    period: int | None
+    """T, where it is always the same."""
+    most: int
+    """The most steps that a goal lasts."""
+    seen: bool
+    """Whether the fear network sees how long a goal is to last."""
+
+    def steps(self, horizon: Array | int | None, count: int, inputs: Inputs) -> Tensor | None:
+        """Announced steps, int64, shape (count,); the most where nobody knows, ``None`` where it is always T.
+
+        Raises:
+            ValueError: If they do not fit, or are missing where the fear network sees them.
+        """
+        if horizon is None:
+            if self.period is not None:
+                return None
+            if self.seen:
+                raise ValueError("horizon must be given where it is an input of the fear network, got None.")
+            horizon = self.most
+        return inputs.horizons(horizon, count, self.most)
+
+    def behind(self, states: Tensor, steps: Tensor | None = None) -> Tensor:
+        """What the selector sees of states, shape (m, state_dim): behind them ``steps / most``, if it may; 1 for T."""
+        if not self.seen:
+            return states
+        share = torch.ones_like(states[:, :1]) if steps is None else steps.unsqueeze(1) / self.most
+        return torch.cat([states, share], dim=1)
