@@ -103,7 +103,7 @@ class GoalDirector:
         self._groups, self._total_steps, self._seed = tuple(groups), total_steps, seed
         self._made_with = settings(
             self._config, goal_box, **periods, horizon_input=horizon_input, first_goals=first_goals, seed=seed,
-            next_step=self._next_step, groups=[[part.start, part.stop, part.step] for part in self._groups],
+            next_step=self._next_step, groups=[str(part) for part in self._groups],
         )  # fmt: skip
         known = None if device is None else torch.empty(0, dtype=torch.float32, device=device).device
         self._told = [*sizes.values()], known
