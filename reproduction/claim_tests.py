@@ -131,6 +131,7 @@ class Alike:
         sides = _sides_in_blocks if evidence.paired(place, self.methods) else _sides
         middle = float(np.median(x - y if sides is _sides_in_blocks else x[:, None] - y))  # Hodges and Lehmann's
         interval = Interval(middle, -_furthest(y, x, sides), _furthest(x, y, sides))
+        reachable = self._reachable(len(x)) if sides is _sides_in_blocks else (0.0, 0.0)
         within = max(interval.high, 0.0 if self.at_most else -interval.low)
         p_for, p_against = map(float, self.p_values(x, y, sides=sides))
         error = (interval.high - interval.low) / (2 * scipy_stats.norm.ppf(1 - ALPHA))
@@ -142,9 +143,16 @@ class Alike:
             effect, within = "difference", max(within, 0.0)
         return Finding(
             effect=effect, interval=interval, no_difference=1.0 if self.measure.ratio else 0.0, p_for=p_for,
-            p_against=p_against, detectable=reach, n={name: len(samples[name]) for name in self.methods},
-            equivalent_within=within,
+            p_against=p_against, detectable=math.inf if max(reachable) > ALPHA else reach,
+            n={name: len(samples[name]) for name in self.methods}, equivalent_within=within, reachable=reachable,
         )  # fmt: skip
+
+    def _reachable(self, blocks: int) -> tuple[float, float]:
+        """Smallest p-values for and against in so many blocks: where no policy differs, and where all do alike."""
+        same, more = np.zeros(blocks), np.full(blocks, 2 * self.settled)
+        return float(self.p_values(same, same, sides=_sides_in_blocks)[0]), float(
+            self.p_values(more, same, sides=_sides_in_blocks)[1]
+        )
 
     def p_values(
         self, x: Array, y: Array, permutations: int | None = None, *, sides: "Sides | None" = None

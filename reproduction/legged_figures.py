@@ -61,13 +61,14 @@ def _methods(data: Data, environment: str) -> list[str]:
 
 
 def pairs(data: Data, environment: str, period: int) -> "Figure":
-    """Crashes per interaction and score of every policy, without and with an attacker, a line for each base."""
+    """Crashes per interaction and score of every policy, without and with attackers, a line for each base."""
     easy, hard = Where(environment, "naive", period), Where(environment, "adversary", period)
     worst = outcomes.attacked(data, environment, period)
     methods, numbers = _methods(data, environment), bases(data, environment)
-    figure, axes = subplots(2, 2, (WIDTH, 4.6), sharex=True, sharey="row")
+    figure, axes = subplots(2, 3, (WIDTH, 5.0), sharey="row")
     for panel, where, metric, title in (
-        (axes[0, 0], easy, "crash_rate", "uniform goals"), (axes[0, 1], worst.where, worst.metric, worst.by),
+        (axes[0, 0], easy, "crash_rate", "uniform goals"), (axes[0, 1], hard, "crash_rate", "the Adversary"),
+        (axes[0, 2], worst.where, worst.metric, "the worst attacker"),
         (axes[1, 0], easy, "score", "uniform goals"), (axes[1, 1], hard, "score", "the Adversary"),
     ):  # fmt: skip
         unit = 1 if metric == "score" else 100
@@ -78,10 +79,11 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
         _lines(panel, values)
         panel.set_title(f"under {title}")
         panel.grid(axis="y", alpha=0.3)
+        panel.set_xticks(range(len(methods)), methods if panel in (*axes[1], axes[0, 2]) else [])
+        panel.tick_params(axis="x", rotation=45)
     as_rates(axes[0, 0], "y", "crashes per interaction [%]")
     axes[1, 0].set_ylabel("score")
-    for panel in axes[1]:
-        panel.set_xticks(range(len(methods)), methods, rotation=30, ha="right", rotation_mode="anchor")
+    axes[1, 2].set_axis_off()
     _legend(figure, numbers)
     return figure
 

@@ -22,7 +22,16 @@ from deimos.study import figures, stats
 from deimos.study.data import Data, Style, Where
 from deimos.study.document import Block, to_html, to_markdown
 from deimos.study.figures import Figures
-from deimos.study.outcomes import SAFE, Attacked, attacked, base_of, of_environment, of_factors, settings_of
+from deimos.study.outcomes import (
+    SAFE,
+    Attacked,
+    attacked,
+    base_of,
+    late_doses,
+    of_environment,
+    of_factors,
+    settings_of,
+)
 from deimos.study.permutation import superiority_in_blocks
 from deimos.study.plan import Cell
 from deimos.study.stats import Array
@@ -89,6 +98,7 @@ def what_was_run(data: Data) -> list[Block]:
     """Environments, methods, seeds, sizes, attackers and versions."""
     rows = []
     for environment in data.environments:
+        trained_in = data.trained_in(environment)
         methods, own = data.methods(environment), [row for row in data.rows if row["environment"] == environment]
         counts = Counter(len({row["seed"] for row in own if row["method"] == name}) for name in methods)
         policies = {(row["method"], row["seed"]): row["env_steps"] * row["num_envs"] for row in own}
@@ -96,7 +106,8 @@ def what_was_run(data: Data) -> list[Block]:
             "environment": environment, "methods": ", ".join(methods),
             "runs": ", ".join(f"{n} seeds x {k} methods" for n, k in sorted(counts.items())),
             "worlds": _values(own, "num_envs"), "parallel steps": _values(own, "env_steps"),
-            "transitions, all": f"{sum(policies.values()) / 1e6:.0f} M",
+            "transitions, all": f"{sum(policies.values()) / 1e6:.0f} M" if trained_in == environment
+            else f"those of {trained_in}",
             "T in training": _values(own, "trained_period"), "T evaluated": _values(own, "goal_period"),
             "evaluation: worlds x steps": f"{_values(own, 'worlds')} x {_values(own, 'steps')}",
             "goals": _values(own, "goals"), "setting": _values(own, "setting"),
@@ -192,7 +203,8 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
         })  # fmt: skip
     return [
         f"### {environment}, T = {period}: outcomes",
-        f"Crashes per interaction under {hard.by}, the score under uniform goals; with 95 % intervals over policies.",
+        f"Crashes per interaction under {hard.by}, the score under uniform goals; with 95 % intervals over policies."
+        + late_doses(data, environment),
         rows, "Mean crashes per interaction [%] by who chooses the goals:", by_attacker,
     ]  # fmt: skip
 
@@ -282,7 +294,7 @@ def _over_places(*samples: Array) -> Array:
 def speed(data: Data) -> list[Block]:
     """Frames per second; the rows of its table, the last of its blocks, can be added to."""
     rows = []
-    for environment in data.environments:
+    for environment in [name for name in data.environments if data.trained_in(name) == name]:
         place = data.places(environment, "naive")[0]
         fps = {name: data.sample(place, name, "fps") for name in data.methods(environment)}
         base = fps.get(data.style.reference, np.array([]))
@@ -302,16 +314,16 @@ def speed(data: Data) -> list[Block]:
 
 def limits(data: Data) -> list[str]:
     """What a reader must bear in mind, one text each."""
-    places = [place for environment in data.environments for place in data.places(environment, "naive")]
-    smallest = min(
-        len(data.sample(place, name, "crashes")) for place in places for name in data.methods(place.environment)
-    )
+    apart = [name for name in data.environments if not data.paired(name)]
+    sizes = [len(data.sample(place, name, "crashes")) for environment in apart
+             for place in data.places(environment, "naive") for name in data.methods(environment)]  # fmt: skip
     p10, p30 = (stats.detectable_probability(n, n) for n in (10, 30))
+    power = [
+        f"The smallest population here has {min(sizes)} policies. With a power of 80 %, a rank-sum test finds P(x > y) "
+        f"= {p10:.2f} with 10 a side and {p30:.2f} with 30."
+    ] if sizes else []  # fmt: skip
     return [
-        "The unit is one trained policy. Its worlds and episodes are no replicates.",
-        f"The smallest population here has {smallest} policies. With a power of 80 %, a rank-sum test finds P(x > y) = "
-        f"{p10:.2f} with 10 a side and {p30:.2f} with 30.",
-        COVERAGE,
+        "The unit is one trained policy. Its worlds and episodes are no replicates.", *power, COVERAGE,
         "CVaR over seeds is too low in small populations.",
         "The mean reward per transition pays for crashing where a crash puts the robot back to safety; the score does "
         "not.",
