@@ -1,8 +1,9 @@
 """Claims of the thesis as lists of clauses, and their verdicts, which can go either way.
 
 A clause is one comparison with one number. It *holds* where a test rejects its opposite, *does not hold* where it
-rejects the clause itself, and is *undecided* otherwise, as it is where one of the two is out of reach. Either verdict is wrong in at most 5 % of all studies, as
-``python -m reproduction.verdicts`` measures. Nothing is corrected over clauses, but where one of several is enough.
+rejects the clause itself, and is *undecided* otherwise, also where one of the two is out of reach. Either verdict is
+wrong in at most 5 % of all studies, as ``python -m reproduction.verdicts`` measures. Nothing is corrected over clauses,
+but where one of several is enough.
 """
 
 import math

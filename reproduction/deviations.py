@@ -28,26 +28,26 @@ PARTICLE_DEVIATIONS = [
 """What, in Particle Gym, the thesis's, and the likely effect."""
 LEGGED_PILOTS = (
     "How the choices were made: what is compared was declared before the first cell (reproduction/legged.md). The "
-    "robots' settings are presets that were made to walk under Uniform goals within minutes of a core (docs/lab/quad.md, "
-    "docs/lab/quad_arm.md). Nothing was tuned for a Director."
+    "robots' settings are presets that were made to walk under Uniform goals within minutes of a core "
+    "(docs/lab/quad.md, docs/lab/quad_arm.md). Nothing was tuned for a Director."
 )
 LEGGED_DEVIATIONS = [
-    ("training", "methods branch off common bases: 10 M transitions under Uniform (flat, then rough ground), then 2 M of "
-     "each method (Quad+arm: 1.5 M); in pairs, five bases (Quad+arm: three)",
-     "every method from nothing, 295 M transitions, 30 seeds",
+    ("training", "methods branch off common bases after 10 M transitions under Uniform, and have 2 M each (Quad+arm: "
+     "1.5 M); in pairs, on five bases (Quad+arm: three)", "every method from nothing, 295 M transitions, 30 seeds",
      "how goals change a policy that walks, not how it learns to walk; smaller effects"),
     ("first rollouts of a branch", "critics learn for ten before the policy changes, under every method", "-", "none"),
-    ("T in training", "T2, 100 steps (`quad_long`: T10, 500); bases T10 (Quad+arm: T2)", "T10",
-     "twice to five times as many chosen goals"),
+    ("T in training", "bases T10 (Quad+arm: T2), branches T2; `quad_long`: T10", "T10",
+     "selectors choose nine of ten goals, not one of two"),
     ("simulator", "MuJoCo, native engine, 512 robots; `quad_warp` and `quad_on_warp`: mujoco-warp",
      "Isaac Gym, 4096 robots", "other contacts; noisier gradients"),
-    ("robot", "Go1, gains of Legged Gym's A1 raised by half", "Go1", "unknown"),
-    ("ground", "rough; levels by the tracking of the velocity", "rough; levels by the reward", "little"),
+    ("ground", "Quad: rough; Quad+arm: flat", "rough", "Quad+arm crashes less"),
+    ("robot", "Go1, gains of Legged Gym's A1 raised by half", "silent", "unknown"),
     ("reward", "Legged Gym's A1 list with the tilt squared, no reward for air time, penalties a half to a quarter as "
-     "heavy, clipped at 0", "goal matching and terms for gaits [51]", "walks in minutes; rougher gaits"),
-    ("PPO and networks", "discount 0.97, [128, 64, 32] ELU", "silent", "in favour of Uniform, under which they were chosen"),
+     "heavy, clipped at 0", "matching goals and terms for gaits, as Legged Gym", "walks in minutes; rougher gaits"),
+    ("PPO and networks", "discount 0.97, [128, 64, 32] ELU (Quad+arm: [256, 128, 64])", "silent",
+     "chosen under Uniform, so in its favour"),
     ("crash", "trunk, hips or head on the ground with more than 1 N", "\"any part of the robot's base\"", "a few more"),
-    ("penalty-30", "30 times the largest reward of a step for a crash", "no penalty", "a baseline that it lacks"),
+    ("penalty-30", "30 times the largest reward of a step for a crash", "no penalty", "a baseline more"),
     ("fear's data", "a crash memory in all Directors", "balanced batches of the rollout buffer",
      "the memory is another method"),
     ("VDS", "its ensemble begins from nothing in place of the base's critic", "from the beginning",

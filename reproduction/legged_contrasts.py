@@ -10,7 +10,7 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ REFERENCE = "uniform"
 PRIMARY = ("p75", "vds+p75", "penalty-30")
 CORE_HOURS = {"quad": 1.7, "quad_arm": 0.4}
 """What one more method takes on all bases of a robot (legged.md)."""
-WITH_PARTICLE = "rows of Particle Gym: merge docs/results/particle_[a-f] into the folder"
+WITH_PARTICLE = "rnd beside Particle Gym's, whose rows are docs/results/particle_[a-f]: to be merged into the folder"
 LONGER_HOURS = {"quad": 3.2, "quad_arm": 0.7}
 """What the evaluation of its policies at T10 takes."""
 WALKS = 0.3
@@ -274,18 +274,23 @@ def not_run(evidence: Evidence) -> list[Block]:
         places = [place for place in evidence.places(robot) if evidence.paired(place)]
         ran = {name for name in evidence.methods for place in places if evidence.evaluations(place, "naive", name)}
         lacking = {
-            name: (_claims(robot, lambda clause, name=name: name in clause.test.methods), CORE_HOURS[robot])
+            name: (_claims(robot, partial(_of_robots, name)),
+                   CORE_HOURS[robot])
             for name in (*LEGGED_METHODS, *PENALTIES) if name not in ran
         }  # fmt: skip
         if LONG not in [place.period for place in places]:
             lacking["T10"] = _claims(robot, _at_t10), LONGER_HOURS[robot]
-        if not any(evidence.places(name) for name in PARTICLE):
-            lacking[WITH_PARTICLE] = _claims(robot, _beside_particle), 0.0
+        if "rnd" not in ran or not any(evidence.places(name) for name in PARTICLE):
+            lacking[WITH_PARTICLE] = _claims(robot, _beside_particle), CORE_HOURS[robot] * ("rnd" not in ran)
         rows += [
             {"robot": robot, "not run": name, "claims that speak of it": text, "would take [core-hours]": f"{hours:g}"}
             for name, (text, hours) in lacking.items() if text
         ]  # fmt: skip
     return ["### Not run", rows] if rows else []
+
+
+def _of_robots(method: str, clause: Clause) -> bool:
+    return method in clause.test.methods and not _beside_particle(clause)
 
 
 def _beside_particle(clause: Clause) -> bool:

@@ -30,6 +30,7 @@ TRAINING = "every line is a base, in grey Uniform's of the same bases; rolling m
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")  # Okabe and Ito's
 _MARKERS = "osD^vP"
 _COLUMNS = 5
+LEAST_RATE = 0.01  # [%] of interactions, below which an axis of rates is linear
 LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
@@ -45,6 +46,8 @@ def figures(data: Data, environment: str) -> Figures:
                 f"{place}: {DIFFERENCES}", differences(data, environment, period)
             ),
         }  # fmt: skip
+    if data.trained_in(environment) != environment:
+        return found
     title = f"Figure {CURVES[environment]} in pairs, {environment}" if environment in CURVES else environment
     found[f"training-{environment}"] = (f"{title}: {TRAINING} {CAVEAT}", training(data, environment))
     return found
@@ -82,6 +85,9 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
         panel.set_xticks(range(len(methods)), methods if panel in (*axes[1], axes[0, 2]) else [])
         panel.tick_params(axis="x", rotation=45)
     as_rates(axes[0, 0], "y", "crashes per interaction [%]")
+    rates = [x for panel in axes[0] for line in panel.lines for x in line.get_ydata()]
+    if rates and min(rates) > LEAST_RATE:  # decades that nothing is in would hide what is between bases
+        axes[0, 0].set_ylim(10 ** np.floor(np.log10(min(rates))), 10 ** np.ceil(np.log10(max(rates))))
     axes[1, 0].set_ylabel("score")
     axes[1, 2].set_axis_off()
     _legend(figure, numbers)

@@ -25,8 +25,8 @@ CLAUSES = "clauses"
 PAIRED = (
     "Policies that branched off the same base are compared with each other alone: clauses permute and resample within "
     "bases. Two methods on five bases cannot be ordered by that, for even five of five is p = 1/16 on both sides. That "
-    "two methods are alike could be held on five bases (p = 1/32), but not refused (1/16), so such clauses are undecided "
-    "too. Fewer than five bases give estimates without a verdict."
+    "two methods are alike could be held on five bases (p = 1/32), but not refused (1/16), so such clauses are "
+    "undecided too. Fewer than five bases give estimates without a verdict."
 )
 
 
@@ -63,8 +63,8 @@ def page(data: Data, pictures: report.Pictures, out: Path, speeds: Sequence[Mapp
     return [
         "# What the thesis claims, clause by clause", _summary(outcomes, data), *first,
         "# The study", *_lines(outcomes), *report.environments(data, pictures), *report.over_all(data),
-        *legged_contrasts.blocks(evidence), *report.what_was_run(data), *deviations.blocks(data.environments), *report.speed(data),
-        *report.distributions(data),
+        *legged_contrasts.blocks(evidence), *report.what_was_run(data), *deviations.blocks(data.environments),
+        *report.speed(data), *report.distributions(data),
         "## Every clause", *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip

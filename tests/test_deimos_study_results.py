@@ -238,6 +238,22 @@ def test_merge_adds_what_is_new(tmp_path):
     assert merge(tmp_path / "c", [tmp_path / "a"]) == (0, 2, 0)
 
 
+def test_merge_keeps_the_settings(tmp_path):
+    """Of every environment the configuration of a cell stays with the tables, also through a second merge."""
+    for name, worlds in (("a", 16), ("b", 32)):
+        fill(tmp_path / name, [result(name)])
+        home = RunFolder.create(tmp_path / name / "cells" / name)
+        home.write_json("cell.json", {"environment": f"on {name}", "config": {"num_envs": worlds}})
+    merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"])
+    merge(tmp_path / "d", [tmp_path / "c"])
+    assert settings(tmp_path / "d") == {"on a": {"num_envs": 16}, "on b": {"num_envs": 32}}
+    merge(tmp_path / "a", [tmp_path / "a"])
+    assert not (tmp_path / "a" / "settings").exists()  # it has the cells themselves
+    (tmp_path / "c" / "settings" / "on a.json").write_text('{"environment": "on a"}')
+    with pytest.raises(RunError, match="does not describe a cell"):
+        settings(tmp_path / "c")
+
+
 def test_merge_adds_what_other_attackers_did_to_the_same_policies(tmp_path):
     """Two folders whose policies met different attackers make one with the rows of all, but for other weights."""
     fill(tmp_path / "a", [result("1"), result("1", goals="mine", code="y mine=0")])

@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos.study.folder import StudyFolder
-from deimos.study.plan import Cell
-from deimos.study.results import Results, Row
+from deimos.study.results import Results, Row, settings
 from deimos.study.stats import Array
 
 _COLOURS = "#0072B2 #E69F00 #009E73 #CC79A7 #D55E00 #56B4E9 #7f7f7f #a6761d #332288 #e7298a".split()
@@ -71,10 +69,12 @@ class Data:
     results are no one study; see ``Results.check``.
     """
 
-    def __init__(self, results: Results, style: Style | None = None, cells: Sequence[Cell] = ()) -> None:
+    def __init__(
+        self, results: Results, style: Style | None = None, settings: Mapping[str, Mapping] | None = None
+    ) -> None:
         results.check()
-        self.cells = cells
-        """What made them; none where the tables are all that there is."""
+        self.settings = settings or {}
+        """Configurations by environment, as JSON types; none where the tables are all that there is."""
         self._results, self.rows = results, results.rows
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = defaultdict(dict)
@@ -86,12 +86,12 @@ class Data:
     @classmethod
     def read(cls, folder: Path, style: Style | None = None) -> "Data":
         """The results of a folder; raises ``RunError`` if there are none, or as ``Results.read`` and ``check`` do."""
-        return cls(Results.read(folder, may_be_empty=False), style, StudyFolder(folder).cells())
+        return cls(Results.read(folder, may_be_empty=False), style, settings(folder))
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
         rows, curves = ([row for row in rows if row["method"] in methods] for rows in (self.rows, self._results.curves))
-        return Data(Results(rows, curves), self.style, self.cells)
+        return Data(Results(rows, curves), self.style, self.settings)
 
     @property
     def curve_rows(self) -> list[Row]:

@@ -69,7 +69,9 @@ def of_environment(data: Data, environment: str) -> Figures:
 def late_doses(data: Data, environment: str) -> str:
     """A sentence on the methods whose dose is that of a part of their training; empty where there are none."""
     names = ", ".join(data.dosed_late(environment))
-    return f" The dose of {names} is that of the last part of the training, whose goals alone fear ranked." * bool(names)
+    return f" The dose of {names} is that of the last part of the training, whose goals alone fear ranked." * bool(
+        names
+    )
 
 
 def of_factors(data: Data) -> Figures:

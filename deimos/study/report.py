@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.stats import sem
 
 from deimos.files import write_bytes
-from deimos.run.config import to_dict
 from deimos.study import figures, stats
 from deimos.study.data import Data, Style, Where
 from deimos.study.document import Block, to_html, to_markdown
@@ -33,7 +32,6 @@ from deimos.study.outcomes import (
     settings_of,
 )
 from deimos.study.permutation import superiority_in_blocks
-from deimos.study.plan import Cell
 from deimos.study.stats import Array
 
 Pictures = Mapping[str, Sequence[Block]]
@@ -115,18 +113,21 @@ def what_was_run(data: Data) -> list[Block]:
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
     return [
         "## What was run", rows, *_uninformed(data), "Run on " + "; ".join(versions) + ".",
-        "### Hyper-parameters", *hyper_parameters(data.cells),
+        "### Hyper-parameters", *hyper_parameters(data.settings),
     ]  # fmt: skip
 
 
-def hyper_parameters(cells: Sequence[Cell]) -> list[Block]:
+def hyper_parameters(settings: Mapping[str, Mapping[str, Any]]) -> list[Block]:
     """Every field of the environments, of the learner and of the evaluation, those that are not set left out.
 
     A selector's are those that its method's name stands for.
+
+    Args:
+        settings: Configurations by environment, as JSON types.
     """
-    if not cells:
+    if not settings:
         return ["They are in the cells of the study, which are not beside these tables."]
-    environments = {cell.environment: _flat(to_dict(cell.config)) for cell in cells}
+    environments = {name: _flat(config) for name, config in settings.items()}
     names = dict.fromkeys(name for fields in environments.values() for name in fields)
     rows = [{"field": name} | {place: fields.get(name, "-") for place, fields in environments.items()}
             for name in names if name.partition(".")[0] not in ("method", "selector", "seed")]  # fmt: skip
@@ -184,6 +185,11 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
     hard, easy = attacked(data, environment, period), Where(environment, "naive", period)
     names = data.methods(environment)
     under_attack = {name: data.sample(hard.where, name, hard.metric) for name in names}
+    met = [
+        goals for goals in data.goals
+        if any(len(data.sample(Where(environment, goals, period), name, "crash_rate")) for name in names)
+    ]  # fmt: skip
+    by = hard.by if any(map(len, under_attack.values())) else f"{hard.by} (nobody attacked)"
     rows, by_attacker = [], []
     for name, rate in under_attack.items():
         score = data.sample(easy, name, "score")
@@ -198,12 +204,12 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
             "delivered dose": f"{np.mean(doses):.1f}" if doses else "not recorded",
         })  # fmt: skip
         by_attacker.append({"method": name} | {
-            goals: f"{100 * values.mean():.3g}" if len(values) else "-" for goals in data.goals
+            goals: f"{100 * values.mean():.3g}" if len(values) else "-" for goals in met
             if (values := data.sample(Where(environment, goals, period), name, "crash_rate")) is not None
         })  # fmt: skip
     return [
         f"### {environment}, T = {period}: outcomes",
-        f"Crashes per interaction under {hard.by}, the score under uniform goals; with 95 % intervals over policies."
+        f"Crashes per interaction under {by}, the score under uniform goals; with 95 % intervals over policies."
         + late_doses(data, environment),
         rows, "Mean crashes per interaction [%] by who chooses the goals:", by_attacker,
     ]  # fmt: skip
@@ -323,7 +329,9 @@ def limits(data: Data) -> list[str]:
         f"= {p10:.2f} with 10 a side and {p30:.2f} with 30."
     ] if sizes else []  # fmt: skip
     return [
-        "The unit is one trained policy. Its worlds and episodes are no replicates.", *power, COVERAGE,
+        "The unit is one trained policy. Its worlds and episodes are no replicates.",
+        *power,
+        COVERAGE,
         "CVaR over seeds is too low in small populations.",
         "The mean reward per transition pays for crashing where a crash puts the robot back to safety; the score does "
         "not.",
