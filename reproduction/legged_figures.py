@@ -31,6 +31,7 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")  #
 _MARKERS = "osD^vP"
 _COLUMNS = 5
 LEAST_RATE = 0.01  # [%] of interactions, below which an axis of rates is linear
+ALL = 150  # [%] of interactions, above which no axis of rates goes
 LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
@@ -87,7 +88,8 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
     as_rates(axes[0, 0], "y", "crashes per interaction [%]")
     rates = [x for panel in axes[0] for line in panel.lines for x in line.get_ydata()]
     if rates and min(rates) > LEAST_RATE:  # decades that nothing is in would hide what is between bases
-        axes[0, 0].set_ylim(10 ** np.floor(np.log10(min(rates))), 10 ** np.ceil(np.log10(max(rates))))
+        low, high = np.floor(np.log10([min(rates), max(rates)]))
+        axes[0, 0].set_ylim(10**low, min(10 ** (high + 1), ALL))
     axes[1, 0].set_ylabel("score")
     axes[1, 2].set_axis_off()
     _legend(figure, numbers)

@@ -242,7 +242,7 @@ def test_policies_judged_again_have_no_trainings_of_their_own(tables):
     data = Data(Results(found.rows + again, found.curves + lines))
     assert [data.trained_in(name) for name in data.environments] == ["quad", "quad"]
     drawn = {name: {each.split("-")[0] for each in figures(data, name)} for name in data.environments}
-    assert drawn["quad"] - drawn["quad_on_warp"] == {"training"}
+    assert drawn["quad"] - drawn["quad_on_warp"] == {"training", "dose"}
     assert "evaluation" in drawn["quad_on_warp"]
     assert {row["environment"] for row in legged_contrasts._trainings(Evidence.of(data))[2]} == {"quad"}
 
