@@ -319,7 +319,7 @@ def test_pictures_show_every_policy(tables):
     assert own == {BASES, 2 * BASES}  # Uniform's own panels, and those with Uniform in grey behind
 
 
-@pytest.mark.parametrize("crashes", [(2.2, 4.5), (0.3, 0.5), (0.02, 40.0)])
+@pytest.mark.parametrize("crashes", [(2.2, 4.5), (0.3, 0.5), (0.15, 1.6), (0.02, 40.0)])
 def test_axes_of_trainings_have_numbers(tables, crashes):
     """However narrow the range of the crashes is, the axis has two numbers or more."""
     data = Data.read(tables)
