@@ -313,7 +313,8 @@ DISCUSSION = (
     ), note="The best are chosen on every other seed and tested on the rest."),
     Claim("C29", "Halfway through training, VDS's policies crash rarely.", (
         *_say(505, "VDS-trained policies start experiencing very few crashes", LEGGED, _mostly(HALFWAY, ["vds"])),
-    ), note="Rarely: less than a tenth of what they did in the first tenth."),
+    ), note="Rarely: less than a tenth of what they did in the first tenth. Nothing is told of policies that branched "
+          "off others, which walked from the beginning."),
     Claim("C30", "Under attack, policies trained by DEIMOS lose less score and gain fewer crashes than baselines'.", (
         *[clause for best, places in (("p25", PARTICLE), ("vds+p75", LEGGED))
           for clause in _say(662, "produces better policy populations than the baseline methods", places,

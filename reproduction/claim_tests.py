@@ -131,20 +131,26 @@ class Alike:
         sides = _sides_in_blocks if evidence.paired(place, self.methods) else _sides
         middle = float(np.median(x - y if sides is _sides_in_blocks else x[:, None] - y))  # Hodges and Lehmann's
         interval = Interval(middle, -_furthest(y, x, sides), _furthest(x, y, sides))
+        reachable = self._reachable(len(x)) if sides is _sides_in_blocks else (0.0, 0.0)
         within = max(interval.high, 0.0 if self.at_most else -interval.low)
         p_for, p_against = map(float, self.p_values(x, y, sides=sides))
         error = (interval.high - interval.low) / (2 * scipy_stats.norm.ppf(1 - ALPHA))
         reach = float(scipy_stats.norm.ppf(1 - ALPHA) + scipy_stats.norm.ppf((1 + POWER) / 2)) * error
+        effect, within = "difference", max(within, 0.0)
         if self.measure.ratio:
             effect, interval = "ratio", _exp(interval)
-            within, reach = (float(np.exp(min(z, 50.0))) for z in (max(within, 0.0), reach))
-        else:
-            effect, within = "difference", max(within, 0.0)
+            within, reach = (float(np.exp(min(z, 50.0))) for z in (within, reach))
         return Finding(
             effect=effect, interval=interval, no_difference=1.0 if self.measure.ratio else 0.0, p_for=p_for,
-            p_against=p_against, detectable=reach, n={name: len(samples[name]) for name in self.methods},
-            equivalent_within=within,
+            p_against=p_against, detectable=math.inf if max(reachable) > ALPHA else reach,
+            n={name: len(samples[name]) for name in self.methods}, equivalent_within=within, reachable=reachable,
         )  # fmt: skip
+
+    def _reachable(self, blocks: int) -> tuple[float, float]:
+        """Smallest p-values for and against in so many blocks: where no policy differs, and where all do alike."""
+        same, sides = np.zeros(blocks), _sides_in_blocks
+        p_for, _ = self.p_values(same, same, sides=sides)
+        return float(p_for), float(self.p_values(same + 2 * self.settled, same, sides=sides)[1])
 
     def p_values(
         self, x: Array, y: Array, permutations: int | None = None, *, sides: "Sides | None" = None
@@ -254,9 +260,8 @@ class Highest:
         p_for, p_against = (min(1.0, 2 * float(p[0])) for p in self.p_values(own[None], [x[None] for x in rivals]))
         top = max(float(x.max()) for x in rivals)
         above = (own > top).sum() or -max((x > own.max()).sum() for x in rivals)
-        enough = next(
-            (k for k in range(1, len(own) + 1) if 2 * _on_top(len(own), len(rivals[0]), k) <= ALPHA), math.inf
-        )
+        sizes = len(own), len(rivals[0])
+        enough = next((k for k in range(1, len(own) + 1) if 2 * _on_top(*sizes, k) <= ALPHA), math.inf)
         return Finding(
             effect="policies above all others'", interval=Interval(float(above), math.nan, math.nan), no_difference=0.0,
             p_for=p_for, p_against=p_against, detectable=float(enough),
@@ -310,8 +315,7 @@ class Matters:
         if len(both) < 3:
             return None
         sizes = [len(x) for _, x in both]
-        values = np.array([np.concatenate([x for _, x in both]),
-                           np.concatenate([*_enough(less, paired).values()])])  # fmt: skip
+        values = np.array([np.concatenate([*_enough(own, paired).values()]) for own in (more, less)])
         p_for, p_against = (min(1.0, 2 * float(p[0])) for p in self.p_values(values[None], sizes, paired=paired))
         ranks = scipy_stats.rankdata(values, axis=-1)
         interval, error = self._interval(ranks, sizes, paired)
@@ -358,9 +362,8 @@ def omega_squared(values: Array, sizes: Sequence[int]) -> Array:
     total = ((values - values.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)
     within = sum(((x - x.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1) for x in groups)
     error = within / (values.shape[-1] - len(groups))
-    return np.where(
-        total > 0, (total - within - (len(groups) - 1) * error) / np.where(total > 0, total + error, 1), 0.0
-    )
+    over = np.where(total > 0, total + error, 1)
+    return np.where(total > 0, (total - within - (len(groups) - 1) * error) / over, 0.0)
 
 
 @dataclass(frozen=True)

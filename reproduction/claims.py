@@ -1,8 +1,9 @@
 """Claims of the thesis as lists of clauses, and their verdicts, which can go either way.
 
 A clause is one comparison with one number. It *holds* where a test rejects its opposite, *does not hold* where it
-rejects the clause itself, and is *undecided* otherwise. Either verdict is wrong in at most 5 % of all studies, as
-``python -m reproduction.verdicts`` measures. Nothing is corrected over clauses, but where one of several is enough.
+rejects the clause itself, and is *undecided* otherwise, also where one of the two is out of reach. Either verdict is
+wrong in at most 5 % of all studies, as ``python -m reproduction.verdicts`` measures. Nothing is corrected over clauses,
+but where one of several is enough.
 """
 
 import math
@@ -43,10 +44,14 @@ class Finding:
     """Of an equivalence: the smallest ratio, or difference, within which it holds at 95 %."""
     chosen: str = ""
     """Of a choice made on other seeds: what was chosen."""
+    reachable: tuple[float, float] = (0.0, 0.0)
+    """Smallest p-values, for and against, that any policies in so few blocks can have."""
 
     @property
     def verdict(self) -> Verdict:
-        """What it says."""
+        """What it says; nothing where only one of two verdicts could be reached, whatever the policies had done."""
+        if max(self.reachable) > ALPHA:
+            return "undecided"
         if self.p_for <= ALPHA:
             return "holds"
         return "does not hold" if self.p_against <= ALPHA else "undecided"

@@ -63,7 +63,11 @@ def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figure
     if not data.paired(environment):
         return found
     found |= legged_figures.figures(data, environment)
-    return {name: (f"{caption} {legged_figures.ORIGIN}", figure) for name, (caption, figure) in found.items()}
+    return {
+        name: (f"{caption} {legged_figures.ORIGIN}", figure) for name, (caption, figure) in found.items()
+        # A few policies have no profile; what one setting of several was not asked for needs no place in its section.
+        if figure is not None and not name.startswith("profile-")
+    }  # fmt: skip
 
 
 def dose_response(data: Data, environment: str, period: int, shifted: Sequence[Row]) -> "Figure":

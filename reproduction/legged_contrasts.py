@@ -10,7 +10,7 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,15 @@ from deimos.study.stats import Array, Interval
 from reproduction.claim_list import CLAIMS
 from reproduction.claims import Clause
 from reproduction.legged_bases import KEPT_IN, LONG, ROBOTS, SHORT, base_name
-from reproduction.measures import DOSE, LEVEL, PENALTIES, SCORE, VARIANCE, Evidence, Measure, Numbers, Place
-from reproduction.thesis import LEGGED, LEGGED_METHODS
+from reproduction.legged_on_warp import ENVIRONMENT as ON_WARP
+from reproduction.measures import DOSE, FPS, LEVEL, PENALTIES, SCORE, VARIANCE, Evidence, Measure, Numbers, Place
+from reproduction.thesis import LEGGED, LEGGED_METHODS, PARTICLE
 
 REFERENCE = "uniform"
 PRIMARY = ("p75", "vds+p75", "penalty-30")
 CORE_HOURS = {"quad": 1.7, "quad_arm": 0.4}
 """What one more method takes on all bases of a robot (legged.md)."""
+WITH_PARTICLE = "rnd beside Particle Gym's, whose rows are docs/results/particle_[a-f]: to be merged into the folder"
 LONGER_HOURS = {"quad": 3.2, "quad_arm": 0.7}
 """What the evaluation of its policies at T10 takes."""
 WALKS = 0.3
@@ -38,13 +40,13 @@ WALKS = 0.3
 TITLES = {
     ("quad", 100): "Quad at T2", ("quad", 500): "Quad at T10, trained at T2",
     ("quad_long", 100): "Quad at T2, trained at T10", ("quad_long", 500): "Quad at T10, trained at T10",
-    ("quad_on_warp", 100): "Quad at T2, evaluated on mujoco-warp",
+    (ON_WARP, 100): "Quad at T2, evaluated on mujoco-warp",
     ("quad_warp", 100): "Quad at T2, trained and evaluated on mujoco-warp",
     ("quad_arm", 100): "Quad+arm at T2", ("quad_arm", 500): "Quad+arm at T10",
 }  # fmt: skip
 """Of the places where methods are compared, in order."""
 ENGINES = {
-    "quad": "native", "quad_on_warp": "native, judged on mujoco-warp", "quad_warp": "mujoco-warp",
+    "quad": "native", ON_WARP: "native, judged on mujoco-warp", "quad_warp": "mujoco-warp",
 }  # fmt: skip
 """Environments of Quad by the engine of training and evaluation."""
 TEXT = (
@@ -191,7 +193,8 @@ def _trainings(evidence: Evidence) -> list[Block]:
             for each in (LEVEL, VARIANCE, DOSE)
         }
         for environment in dict.fromkeys(name for name, _ in TITLES) for place in evidence.places(environment)[:1]
-        if evidence.paired(place) for name in evidence.methods if evidence.trainings(place, name)
+        if evidence.paired(place) and environment != ON_WARP  # whose trainings are Quad's
+        for name in evidence.methods if evidence.trainings(place, name)
     ]  # fmt: skip
     return ["### Trainings, base by base", VDS_TEXT, rows] if rows else []
 
@@ -271,11 +274,14 @@ def not_run(evidence: Evidence) -> list[Block]:
         places = [place for place in evidence.places(robot) if evidence.paired(place)]
         ran = {name for name in evidence.methods for place in places if evidence.evaluations(place, "naive", name)}
         lacking = {
-            name: (_claims(robot, lambda clause, name=name: name in clause.test.methods), CORE_HOURS[robot])
+            name: (_claims(robot, partial(_of_robots, name)),
+                   CORE_HOURS[robot])
             for name in (*LEGGED_METHODS, *PENALTIES) if name not in ran
         }  # fmt: skip
         if LONG not in [place.period for place in places]:
             lacking["T10"] = _claims(robot, _at_t10), LONGER_HOURS[robot]
+        if "rnd" not in ran or not any(evidence.places(name) for name in PARTICLE):
+            lacking[WITH_PARTICLE] = _claims(robot, _beside_particle), CORE_HOURS[robot] * ("rnd" not in ran)
         rows += [
             {"robot": robot, "not run": name, "claims that speak of it": text, "would take [core-hours]": f"{hours:g}"}
             for name, (text, hours) in lacking.items() if text
@@ -283,15 +289,24 @@ def not_run(evidence: Evidence) -> list[Block]:
     return ["### Not run", rows] if rows else []
 
 
+def _of_robots(method: str, clause: Clause) -> bool:
+    return method in clause.test.methods and not _beside_particle(clause)
+
+
+def _beside_particle(clause: Clause) -> bool:
+    return any(name.endswith("@ particle") for name in clause.test.methods)
+
+
 def _at_t10(clause: Clause) -> bool:
     return LONG in clause.periods or any(name.endswith(f"@ {LONG}") for name in clause.test.methods)
 
 
 def _claims(robot: str, about: Callable[[Clause], bool]) -> str:
-    """The claims that have clauses about something on a robot."""
+    """The claims that have clauses about something on a robot, but for those on speed: no further run tells them."""
     return ", ".join(
         claim.id for claim in CLAIMS
-        if any(robot in clause.environments and about(clause) for clause in claim.clauses)
+        if any(robot in clause.environments and about(clause) and getattr(clause.test, "measure", None) is not FPS
+               for clause in claim.clauses)
     )  # fmt: skip
 
 

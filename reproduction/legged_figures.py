@@ -30,6 +30,8 @@ TRAINING = "every line is a base, in grey Uniform's of the same bases; rolling m
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")  # Okabe and Ito's
 _MARKERS = "osD^vP"
 _COLUMNS = 5
+RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
+"""Ticks of a logarithmic axis of rates [% of interactions]."""
 LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
@@ -45,6 +47,8 @@ def figures(data: Data, environment: str) -> Figures:
                 f"{place}: {DIFFERENCES}", differences(data, environment, period)
             ),
         }  # fmt: skip
+    if data.trained_in(environment) != environment:
+        return found
     title = f"Figure {CURVES[environment]} in pairs, {environment}" if environment in CURVES else environment
     found[f"training-{environment}"] = (f"{title}: {TRAINING} {CAVEAT}", training(data, environment))
     return found
@@ -61,13 +65,14 @@ def _methods(data: Data, environment: str) -> list[str]:
 
 
 def pairs(data: Data, environment: str, period: int) -> "Figure":
-    """Crashes per interaction and score of every policy, without and with an attacker, a line for each base."""
+    """Crashes per interaction and score of every policy, without and with attackers, a line for each base."""
     easy, hard = Where(environment, "naive", period), Where(environment, "adversary", period)
     worst = outcomes.attacked(data, environment, period)
     methods, numbers = _methods(data, environment), bases(data, environment)
-    figure, axes = subplots(2, 2, (WIDTH, 4.6), sharex=True, sharey="row")
+    figure, axes = subplots(2, 3, (WIDTH, 5.0), sharey="row")
     for panel, where, metric, title in (
-        (axes[0, 0], easy, "crash_rate", "uniform goals"), (axes[0, 1], worst.where, worst.metric, worst.by),
+        (axes[0, 0], easy, "crash_rate", "uniform goals"), (axes[0, 1], hard, "crash_rate", "the Adversary"),
+        (axes[0, 2], worst.where, worst.metric, "the worst attacker"),
         (axes[1, 0], easy, "score", "uniform goals"), (axes[1, 1], hard, "score", "the Adversary"),
     ):  # fmt: skip
         unit = 1 if metric == "score" else 100
@@ -78,10 +83,17 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
         _lines(panel, values)
         panel.set_title(f"under {title}")
         panel.grid(axis="y", alpha=0.3)
+        panel.set_xticks(range(len(methods)), methods, rotation=45, ha="right", rotation_mode="anchor")
+        panel.tick_params(axis="x", labelbottom=panel not in axes[0, :2])
+        panel.set_xlim(-0.5, len(methods) - 0.5)
     as_rates(axes[0, 0], "y", "crashes per interaction [%]")
+    rates = [x for panel in axes[0] for line in panel.lines for x in line.get_ydata()]
+    if rates and min(rates) >= RATES[0]:  # decades that nothing is in would hide what is between bases
+        low, high = max(x for x in RATES if x <= min(rates)), min(x for x in RATES if x > max(rates))
+        axes[0, 0].set_yticks(RATES, [f"{x:g}" for x in RATES])
+        axes[0, 0].set_ylim(low, high)
     axes[1, 0].set_ylabel("score")
-    for panel in axes[1]:
-        panel.set_xticks(range(len(methods)), methods, rotation=30, ha="right", rotation_mode="anchor")
+    axes[1, 2].set_axis_off()
     _legend(figure, numbers)
     return figure
 
@@ -157,7 +169,7 @@ def training(data: Data, environment: str) -> "Figure | None":
         _share_limits(axes[which::2], label)
     for panel in axes[::2].flat:
         low, high = panel.get_ylim()
-        if high < 10 * max(low, LINEAR):  # powers of ten would be one tick or none
+        if np.floor(np.log10(high)) <= np.ceil(np.log10(max(low, LINEAR))):  # powers of ten: one tick or none
             panel.yaxis.set_major_locator(MaxNLocator(4))
     _legend(figure, bases(data, environment))
     return figure

@@ -10,7 +10,7 @@ from scipy import stats as scipy_stats
 
 from deimos.goals.methods import METHODS
 from deimos.study.audits import diversity
-from deimos.study.data import Data
+from deimos.study.data import Data, delivered_dose
 from deimos.study.results import Row
 from deimos.study.stats import Array
 from reproduction.thesis import PARTICLE
@@ -186,6 +186,16 @@ def _curve(column: str, number: Callable[[Array], float]) -> Callable[[Evidence,
     return numbers
 
 
+def _from_nothing(column: str, number: Callable[[Array], float]) -> Callable[[Evidence, Place, str], Numbers]:
+    """Of trainings that began with nothing: the first part of a branch's is no beginning."""
+    of_curve = _curve(column, number)
+
+    def numbers(evidence: Evidence, place: Place, method: str) -> Numbers:
+        return {} if evidence.paired(place) else of_curve(evidence, place, method)
+
+    return numbers
+
+
 def _tail(values: Array, share: float) -> Array:
     return values[-max(1, round(share * len(values))) :]
 
@@ -261,13 +271,13 @@ GAIN = Measure("crashes per interaction that the attack adds", _less(ATTACKED, N
 LOSS = Measure("score that the attack costs", _less(SCORE, ATTACKED_SCORE))
 LATE = Measure("crashes per 1000 transitions at the end of training",
                _curve("crashes_per_1000", lambda x: float(_tail(x, 0.1).mean())), ratio=True, floor=1e-3)  # fmt: skip
-FALL = Measure("fall of log crashes over training", _curve("crashes_per_1000", _fall))
+FALL = Measure("fall of log crashes over training", _from_nothing("crashes_per_1000", _fall))
 LATE_FALL = Measure("fall of log crashes in the last fifth of training", _curve("crashes_per_1000", _late_fall))
-HALFWAY = Measure("crashes halfway below a tenth of the first", _curve("crashes_per_1000", _rare_halfway))
+HALFWAY = Measure("crashes halfway below a tenth of the first", _from_nothing("crashes_per_1000", _rare_halfway))
 CHOSEN = Measure("share of goals that the Director chose", _curve("selected_fraction", lambda x: float(x.mean())))
 DIVERSITY = Measure("diversity of goals", _curve("goal_map", diversity))
 DOSE = Measure("delivered dose: mean percentile of fear of the goals in training",
-               _curve("goal_percentile", _known_mean))  # fmt: skip
+               _curve("goal_percentile", delivered_dose))  # fmt: skip
 FITTED = Measure("share of rollouts after which fear was fitted", _curve("fear_fitted", _known_mean))
 EXACT_RANK = Measure("percentile of the chosen goals, tried in clones", _curve("exact_percentile", _known_mean))
 AUROC = Measure("AUROC of fear within contexts", _curve("auroc", _known_mean))

@@ -24,8 +24,9 @@ CLAUSES = "clauses"
 """Name of the figure on the first page."""
 PAIRED = (
     "Policies that branched off the same base are compared with each other alone: clauses permute and resample within "
-    "bases. Two methods on five bases cannot be ordered by that, for even five of five is p = 1/16 on both sides. "
-    "Fewer than five bases give estimates without a verdict."
+    "bases. Two methods on five bases cannot be ordered by that, for even five of five is p = 1/16 on both sides. That "
+    "two methods are alike could be held on five bases (p = 1/32), but not refused (1/16), so such clauses are "
+    "undecided too. Fewer than five bases give estimates without a verdict."
 )
 
 
@@ -62,8 +63,8 @@ def page(data: Data, pictures: report.Pictures, out: Path, speeds: Sequence[Mapp
     return [
         "# What the thesis claims, clause by clause", _summary(outcomes, data), *first,
         "# The study", *_lines(outcomes), *report.environments(data, pictures), *report.over_all(data),
-        *legged_contrasts.blocks(evidence), *report.what_was_run(data), *deviations.blocks(), *report.speed(data),
-        *report.distributions(data),
+        *legged_contrasts.blocks(evidence), *report.what_was_run(data), *deviations.blocks(data.environments),
+        *report.speed(data), *report.distributions(data),
         "## Every clause", *[block for outcome in outcomes for block in _details(outcome)],
         "## Limits", "\n".join(f"* {text}" for text in _limits(data)),
     ]  # fmt: skip
@@ -117,16 +118,14 @@ def _row(each: Result) -> dict[str, str]:
 
 def _limits(data: Data) -> list[str]:
     """Those of every study, and of the tests of claims."""
-    unit, power, *rest = report.limits(data)
     pairs = [PAIRED] if any(map(data.paired, data.environments)) else []
     return [
-        unit,
-        f"{power} Nothing is tested below {LEAST} policies.",
+        *report.limits(data),
         "A clause is one comparison. It holds where a test rejects its opposite, does not hold where it rejects the "
         "clause, each wrongly in at most 5 % of all studies, and is undecided otherwise. Nothing is corrected over "
-        f"clauses. An equivalence is settled within a ratio of {SETTLED_RATIO:g}, or {SETTLED_SHARE:g} of the score.",
+        f"clauses, and nothing is tested below {LEAST} policies. An equivalence is settled within a ratio of "
+        f"{SETTLED_RATIO:g}, or {SETTLED_SHARE:g} of the score.",
         *pairs,
-        *rest,
         "`python -m reproduction coverage` measures again how often these intervals contain the truth.",
         "What the thesis measured its Table 4.1 on is not known; its claim on speed rests on `python -m benchmarks "
         "table41`, never on the clocks of a study.",

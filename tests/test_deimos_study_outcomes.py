@@ -238,10 +238,10 @@ def test_hyper_parameters_stand_in_one_table():
         Cell(environment=name, config=TrainConfig(method="p25", num_envs=count, env=Config(variant=name)),
              goal_periods=(100,)) for name, count in sizes.items()
     ]  # fmt: skip
-    (table,) = report.hyper_parameters(cells)
+    (table,) = report.hyper_parameters({cell.environment: cell.to_dict()["config"] for cell in cells})
     rows = {row.pop("field"): row for row in table}
     assert rows["num_envs"] == {"directional": "64", "relative": "32"}
     assert rows["env.variant"] == {"directional": "directional", "relative": "relative"}
     assert rows["ppo.hidden"]["directional"] == "64 64"
     assert not {"method", "seed", "env.goal_range"} & set(rows)
-    assert report.hyper_parameters([]) == ["They are in the cells of the study, which are not beside these tables."]
+    assert report.hyper_parameters({}) == ["They are in the cells of the study, which are not beside these tables."]

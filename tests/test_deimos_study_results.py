@@ -11,7 +11,7 @@ from deimos.checks import RunError
 from deimos.run.folder import RunFolder
 from deimos.study import results
 from deimos.study.data import Data, Where
-from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results, merge, read_table, write_table
+from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, Results, merge, read_table, settings, write_table
 
 COLUMNS = {"name": str, "count": int, "rate": float, "weak": bool, "points": tuple, "errors": dict}
 
@@ -236,6 +236,22 @@ def test_merge_adds_what_is_new(tmp_path):
     assert found.rows[0]["crashes"] == 1
     assert [each["hash"] for each in found.curves] == ["3"]
     assert merge(tmp_path / "c", [tmp_path / "a"]) == (0, 2, 0)
+
+
+def test_merge_keeps_the_settings(tmp_path):
+    """Of every environment the configuration of a cell stays with the tables, also through a second merge."""
+    for seed, (name, worlds) in enumerate((("a", 16), ("b", 32))):
+        fill(tmp_path / name, [result(str(seed))])
+        home = RunFolder.create(tmp_path / name / "cells" / name)
+        home.write_json("cell.json", {"environment": f"on_{name}", "config": {"num_envs": worlds}})
+    merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"])
+    merge(tmp_path / "d", [tmp_path / "c"])
+    assert settings(tmp_path / "d") == {"on_a": {"num_envs": 16}, "on_b": {"num_envs": 32}}
+    merge(tmp_path / "a", [tmp_path / "a"])
+    assert not (tmp_path / "a" / "settings").exists()  # it has the cells themselves
+    (tmp_path / "c" / "settings" / "on_a.json").write_text('{"environment": "on_a"}')
+    with pytest.raises(RunError, match="does not describe a cell"):
+        settings(tmp_path / "c")
 
 
 def test_merge_adds_what_other_attackers_did_to_the_same_policies(tmp_path):

@@ -184,7 +184,7 @@ def test_five_bases_cannot_order_two_methods():
 
 def test_bases_widen_no_spread_and_hide_no_equivalence():
     """Within blocks methods are alike whose bases differ, and a method is wider whose policies move apart on them."""
-    base = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
+    base = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     near = in_blocks({"vds": 1.05 * base, "uniform": base})
     found = Alike(NAIVE, "vds", "uniform").find(near, HERE)
     assert (found.verdict, found.interval.estimate) == ("holds", pytest.approx(1.05, rel=1e-3))
@@ -193,6 +193,20 @@ def test_bases_widen_no_spread_and_hide_no_equivalence():
     spread = Ordered(NAIVE, (("vds", "uniform"),), spread=True).find(wide, HERE)
     assert spread.interval.estimate == pytest.approx(3.0)
     assert spread.p_for < spread.p_against
+
+
+def test_no_equivalence_where_its_opposite_is_out_of_reach():
+    """Of five bases neither the same nor other scores give a verdict that two methods are alike; of six both do."""
+    test, one_sided = Alike(SCORE, "vds", "uniform"), Alike(SCORE, "vds", "uniform", at_most=True)
+    for bases, verdicts in ((5, ("undecided", "undecided")), (6, ("holds", "does not hold"))):
+        score = 0.1 * np.arange(bases)
+        near, far = (in_blocks({"vds": score + shift, "uniform": score}, "score") for shift in (0.0, 0.6))
+        assert tuple(test.find(each, HERE).verdict for each in (near, far)) == verdicts
+        assert test.find(near, HERE).reachable == (0.5**bases, 2 * 0.5**bases)
+        assert math.isinf(test.find(near, HERE).detectable) == (bases == 5)
+        # Of one side five bases are enough both ways.
+        assert [one_sided.find(each, HERE).verdict for each in (near, far)] == ["holds", "does not hold"]
+    assert test.find(only({"vds": score, "uniform": score}, "score"), HERE).reachable == (0.0, 0.0)
 
 
 def test_verdicts_on_bases_are_seldom_wrong():

@@ -297,6 +297,16 @@ def test_measures_of_curves():
     assert measures.DIVERSITY(Evidence([], [replace_map(curve)]), HERE, "p25") == {}
 
 
+def test_branches_have_no_beginning():
+    """What became of a training since its beginning is not asked of one that branched off a policy."""
+    curve = {"environment": "quad", "method": "vds", "seed": 1, "crashes_per_1000": tuple(np.linspace(5.0, 0.1, 40))}
+    alone, branch = Evidence([], [curve]), Evidence([], [curve | {"block": "base 1"}])
+    place = Place("quad", 100)
+    for measure in (measures.HALFWAY, measures.FALL):
+        assert (len(measure(alone, place, "vds")), measure(branch, place, "vds")) == (1, {})
+    assert measures.LATE(branch, place, "vds") == measures.LATE(alone, place, "vds") != {}
+
+
 def replace_map(curve):
     """The same curve of a training without a map."""
     return {name: value for name, value in curve.items() if name != "goal_map"}

@@ -15,12 +15,14 @@ from deimos.sim.envs import particle
 from deimos.study import cell as worker
 from deimos.study import outcomes as study_outcomes
 from deimos.study import plan, stats
-from deimos.study.data import Data, Where
+from deimos.study import report as study_report
+from deimos.study.data import Data, Where, delivered_dose
 from deimos.study.folder import StudyFolder
 from deimos.study.report import outcomes
 from deimos.study.results import Results, merge
-from reproduction import claim_tests, legged_bases, legged_contrasts, legged_figures, report
-from reproduction.measures import SCORE, Evidence, Place
+from reproduction import claim_tests, deviations, legged_bases, legged_contrasts, legged_figures, report
+from reproduction.figures import figures
+from reproduction.measures import DOSE, SCORE, Evidence, Place
 
 QUAD = Place("quad", 100)
 BASES = 3
@@ -153,6 +155,9 @@ def test_tables_say_what_is_judged_and_what_is_estimated(tmp_path, monkeypatch):
     assert {row["not run"] for row in lacking}.isdisjoint({"uniform", "p75", "vds", "vds+p75", "penalty-30"})
     claims = {(row["robot"], row["not run"]): row["claims that speak of it"] for row in lacking}
     assert (claims["quad", "T10"], claims["quad_arm", "T10"]) == ("C19", "C22, C23")
+    assert not any("C31" in text.split(", ") for text in claims.values())  # speed is not measured by a run
+    assert claims["quad", legged_contrasts.WITH_PARTICLE] == "C18"
+    assert "C18" not in claims["quad", "rnd"].split(", ")
 
 
 def test_studies_without_bases_have_no_such_section():
@@ -213,6 +218,51 @@ def test_trainings_are_told_base_by_base(tables):
         assert len(row["explained variance of the critic in training"].split(", ")) == BASES
 
 
+def test_one_dose_of_a_method_that_hands_over(tables):
+    """Tables, figures and clauses have one dose: that of the half under the Director; what ends unranked has none."""
+    data = Data.read(tables)
+    for row in data.curve_rows:
+        half = len(row["env_steps"]) // 2
+        own = {"vds+p75": (50.0, math.nan, *[80.0] * half), "uniform": (50.0, math.nan)}
+        row["goal_percentile"] = own.get(row["method"], (75.0,))
+    _, text, rows, *_ = outcomes(data, "quad", 100)
+    shown = {row["method"]: row["delivered dose"] for row in rows}
+    assert shown == {"uniform": "not recorded", "p75": "75.0", "vds+p75": "80.0", "penalty-30": "75.0"}
+    assert "The dose of vds+p75 is that of the last part" in text
+    told = DOSE(Evidence.of(data), QUAD, "vds+p75")
+    assert told == data.delivered("quad", "vds+p75") == dict.fromkeys(range(1, BASES + 1), 80.0)
+    assert math.isnan(delivered_dose(np.array([50.0, math.nan])))
+
+
+def test_policies_judged_again_have_no_trainings_of_their_own(tables):
+    """Where the policies are another environment's, its trainings and doses are not drawn a second time."""
+    found = Results.read(tables)
+    again = [row | {"environment": "quad_on_warp"} for row in found.rows if row["method"] in METHODS[:2]]
+    lines = [row | {"environment": "quad_on_warp"} for row in found.curves if row["method"] in METHODS[:2]]
+    data = Data(Results(found.rows + again, found.curves + lines))
+    assert [data.trained_in(name) for name in data.environments] == ["quad", "quad"]
+    drawn = {name: {each.split("-")[0] for each in figures(data, name)} for name in data.environments}
+    assert drawn["quad"] - drawn["quad_on_warp"] == {"training", "dose"}
+    assert "evaluation" in drawn["quad_on_warp"]
+    assert {row["environment"] for row in legged_contrasts._trainings(Evidence.of(data))[2]} == {"quad"}
+
+
+def test_deviations_are_those_of_what_was_run():
+    """Robots are not told Particle Gym's settings, nor it theirs; both are where both are."""
+    found = {names: str(deviations.blocks(names)) for names in (("relative",), ("quad_on_warp",), ("relative", "quad"))}
+    for words, there in (("1500 steps of 2000 worlds", (True, False, True)), ("Isaac Gym", (False, True, True))):
+        assert tuple(words in text for text in found.values()) == there
+
+
+def test_pairs_are_told_no_power_of_rank_sums(tables):
+    """What 10 or 30 policies a side would show is nothing that pairs hang on; other populations have it."""
+    data = Data.read(tables)
+    assert not any("rank-sum" in text for text in study_report.limits(data))
+    for row in data.rows:
+        row["block"] = ""
+    assert any("rank-sum" in text for text in study_report.limits(data))
+
+
 def test_a_study_of_branches_gives_its_tables(tables, capsys, monkeypatch):
     """The command prints the contrasts of real rows: every base of the study in every outcome."""
     monkeypatch.setattr("sys.argv", ["legged_contrasts", str(tables)])
@@ -228,6 +278,7 @@ def test_report_has_pairs_claims_and_pictures(tables, tmp_path):
     """The report of such a study judges clauses in pairs, has the section and the figures with their origin."""
     report.write(tables, tmp_path)
     text = (tmp_path / "report.md").read_text()
+    assert "| ppo.hidden | 8 |" in text  # the merge has kept the settings
     for words in ("Figure 4.8 in pairs", "Figure A.1 in pairs", legged_figures.ORIGIN, "## Methods in pairs",
                   "### Not run", "score (Naive): uniform > penalty-30"):  # fmt: skip
         assert words in text, words
@@ -249,7 +300,11 @@ def test_pictures_show_every_policy(tables):
     """A line for each base holds the values of the rows, method by method; a bar is their mean."""
     data = Data.read(tables)
     figure = legged_figures.pairs(data, "quad", 100)
-    score = figure.axes[2]
+    score = figure.axes[3]
+    hard = Where("quad", "adversary", 100)
+    assert figure.axes[1].get_title() == "under the Adversary"
+    nobody = study_outcomes.NOBODY in [text.get_text() for text in figure.axes[1].texts]
+    assert nobody == (len(data.sample(hard, "p75", "crash_rate")) == 0)
     lines = [line for line in score.lines if len(line.get_xdata()) == len(METHODS)]
     shown = np.array([line.get_ydata() for line in lines])
     evidence = Evidence.of(data)
@@ -264,7 +319,7 @@ def test_pictures_show_every_policy(tables):
     assert own == {BASES, 2 * BASES}  # Uniform's own panels, and those with Uniform in grey behind
 
 
-@pytest.mark.parametrize("crashes", [(2.2, 4.5), (0.3, 0.5), (0.02, 40.0)])
+@pytest.mark.parametrize("crashes", [(2.2, 4.5), (0.3, 0.5), (0.15, 1.6), (0.02, 40.0)])
 def test_axes_of_trainings_have_numbers(tables, crashes):
     """However narrow the range of the crashes is, the axis has two numbers or more."""
     data = Data.read(tables)

@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos.study.folder import StudyFolder
-from deimos.study.plan import Cell
-from deimos.study.results import Results, Row
+from deimos.study.results import Results, Row, settings
 from deimos.study.stats import Array
 
 _COLOURS = "#0072B2 #E69F00 #009E73 #CC79A7 #D55E00 #56B4E9 #7f7f7f #a6761d #332288 #e7298a".split()
@@ -71,10 +69,12 @@ class Data:
     results are no one study; see ``Results.check``.
     """
 
-    def __init__(self, results: Results, style: Style | None = None, cells: Sequence[Cell] = ()) -> None:
+    def __init__(
+        self, results: Results, style: Style | None = None, settings: Mapping[str, Mapping] | None = None
+    ) -> None:
         results.check()
-        self.cells = cells
-        """What made them; none where the tables are all that there is."""
+        self.settings = settings or {}
+        """Configurations by environment, as JSON types; none where the tables are all that there is."""
         self._results, self.rows = results, results.rows
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = defaultdict(dict)
@@ -86,12 +86,12 @@ class Data:
     @classmethod
     def read(cls, folder: Path, style: Style | None = None) -> "Data":
         """The results of a folder; raises ``RunError`` if there are none, or as ``Results.read`` and ``check`` do."""
-        return cls(Results.read(folder, may_be_empty=False), style, StudyFolder(folder).cells())
+        return cls(Results.read(folder, may_be_empty=False), style, settings(folder))
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
         rows, curves = ([row for row in rows if row["method"] in methods] for rows in (self.rows, self._results.curves))
-        return Data(Results(rows, curves), self.style, self.cells)
+        return Data(Results(rows, curves), self.style, self.settings)
 
     @property
     def curve_rows(self) -> list[Row]:
@@ -170,15 +170,37 @@ class Data:
         return {seed: values for seed, values in found.items() if len(values)}
 
     def delivered(self, environment: str, method: str) -> dict[int, float]:
-        """Delivered dose of every policy, by seed: the mean percentile of fear of its goals in training.
+        """Delivered dose of every policy, by seed; see ``delivered_dose``. Those of unknown dose are left out."""
+        ranked = self.curves_by_seed(environment, method, "goal_percentile")
+        doses = {seed: delivered_dose(values) for seed, values in ranked.items()}
+        return {seed: dose for seed, dose in doses.items() if not math.isnan(dose)}
 
-        First goals and the time before fear had learnt count. Policies of which it is not known are left out.
-        """
-        means = {
-            seed: float(values.mean())
-            for seed, values in self.curves_by_seed(environment, method, "goal_percentile").items()
-        }
-        return {seed: mean for seed, mean in means.items() if not math.isnan(mean)}
+    def dosed_late(self, environment: str) -> list[str]:
+        """Methods whose delivered dose is that of a last part of their training, as it is not known of the first."""
+        return [
+            name for name in self.methods(environment) if self.delivered(environment, name)
+            and any(np.isnan(values).any() for values in self.curves(environment, name, "goal_percentile"))
+        ]  # fmt: skip
+
+    def trained_in(self, environment: str) -> str:
+        """The environment whose policies those of an environment are: another one where they were only judged again."""
+        weights = {name: {row.get("weights") for row in self.rows if row["environment"] == name}
+                   for name in self.environments}  # fmt: skip
+        own = weights[environment]
+        # Where two have the same policies, the first is the one that they were trained in.
+        others = [name for name in weights if None not in own and own <= weights[name]]
+        return max(others, key=lambda name: len(weights[name]), default=environment)
+
+
+def delivered_dose(percentiles: Array) -> float:
+    """Mean percentile of fear of the goals of a training, shape (k,), since it has been known without a gap.
+
+    First goals and the time before fear had learnt count. Nobody ranks the goals of some selectors, and of one that
+    hands over to a Director (``vds+p75``) the Director's part counts. NaN where it is not known at the end.
+    """
+    unknown = np.flatnonzero(np.isnan(percentiles))
+    known = percentiles[unknown[-1] + 1 :] if unknown.size else percentiles
+    return float(known.mean()) if known.size else math.nan
 
 
 def _metric(row: Row, name: str) -> float:

@@ -3,7 +3,8 @@
 A cell's folder holds ``cell.json`` (what it is), ``run/`` (its run folder), ``audits.json`` (what was measured late in
 its training), ``fear.pt`` (its fear network, where it has one), ``result.json`` once it is finished, ``log.txt`` (what
 its workers said) and ``failures.jsonl`` (how they died). ``attack.json`` has the attackers that were added later,
-``scales.json`` the returns that make scores of 0 and 1, once for each task.
+``scales.json`` the returns that make scores of 0 and 1, once for each task. ``settings/`` has the configuration of
+every environment that a merge took rows of.
 """
 
 import contextlib

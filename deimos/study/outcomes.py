@@ -52,14 +52,26 @@ def of_environment(data: Data, environment: str) -> Figures:
         found |= {
             f"evaluation-{ending}": (f"{place}: {BOXES}", boxes(data, environment, period)),
             f"pareto-{ending}": (f"{place}: {PARETO}", pareto(data, environment, period)),
-            f"dose-{ending}": (f"{place}: {DOSE}", dose(data, environment, period)),
+            f"dose-{ending}": (f"{place}: {DOSE}{late_doses(data, environment)}", dose(data, environment, period)),
             f"profile-{ending}": (f"{place}: {PROFILES}", profiles(data, environment, period)),
         }
+        if data.trained_in(environment) != environment:
+            del found[f"dose-{ending}"]
+    if data.trained_in(environment) != environment:  # its trainings are drawn there
+        return found
     text = f"{environment}: {figures.TRAINING} {figures.CAVEAT}"
     return found | {
         f"goals-{environment}": (f"{environment}: {MAPS}", goal_maps(data, environment)),
         f"training-{environment}": (text, figures.training(data, environment)),
     }
+
+
+def late_doses(data: Data, environment: str) -> str:
+    """A sentence on the methods whose dose is that of a part of their training; empty where there are none."""
+    names = ", ".join(data.dosed_late(environment))
+    return f" The dose of {names} is that of the last part of the training, whose goals alone fear ranked." * bool(
+        names
+    )
 
 
 def of_factors(data: Data) -> Figures:

@@ -17,14 +17,21 @@ from numpy.typing import NDArray
 from scipy.stats import sem
 
 from deimos.files import write_bytes
-from deimos.run.config import to_dict
 from deimos.study import figures, stats
 from deimos.study.data import Data, Style, Where
 from deimos.study.document import Block, to_html, to_markdown
 from deimos.study.figures import Figures
-from deimos.study.outcomes import SAFE, Attacked, attacked, base_of, of_environment, of_factors, settings_of
+from deimos.study.outcomes import (
+    SAFE,
+    Attacked,
+    attacked,
+    base_of,
+    late_doses,
+    of_environment,
+    of_factors,
+    settings_of,
+)
 from deimos.study.permutation import superiority_in_blocks
-from deimos.study.plan import Cell
 from deimos.study.stats import Array
 
 Pictures = Mapping[str, Sequence[Block]]
@@ -89,6 +96,7 @@ def what_was_run(data: Data) -> list[Block]:
     """Environments, methods, seeds, sizes, attackers and versions."""
     rows = []
     for environment in data.environments:
+        trained_in = data.trained_in(environment)
         methods, own = data.methods(environment), [row for row in data.rows if row["environment"] == environment]
         counts = Counter(len({row["seed"] for row in own if row["method"] == name}) for name in methods)
         policies = {(row["method"], row["seed"]): row["env_steps"] * row["num_envs"] for row in own}
@@ -96,7 +104,8 @@ def what_was_run(data: Data) -> list[Block]:
             "environment": environment, "methods": ", ".join(methods),
             "runs": ", ".join(f"{n} seeds x {k} methods" for n, k in sorted(counts.items())),
             "worlds": _values(own, "num_envs"), "parallel steps": _values(own, "env_steps"),
-            "transitions, all": f"{sum(policies.values()) / 1e6:.0f} M",
+            "transitions, all": f"{sum(policies.values()) / 1e6:.0f} M" if trained_in == environment
+            else f"those of {trained_in}",
             "T in training": _values(own, "trained_period"), "T evaluated": _values(own, "goal_period"),
             "evaluation: worlds x steps": f"{_values(own, 'worlds')} x {_values(own, 'steps')}",
             "goals": _values(own, "goals"), "setting": _values(own, "setting"),
@@ -104,18 +113,21 @@ def what_was_run(data: Data) -> list[Block]:
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
     return [
         "## What was run", rows, *_uninformed(data), "Run on " + "; ".join(versions) + ".",
-        "### Hyper-parameters", *hyper_parameters(data.cells),
+        "### Hyper-parameters", *hyper_parameters(data.settings),
     ]  # fmt: skip
 
 
-def hyper_parameters(cells: Sequence[Cell]) -> list[Block]:
+def hyper_parameters(settings: Mapping[str, Mapping[str, Any]]) -> list[Block]:
     """Every field of the environments, of the learner and of the evaluation, those that are not set left out.
 
     A selector's are those that its method's name stands for.
+
+    Args:
+        settings: Configurations by environment, as JSON types.
     """
-    if not cells:
+    if not settings:
         return ["They are in the cells of the study, which are not beside these tables."]
-    environments = {cell.environment: _flat(to_dict(cell.config)) for cell in cells}
+    environments = {name: _flat(config) for name, config in settings.items()}
     names = dict.fromkeys(name for fields in environments.values() for name in fields)
     rows = [{"field": name} | {place: fields.get(name, "-") for place, fields in environments.items()}
             for name in names if name.partition(".")[0] not in ("method", "selector", "seed")]  # fmt: skip
@@ -173,6 +185,11 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
     hard, easy = attacked(data, environment, period), Where(environment, "naive", period)
     names = data.methods(environment)
     under_attack = {name: data.sample(hard.where, name, hard.metric) for name in names}
+    met = [
+        goals for goals in data.goals
+        if any(len(data.sample(Where(environment, goals, period), name, "crash_rate")) for name in names)
+    ]  # fmt: skip
+    by = hard.by if any(map(len, under_attack.values())) else f"{hard.by} (nobody attacked)"
     rows, by_attacker = [], []
     for name, rate in under_attack.items():
         score = data.sample(easy, name, "score")
@@ -187,12 +204,13 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
             "delivered dose": f"{np.mean(doses):.1f}" if doses else "not recorded",
         })  # fmt: skip
         by_attacker.append({"method": name} | {
-            goals: f"{100 * values.mean():.3g}" if len(values) else "-" for goals in data.goals
+            goals: f"{100 * values.mean():.3g}" if len(values) else "-" for goals in met
             if (values := data.sample(Where(environment, goals, period), name, "crash_rate")) is not None
         })  # fmt: skip
     return [
         f"### {environment}, T = {period}: outcomes",
-        f"Crashes per interaction under {hard.by}, the score under uniform goals; with 95 % intervals over policies.",
+        f"Crashes per interaction under {by}, the score under uniform goals; with 95 % intervals over policies."
+        + late_doses(data, environment),
         rows, "Mean crashes per interaction [%] by who chooses the goals:", by_attacker,
     ]  # fmt: skip
 
@@ -282,7 +300,7 @@ def _over_places(*samples: Array) -> Array:
 def speed(data: Data) -> list[Block]:
     """Frames per second; the rows of its table, the last of its blocks, can be added to."""
     rows = []
-    for environment in data.environments:
+    for environment in [name for name in data.environments if data.trained_in(name) == name]:
         place = data.places(environment, "naive")[0]
         fps = {name: data.sample(place, name, "fps") for name in data.methods(environment)}
         base = fps.get(data.style.reference, np.array([]))
@@ -302,15 +320,17 @@ def speed(data: Data) -> list[Block]:
 
 def limits(data: Data) -> list[str]:
     """What a reader must bear in mind, one text each."""
-    places = [place for environment in data.environments for place in data.places(environment, "naive")]
-    smallest = min(
-        len(data.sample(place, name, "crashes")) for place in places for name in data.methods(place.environment)
-    )
+    apart = [name for name in data.environments if not data.paired(name)]
+    sizes = [len(data.sample(place, name, "crashes")) for environment in apart
+             for place in data.places(environment, "naive") for name in data.methods(environment)]  # fmt: skip
     p10, p30 = (stats.detectable_probability(n, n) for n in (10, 30))
+    power = [
+        f"The smallest population here has {min(sizes)} policies. With a power of 80 %, a rank-sum test finds P(x > y) "
+        f"= {p10:.2f} with 10 a side and {p30:.2f} with 30."
+    ] if sizes else []  # fmt: skip
     return [
         "The unit is one trained policy. Its worlds and episodes are no replicates.",
-        f"The smallest population here has {smallest} policies. With a power of 80 %, a rank-sum test finds P(x > y) = "
-        f"{p10:.2f} with 10 a side and {p30:.2f} with 30.",
+        *power,
         COVERAGE,
         "CVaR over seeds is too low in small populations.",
         "The mean reward per transition pays for crashing where a crash puts the robot back to safety; the score does "

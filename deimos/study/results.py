@@ -17,7 +17,7 @@ from typing import Any
 
 import deimos
 from deimos.checks import RunError, one_line
-from deimos.files import first_line, read_bytes, write_bytes
+from deimos.files import file_name, first_line, read_bytes, write_bytes
 from deimos.run.attack import attacker
 from deimos.run.evaluation import worst
 from deimos.run.folder import RunFolder
@@ -25,6 +25,7 @@ from deimos.study.plan import Cell
 from deimos.study.source import hashes
 
 SCHEMA = 1  # of result.json
+SETTINGS = "settings"  # folder of what a merge keeps of cells, a file for each environment
 Row = dict[str, Any]
 
 _CELL: dict[str, type] = {
@@ -237,7 +238,7 @@ def identity(cell: Cell) -> Row:
 
 
 def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
-    """Add the rows of other folders to the tables of one.
+    """Add the rows of other folders to the tables of one, and keep the settings of their environments.
 
     Args:
         target: The folder whose tables are written; made if it is not there.
@@ -267,7 +268,29 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
     merged.find_worst()
     target.mkdir(parents=True, exist_ok=True)
     merged.write(target)
+    for source in sources:
+        if source.resolve() != target.resolve():
+            for name, config in settings(source).items():
+                (target / SETTINGS).mkdir(exist_ok=True)
+                RunFolder(target / SETTINGS).write_json(
+                    f"{file_name(name)}.json", {"environment": name, "config": config}
+                )
     return added, present, differing
+
+
+def settings(folder: Path) -> dict[str, dict]:
+    """The configuration of a cell of every environment, as JSON types: of a folder's cells, or what a merge kept.
+
+    Raises ``RunError`` if a file is broken.
+    """
+    found = {}
+    for path in sorted(folder.glob(f"{SETTINGS}/*.json")) + sorted(folder.glob("cells/*/cell.json")):
+        cell = RunFolder(path.parent).read_json(path.name)
+        try:
+            found[str(cell["environment"])] = dict(cell["config"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{path} does not describe a cell ({one_line(error)}).") from error
+    return found
 
 
 def _evaluation(row: Row) -> tuple:
