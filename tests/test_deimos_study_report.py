@@ -29,7 +29,8 @@ def fill(folder, seeds=4, points=20):
         for method in METHODS:
             for seed in range(seeds):
                 key = {"environment": environment, "method": method, "seed": seed, "setting": environment,
-                       "selector": method, "hash": f"{environment}-{method}-{seed}", "block": None}  # fmt: skip
+                       "selector": method, "hash": f"{environment}-{method}-{seed}", "block": None,
+                       "weights": f"{environment}-{method}-{seed}"}  # fmt: skip
                 for goals in ("naive", "adversary"):
                     row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()} | key
                     crashes = int(np.exp(rng.normal(5, 0.5))) if goals == "adversary" else 0

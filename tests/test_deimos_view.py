@@ -49,8 +49,8 @@ def bold(tmp_path_factory):
 def shielded(scared, tmp_path_factory):
     """Folder of the first run, with a shield."""
     path = Path(shutil.copytree(scared, tmp_path_factory.mktemp("view") / "shielded"))
-    small = "--alpha 0.3 --worlds 3000 --attackers scripted --eval.worlds 16 --eval.steps 100 --alphas 0.3 --device cpu"
-    assert cli.main(["shield", str(path), *small.split()]) == 0
+    small = "--attackers scripted --eval.worlds 16 --eval.steps 100 --alpha 0.3 --alphas 0.3 --device cpu"
+    assert cli.main(["shield", str(path), "--worlds", "40000", *small.split()]) == 0
     return path
 
 

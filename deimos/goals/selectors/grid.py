@@ -15,10 +15,7 @@ from deimos.nn.ranks import max_over_ranks
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """Goals by the weights of grid cells, which rise around every cell whose goals are tracked well.
-
-    The cells reach as far as goals do from the middle of their range; who gives no ``goal_box`` has goals around 0.
-    """
+    """Goals by the weights of grid cells, which rise around every cell whose goals are tracked well."""
 
     bins: int = 8
     """Cells along every component of a goal, at least 2. Every group of components has a grid of its own."""
@@ -50,6 +47,8 @@ class Config(SelectorConfig):
 
 class Grid(GoalSelector):
     """See ``Config``. Until it has learnt once, and so knows how far goals reach, it is uniform.
+
+    Cells reach as far as goals do from the middle of their range; who gives no ``goal_box`` has goals around 0.
 
     Raises:
         ValueError: If a group's grid would have more than 2^20 cells.
