@@ -185,7 +185,7 @@ def legend(
     ]  # fmt: skip
     widest = 0.45 + 0.055 * max(map(len, methods), default=0)  # [inch]: of a handle, and of each letter
     columns = max(1, int(WIDTH / widest))
-    where = {"loc": "outside lower center", "ncols": columns}
+    where: dict[str, Any] = {"loc": "outside lower center", "ncols": columns}
     if place == "beside":
         where = {"loc": "outside right center"}
         figure.set_figheight(max(figure.get_figheight(), ROW * (len(handles) + 2)))
