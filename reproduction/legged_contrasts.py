@@ -172,14 +172,14 @@ def blocks(evidence: Evidence) -> list[Block]:
 
 
 def _of_walkers(evidence: Evidence, folder: Path = KEPT_IN) -> list[Block]:
-    """The primary contrasts without bases that do not walk; nothing where all do."""
+    """The primary contrasts without bases that do not walk; nothing where all do, or fewer than two."""
     scores = {
         index + 1: row["score"] for index in range(len(ROBOTS["quad"].seeds))
         for row in RunFolder(folder / base_name("quad", index)).read_rows("evaluation.json")
         if row["goal_period"] == SHORT
     }  # fmt: skip
     walking = {base for base, score in scores.items() if score >= WALKS}
-    if len(walking) == len(scores):
+    if len(walking) < 2 or len(walking) == len(scores):
         return []
     found = contrasts(evidence.only(walking), Place("quad", SHORT), PRIMARY)
     return _table(f"The same without bases whose score at T2 is below {WALKS:g}", found, judged=True)
@@ -274,10 +274,10 @@ def not_run(evidence: Evidence) -> list[Block]:
         places = [place for place in evidence.places(robot) if evidence.paired(place)]
         ran = {name for name in evidence.methods for place in places if evidence.evaluations(place, "naive", name)}
         lacking = {
-            name: (_claims(robot, partial(_of_robots, name)),
-                   CORE_HOURS[robot])
-            for name in (*LEGGED_METHODS, *PENALTIES) if name not in ran
-        }  # fmt: skip
+            name: (_claims(robot, partial(_of_robots, name)), CORE_HOURS[robot])
+            for name in (*LEGGED_METHODS, *PENALTIES)
+            if name not in ran
+        }
         if LONG not in [place.period for place in places]:
             lacking["T10"] = _claims(robot, _at_t10), LONGER_HOURS[robot]
         if "rnd" not in ran or not any(evidence.places(name) for name in PARTICLE):
