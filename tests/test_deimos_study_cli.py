@@ -114,11 +114,11 @@ def test_show_cuts_nothing(tmp_path, monkeypatch, capsys):
     assert cells == [long["environment"], long["method"], "x", "1", "1", "1.23e+03", "-", "0.5000", "0"]
 
 
-def test_progress_counts_what_is_done():
-    """The share of a study that is done counts finished and failed cells in full and running ones by their training."""
-    progress = Progress(5, 1, {"a": "it failed"}, {"b": 0.5, "c": 1.0}, seconds_left=90.0)
-    assert cli._share(progress) == pytest.approx(0.7)
-    assert cli._summary(progress) == "1 of 5 cells finished, 1 failed, b 50%, c evaluating, 0:01:30 left"
+def test_progress_is_one_line():
+    """The line of a study that runs says what is finished and failed, where each worker is, and how long it takes."""
+    running = {"b": (0.5, 0.0), "c": (1.0, 0.25)}
+    progress = Progress(5, 1, {"a": "it failed"}, running, share=0.6, seconds_left=90.0)
+    assert cli._summary(progress) == "1 of 5 cells finished, 1 failed, b 50%, c evaluating 25%, 0:01:30 left"
 
 
 def test_every_command_explains_itself():

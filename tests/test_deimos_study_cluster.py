@@ -16,6 +16,7 @@ import pytest
 from deimos.checks import RunError
 from deimos.study import cell as worker
 from deimos.study import cli, on_ray, plan
+from deimos.study.estimate import Estimate
 from deimos.study.folder import StudyFolder
 
 EXAMPLES = Path(__file__).parent.parent / "examples" / "cluster"
@@ -228,7 +229,7 @@ def test_a_study_runs_on_ray(study, ray, monkeypatch):
     finished = study.cells()[0]
     monkeypatch.setattr(StudyFolder, "finished", lambda self, cells: {finished.digest} & {c.digest for c in cells})
     monkeypatch.setattr(Answers, "answer", "out of luck")
-    monkeypatch.setattr(cli, "estimate", lambda study, cells: "")
+    monkeypatch.setattr(cli, "estimate", lambda study, cells: Estimate("", {}))
     with pytest.raises(RunError, match=r"1 of 2 cells failed, .*: out of luck"):
         cli.RunOptions(folder=study.path, engine="ray").run()
     assert Answers.begun == [study.cells()[1].name] * 2

@@ -47,7 +47,9 @@ def test_estimate_is_of_finished_cells_where_there_are_any(tmp_path, monkeypatch
     monkeypatch.setattr(estimate, "_measure", lambda cell: estimate.Speed(training=1000.0, acting=1e6))
     transitions, steps = estimate.cost(study, CELL)
     hours = 3 * (transitions / 1000.0 + steps / 1e6) / 3600
-    said = estimate.estimate(study, cells)
+    found = estimate.estimate(study, cells)
+    assert found.seconds == {cell.name: (transitions / 1000.0, steps / 1e6) for cell in cells}
+    said = found.text
     assert said.startswith(
         f"3 run(s): {3 * transitions / 1e6:.1f} M transitions (FPS measured on a short run of each kind)"
     )
@@ -55,7 +57,7 @@ def test_estimate_is_of_finished_cells_where_there_are_any(tmp_path, monkeypatch
     values = {str: "x", int: 1, float: 0.5, bool: False, tuple: (), dict: {}, list: []}
     row = {name: values[kind] for name, kind in RESULT_COLUMNS.items()}
     Results([row | identity(cells[0]) | {"fps": 50_000.0}]).write(tmp_path)
-    said = estimate.estimate(study, cells)
+    said = estimate.estimate(study, cells).text
     assert "(FPS of the finished cells)" in said
     assert said.endswith(f" = {3 * (transitions / 50_000.0 + steps / 1e6) / 3600:.2f} core-hours.")
 
@@ -75,7 +77,7 @@ def test_a_large_design_is_estimated_by_a_sample(tmp_path, monkeypatch):
     ]
     costs = [estimate.cost(study, cell) for cell in cells]
     assert len({cell.setting for cell in cells}) == 80
-    said = estimate.estimate(study, cells)
+    said = estimate.estimate(study, cells).text
     assert len(measured) == len(set(measured)) == 16
     assert "(FPS measured on a short run of 16 of 80 kinds)" in said
     seconds = sum(trained / 1500.0 + acted / 1e6 for trained, acted in costs)  # the mean of 1/1000 and 1/3000 is 1/1500

@@ -1,5 +1,6 @@
 """Studies run for real, on tiny budgets: stopped, killed, resumed, with workers that die."""
 
+import json
 import math
 import os
 import shutil
@@ -8,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,11 +20,10 @@ from deimos.lock import hold
 from deimos.run import evaluation
 from deimos.run.folder import RunFolder
 from deimos.study import cell as worker
-from deimos.study import cli, plan
+from deimos.study import cli, plan, runner
 from deimos.study.engine import LocalProcesses, last_words
 from deimos.study.folder import StudyFolder
 from deimos.study.results import result
-from deimos.study.runner import Runner
 
 ITERATIONS = 80
 
@@ -194,7 +195,7 @@ def test_worker_that_dies_is_retried_once_then_given_up(file, tmp_path, capsys):
                 killed.append(process.pid)
 
     engine = LocalProcesses(study)
-    end = Runner(study, engine, 2).run(kill, lambda: False)
+    end = runner.Runner(study, engine, 2).run(kill, lambda: False)
     assert len(killed) == 2
     error = "killed by SIGKILL (out of memory?)"
     assert study.failures(victim) == [error, error]
@@ -265,15 +266,50 @@ def test_any_engine_is_retried_once(whole, tmp_path):
     study.add(whole.cells()[:1])
     (cell,) = study.cells()
     engine = Answers("the node is lost", None)
-    end = Runner(study, engine, 1).run(lambda progress: None, lambda: False)
+    end = runner.Runner(study, engine, 1).run(lambda progress: None, lambda: False)
     assert study.failures(cell) == ["the node is lost", "it ended without results"]
     assert end.failed == {cell.name: "it ended without results"}
     study.forget_failures()
     engine = Answers(None)
     asked = iter([False, *[True] * 9])
     engine.run = lambda cell: wait_until(lambda: engine.stopped)
-    end = Runner(study, engine, 1).run(lambda progress: None, lambda: next(asked))
+    end = runner.Runner(study, engine, 1).run(lambda progress: None, lambda: next(asked))
     assert (engine.stopped, end.finished, end.failed, study.failures(cell)) == (1, 0, {}, [])
+
+
+def test_what_is_left_counts_evaluations(whole, tmp_path, monkeypatch):
+    """Training and evaluations count by what they are expected to take, and what was done before as no progress."""
+    study = StudyFolder(tmp_path / "study")
+    study.add(whole.cells())
+    first, second = study.cells()
+    clock = iter([0.0])
+    monkeypatch.setattr(runner, "time", SimpleNamespace(monotonic=lambda: next(clock, 10.0)))
+    run, source = (each.cell_path(first) / "run" for each in (study, whole))
+    run.mkdir()
+    lines = (source / "timing.csv").read_text().splitlines(keepends=True)
+    (run / "timing.csv").write_text("".join(lines[: 1 + ITERATIONS // 4]))
+    rows = RunFolder(source).read_rows("evaluation.json")
+    seen, of = [], 1 / len(rows)
+
+    def work(cell):
+        """Train the first cell to its end, then evaluate it under some of its goals."""
+        for name, text in (("timing.csv", "".join(lines)), ("evaluation.json", json.dumps(rows[:1]))):
+            (run / name).write_text(text)
+            before = len(seen)
+            wait_until(lambda before=before: len(seen) > before + 1)
+        wait_until(lambda: engine.stopped)
+
+    engine = Answers()
+    engine.run = work
+    takes = {first.name: (40.0, 60.0), second.name: (100.0, 100.0)}
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.02)
+    runner.Runner(study, engine, 1, takes).run(seen.append, lambda: seen[-1].running.get(first.name) == (1.0, of))
+    trained = next(each for each in seen if each.running.get(first.name) == (1.0, 0.0))
+    assert trained.share == pytest.approx(0.5 * 0.4)
+    assert trained.seconds_left == pytest.approx(10.0 * (60.0 + 200.0) / (0.75 * 40.0))
+    evaluated = next(each for each in seen if each.running.get(first.name) == (1.0, of))
+    assert evaluated.share == pytest.approx(0.5 * (0.4 + 0.6 * of))
+    assert evaluated.seconds_left == pytest.approx(10.0 * (60.0 * (1 - of) + 200.0) / (0.75 * 40.0 + 60.0 * of))
 
 
 def test_failure_is_told_by_its_last_line(tmp_path):
@@ -308,7 +344,7 @@ def test_worker_without_results_has_failed(whole, tmp_path, monkeypatch):
 
     popen = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", idle)
-    end = Runner(study, LocalProcesses(study), 1).run(lambda progress: None, lambda: False)
+    end = runner.Runner(study, LocalProcesses(study), 1).run(lambda progress: None, lambda: False)
     assert len(begun) == 2
     assert list(end.failed.values()) == ["it ended without results"]
 

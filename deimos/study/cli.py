@@ -3,7 +3,7 @@
 import math
 import sys
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -57,9 +57,10 @@ class _WorkOptions(_FolderOptions):
             raise ValueError("gpus are given to cells by a Ray cluster; add --engine ray.")
 
     def _work(
-        self, study: StudyFolder, stopped: Callable[[], bool], report: Callable[[str, float], None]
+        self, study: StudyFolder, stopped: Callable[[], bool], report: Callable[[str, float], None],
+        seconds: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:  # fmt: skip
-        """Work on a study until it is finished; see ``RunOptions.run``."""
+        """Work on a study until it is finished; see ``RunOptions.run``, and ``Runner`` for what cells take."""
         engine: Engine = LocalProcesses(study)
         workers = self.workers or 1
         if self.engine == "ray":
@@ -67,7 +68,8 @@ class _WorkOptions(_FolderOptions):
 
             engine = cluster = OnRay(study, self.gpus)
             workers = self.workers or cluster.room(study.cells())
-        end = Runner(study, engine, workers).run(lambda progress: report(_summary(progress), _share(progress)), stopped)
+        runner = Runner(study, engine, workers, seconds or {})
+        end = runner.run(lambda progress: report(_summary(progress), progress.share), stopped)
         if end.finished + len(end.failed) < end.total:
             print(f"Stopped with {end.finished} of {end.total} cells finished; continue with: "
                   f"deimos study run {study.path}", file=sys.stderr)  # fmt: skip
@@ -142,11 +144,13 @@ class RunOptions(_WorkOptions):
         _say_strays(study)
         if self.retry_failed:
             study.forget_failures()
-        open_ = _open(study)
-        if open_:
-            print(estimate(study, open_), file=sys.stderr, flush=True)
+        seconds = None
+        if open_ := _open(study):
+            takes = estimate(study, open_)
+            print(takes.text, file=sys.stderr, flush=True)
+            seconds = takes.seconds
         if not self.estimate:
-            self._work(study, stopped, report)
+            self._work(study, stopped, report, seconds)
 
     def _add(self, study: StudyFolder, description: dict) -> None:
         """Add what a file describes to a study, after all that can be wrong with it was checked."""
@@ -425,16 +429,12 @@ progress."""
 LONG = (RunOptions, CellOptions, AttackOptions)
 
 
-def _share(progress: Progress) -> float:
-    done = progress.finished + len(progress.failed) + sum(min(share, 1.0) for share in progress.running.values())
-    return min(1.0, done / progress.total)
-
-
 def _summary(progress: Progress) -> str:
     parts = [f"{progress.finished} of {progress.total} cells finished"]
     if progress.failed:
         parts.append(f"{len(progress.failed)} failed")
-    parts += [f"{name} {share:.0%}" if share < 1 else f"{name} evaluating" for name, share in progress.running.items()]
+    for name, (trained, evaluated) in progress.running.items():
+        parts.append(f"{name} {trained:.0%}" if trained < 1 else f"{name} evaluating {evaluated:.0%}")
     if progress.seconds_left:
         parts.append(f"{timedelta(seconds=int(progress.seconds_left))} left")
     return ", ".join(parts)

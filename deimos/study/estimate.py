@@ -36,8 +36,18 @@ class Speed:
     """World-steps per second of a policy that only acts."""
 
 
-def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
-    """A line on what the cells of a study that are not finished take; it measures kinds of cells for some seconds each.
+@dataclass(frozen=True)
+class Estimate:
+    """What the cells of a study take."""
+
+    text: str
+    """A line on all of them."""
+    seconds: dict[str, tuple[float, float]]
+    """Of every cell, by its name: seconds of a core for its training, and for all else."""
+
+
+def estimate(study: StudyFolder, cells: Iterable[Cell]) -> Estimate:
+    """What the cells of a study that are not finished take; it measures kinds of cells for some seconds each.
 
     Of more than ``MOST_KINDS``, as a design over many settings has, a random sample is measured. Training is as fast as
     the finished cells of a kind were where there are any, and acting as measured.
@@ -52,8 +62,8 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
     sample = random.Random(0).sample([*kinds], min(MOST_KINDS, len(kinds)))
     measures = {name: _measure(kinds[name][0]) for name in sample}
     mean = Speed(*(harmonic_mean([getattr(x, rate) for x in measures.values()]) for rate in ("training", "acting")))
-    trained = acted = hours = 0.0
-    measured = False
+    trained = acted = 0.0
+    measured, seconds = False, {}
     for name, own in kinds.items():
         speed = measures.get(name, mean)
         for cell in own:
@@ -61,12 +71,15 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> str:
             measured |= not known
             transitions, steps = cost(study, cell)
             trained, acted = trained + transitions, acted + steps
-            hours += (transitions / (median(known) if known else speed.training) + steps / speed.acting) / 3600
+            rate = median(known) if known else speed.training
+            seconds[cell.name] = transitions / rate, steps / speed.acting
     each = "each kind" if len(sample) == len(kinds) else f"{len(sample)} of {len(kinds)} kinds"
     source = f"measured on a short run of {each}" if measured else "of the finished cells"
-    return (
+    hours = sum(map(sum, seconds.values())) / 3600
+    return Estimate(
         f"{len(cells)} run(s): {trained / 1e6:,.1f} M transitions (FPS {source}) + {acted / 1e6:,.1f} M world-steps of "
-        f"attacks, evaluations and audits = {hours:.2f} core-hours."
+        f"attacks, evaluations and audits = {hours:.2f} core-hours.",
+        seconds,
     )
 
 

@@ -2,10 +2,13 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 
+from deimos.checks import RunError
+from deimos.run.evaluation import read_evaluation
+from deimos.run.folder import RunFolder
 from deimos.study.engine import Engine
 from deimos.study.folder import StudyFolder
 from deimos.study.plan import Cell
@@ -25,8 +28,10 @@ class Progress:
     """Cells that have results."""
     failed: dict[str, str]
     """Cells that are given up, with how the last attempt ended."""
-    running: dict[str, float]
-    """Cells that are being worked on, with the share of their training that is done."""
+    running: dict[str, tuple[float, float]]
+    """Cells that are being worked on, with the shares of training and of evaluation that are done."""
+    share: float
+    """Of the study that is done, in [0, 1]; cells count alike."""
     seconds_left: float | None
     """Estimate from what was done so far [s]; ``None`` before anything was."""
 
@@ -44,7 +49,10 @@ class Runner:
     """What works on its cells."""
     workers: int
     """Cells at a time, at least 1."""
-    _begun: dict[str, int] = field(default_factory=dict)  # cells begun here, with iterations that were done before
+    seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """What training and all else of a cell are expected to take; one that is not there takes as long for both."""
+    _before: dict[str, tuple[float, float]] = field(default_factory=dict)  # shares of open cells that were done before
+    _begun: set[str] = field(default_factory=set)  # cells begun here
     _active: set[str] = field(default_factory=set)
     _finished: set[str] = field(default_factory=set)  # digests
     _failed: dict[str, str] = field(default_factory=dict)
@@ -64,6 +72,7 @@ class Runner:
         with self.study.hold(), ThreadPoolExecutor(self.workers) as pool:
             cells = self.study.cells()
             self._finished = self.study.finished(cells)
+            self._before = {cell.name: self._shares(cell) for cell in cells if cell.digest not in self._finished}
             begin = time.monotonic()
             jobs = [pool.submit(self._work, cell) for cell in cells if cell.digest not in self._finished]
             try:
@@ -86,7 +95,7 @@ class Runner:
         """Have a cell worked on until it is finished or given up."""
         errors = self.study.failures(cell)
         while not self._stopping and len(errors) < ATTEMPTS:
-            self._begun.setdefault(cell.name, self._iterations(cell))
+            self._begun.add(cell.name)
             self._active.add(cell.name)
             error = self.engine.run(cell)
             self._active.discard(cell.name)
@@ -100,27 +109,40 @@ class Runner:
         if len(errors) >= ATTEMPTS:
             self._failed[cell.name] = errors[-1]
 
-    def _iterations(self, cell: Cell) -> int:
-        """How many iterations of a cell's training are done, by the end of its ``timing.csv``."""
+    def _shares(self, cell: Cell) -> tuple[float, float]:
+        """What is done of a cell's training, by the end of its ``timing.csv``, and of its rows of evaluations."""
+        run = self.study.cell_path(cell) / "run"
+        rows = len(cell.goal_periods) * len({"naive", *cell.config.eval.attackers, *self.study.added(cell)})
         try:
-            with (self.study.cell_path(cell) / "run" / "timing.csv").open("rb") as file:
+            with (run / "timing.csv").open("rb") as file:
                 file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
-                return int(file.read().decode().split("\n")[-2].split(",")[0])  # of the last whole line
+                trained = int(file.read().decode().split("\n")[-2].split(",")[0])  # of the last whole line
         except (OSError, IndexError, ValueError):
-            return 0  # none is whole yet
+            trained = 0  # none is whole yet
+        try:
+            evaluated = len(read_evaluation(RunFolder(run)))
+        except RunError:
+            evaluated = 0  # whoever works on it says what is wrong
+        return min(1.0, trained / cell.config.iterations), min(1.0, evaluated / rows)
 
     def _progress(self, cells: list[Cell], seconds: float) -> Progress:
-        running: dict[str, float] = {}
-        done = left = 0  # transitions
+        running: dict[str, tuple[float, float]] = {}
+        done = left = 0.0  # expected seconds
+        counted = 0.0  # cells
         for cell in cells:
-            iterations = self._iterations(cell) if cell.name in self._begun else 0
-            size = cell.config.ppo.num_steps * cell.config.num_envs
-            done += size * max(0, iterations - self._begun.get(cell.name, iterations))
-            if cell.digest not in self._finished and cell.name not in self._failed:
-                left += size * (cell.config.iterations - iterations)
+            takes = self.seconds.get(cell.name, (1.0, 1.0))
+            now = before = self._before.get(cell.name, (1.0, 1.0))
+            if cell.digest in self._finished or cell.name in self._failed:
+                now = 1.0, 1.0
+            elif cell.name in self._begun:
+                now = self._shares(cell)
+            if cell.name not in self._failed:
+                done += sum(max(0.0, x - x0) * of for x, x0, of in zip(now, before, takes, strict=True))
+            left += sum((1.0 - x) * of for x, of in zip(now, takes, strict=True))
+            counted += sum(x * of for x, of in zip(now, takes, strict=True)) / sum(takes)
             if cell.name in self._active:
-                running[cell.name] = iterations / cell.config.iterations
+                running[cell.name] = now
         return Progress(
             total=len(cells), finished=len(self._finished), failed=dict(self._failed), running=running,
-            seconds_left=left * seconds / done if done else None,
+            share=counted / len(cells), seconds_left=left * seconds / done if done else None,
         )  # fmt: skip
