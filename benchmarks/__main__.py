@@ -107,8 +107,9 @@ def run(options: BenchOptions) -> dict[str, Any]:
         viewer.show(results["viewer"])
         return _write(results, options.json)
     if options.what == "builds":
-        results["memory"] = stability.measure_builds()
+        results["memory"], results["seconds"] = stability.measure_builds()
         print("MiB after each build:", *map(round, results["memory"]))
+        print("CPU time of each [s]:", *(f"{value:.2f}" for value in results["seconds"]))
         return _write(results, options.json)
     if options.what == "learner":
         results["learner"] = learner.measure(options.rounds)

@@ -158,12 +158,15 @@ def test_stability_is_measured(capsys, monkeypatch):
 
 
 def test_memory_after_builds_is_measured(monkeypatch, capsys):
-    """The process's memory is read after every environment on rough ground that was made and dropped."""
+    """Memory and CPU time are read after every environment on rough ground that was made and dropped."""
     monkeypatch.setattr(stability, "measure_builds", partial(stability.measure_builds, 2))
-    found = benchmarks.run(benchmarks.BenchOptions(what="builds", device="cpu", threads=1))["memory"]
-    assert len(found) == 2
+    result = benchmarks.run(benchmarks.BenchOptions(what="builds", device="cpu", threads=1))
+    found, seconds = result["memory"], result["seconds"]
+    assert len(found) == len(seconds) == 2
     assert min(found) > 100
-    assert "MiB after each build: " + " ".join(f"{value:.0f}" for value in found) in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "MiB after each build: " + " ".join(f"{value:.0f}" for value in found) in said
+    assert "CPU time of each [s]: " + " ".join(f"{value:.2f}" for value in seconds) in said
 
 
 def test_quad_is_measured(capsys):

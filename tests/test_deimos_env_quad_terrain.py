@@ -214,6 +214,15 @@ def test_a_run_keeps_its_terrain(tmp_path, monkeypatch, hills):
     assert naive["steps"] == 20
 
 
+def test_rough_ground_is_made_once():
+    """Every environment on rough ground has the same terrain, which nobody can change."""
+    ground = Config(terrain="rough").load_terrain()
+    assert Config(terrain="rough", goal_period=7).load_terrain() is ground
+    for array in (ground.heights, ground.origins):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
 def test_unknown_and_broken_terrains_are_refused(tmp_path):
     """A terrain that is neither a name nor a file, and a file that is not one, each give one clear line."""
     with pytest.raises(ValueError, match=r"terrain must be flat, rough or the path of a terrain file, got 'moon'"):

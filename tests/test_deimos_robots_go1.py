@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from deimos.terrain import Grid, Share, build
+from deimos.terrain import Grid, Share, build, flat
 from deimos.terrain.shapes.stairs import Shape as Stairs
 
 from deimos import plugins
 from deimos.sim.legged import engines, robots
 from deimos.sim.legged.engines import PhysicsConfig
+from deimos.sim.legged.engines.model import build_spec
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, go1
 
 
@@ -211,6 +212,18 @@ def test_collision_geoms_are_spheres_and_capsules(robot, model):
     assert sorted(model.geom(i).name for i in hard) == sorted(name for part in robot.parts for name in part)
     assert len(hard) == 19
     assert len(robot.parts) == 13
+
+
+def test_what_is_simulated_has_no_visual_geoms(robot, model):
+    """The model to simulate is the one to look at without its visual geoms: the same bodies, masses and contacts."""
+    ground = flat()
+    seen, hard = (build_spec(robot, ground, PhysicsConfig(), visual=visual).compile() for visual in (True, False))
+    assert seen.ngeom == model.ngeom + 1
+    assert [hard.geom(i).name for i in range(hard.ngeom)] == [
+        seen.geom(i).name for i in range(seen.ngeom) if seen.geom_group[i] != VISUAL_GROUP
+    ]
+    for name in ("body_mass", "body_inertia", "body_ipos", "jnt_range", "hfield_data", "actuator_gainprm"):
+        assert np.array_equal(getattr(seen, name), getattr(hard, name))
 
 
 def test_no_geom_covers_too_many_prisms(robot, device):

@@ -49,7 +49,7 @@ def write_model(env: Locomotion, folder: Path) -> None:
     """
     import mujoco
 
-    spec = build_spec(env.robot, None if env.config.terrain == "flat" else env.terrain, env.config.physics)
+    spec = build_spec(env.robot, env.physics.terrain, env.config.physics, visual=True)
     wanted = spec.compile()
     for field in spec.hfields:  # in the XML itself it would be some fifty megabytes
         data = np.asarray(field.userdata, np.float32)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -147,7 +148,7 @@ class LocomotionConfig(EnvConfig):
         if self.terrain == "flat":
             return None
         if self.terrain == "rough":
-            return terrain.rough()
+            return _rough()
         path = self.files["terrain"]
         if path.suffix.lower() in importing.OPTIONS.keys() - {".npz"}:
             advice = f"deimos terrain import {path} --out {path.with_suffix('.npz')}"
@@ -157,6 +158,15 @@ class LocomotionConfig(EnvConfig):
         if not path.is_file():
             raise ValueError(f"terrain must be flat, rough or the path of a terrain file, got '{self.terrain}'.")
         return terrain.load(path)
+
+
+@lru_cache(maxsize=1)
+def _rough() -> Terrain:
+    """The terrain ``rough``: the same in every environment, and two seconds of work. Its arrays are read-only."""
+    ground = terrain.rough()
+    for array in (ground.heights, ground.origins):
+        array.flags.writeable = False
+    return ground
 
 
 def check_weights(name: str, weights: Any) -> None:

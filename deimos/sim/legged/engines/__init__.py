@@ -9,6 +9,7 @@ import abc
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -67,11 +68,11 @@ class PhysicsConfig:
 class Physics(abc.ABC):
     """``num_envs`` worlds, each with a robot of its own on the same terrain, at the model's defaults."""
 
+    robot: Robot
+    terrain: Terrain | None
     config: PhysicsConfig
     num_envs: int
     device: torch.device
-    model: "mujoco.MjModel"
-    """The model with its visual geoms, for rendering and viewers."""
     arrays: Simulation
     """What the simulator has for the kernels; torques are those of the last substep."""
     parts: tuple[slice, ...]
@@ -82,6 +83,13 @@ class Physics(abc.ABC):
     """Whether a CUDA graph of more than these may take in steps and resets; see ``Env.recordable``."""
     tensors: dict[str, torch.Tensor]
     """Everything that a bit-exact resume needs, by name; views, worlds along the first axis."""
+
+    @cached_property
+    def model(self) -> "mujoco.MjModel":
+        """The model with its visual geoms, for rendering and viewers; made when it is asked for."""
+        from deimos.sim.legged.engines.model import build_spec
+
+        return build_spec(self.robot, self.terrain, self.config, visual=True).compile()
 
     @abc.abstractmethod
     def step(self) -> None:

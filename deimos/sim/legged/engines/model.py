@@ -13,38 +13,38 @@ if TYPE_CHECKING:
 FINEST_CELL = 0.05  # [m] of a height field on which no geom of a robot covers more than the 50 prisms that are tested
 
 
-def build_model(robot: Robot, terrain: Terrain | None, config: PhysicsConfig) -> "tuple[mujoco.MjModel, mujoco.MjSpec]":
-    """The model with its visual geoms, to look at, and the specification of the one without, to simulate.
+def build_spec(
+    robot: Robot, terrain: Terrain | None, config: PhysicsConfig, *, visual: bool
+) -> "mujoco.MjSpec":  # fmt: skip
+    """The specification of the model, with its visual geoms, to look at, or without, to simulate.
 
     Raises:
         ValueError: If the terrain's cells are finer than ``FINEST_CELL``.
     """
-    spec = build_spec(robot, terrain, config)
-    model = spec.compile()
-    plain = spec.copy()
-    for geom in [geom for geom in plain.geoms if geom.group == VISUAL_GROUP]:
-        plain.delete(geom)
-    return model, plain
-
-
-def build_spec(robot: Robot, terrain: Terrain | None, config: PhysicsConfig) -> "mujoco.MjSpec":
-    """The specification of the model with its visual geoms; raises ``ValueError`` as ``build_model`` does."""
     if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
         raise ValueError(
             f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
             f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}, or import it with "
             f"--resolution {FINEST_CELL}."
         )
-    spec = _with_ground(robot.spec, terrain)
+    spec = robot.spec.copy()
+    for geom in [geom for geom in spec.geoms if geom.group == VISUAL_GROUP and not visual]:
+        spec.delete(geom)  # before there is a height field: with one, each takes 50 ms
+    _add_ground(spec, terrain)
     _set_options(spec, config)
     return spec
 
 
-def _with_ground(robot: "mujoco.MjSpec", terrain: Terrain | None) -> "mujoco.MjSpec":
-    """A copy of the robot's model on a ground without friction of its own: the feet's counts."""
+def _add_ground(spec: "mujoco.MjSpec", terrain: Terrain | None) -> None:
+    """Add a ground without friction of its own: the feet's counts."""
     import mujoco
 
-    spec = robot.copy()
+    if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
+        raise ValueError(
+            f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
+            f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}, or import it with "
+            f"--resolution {FINEST_CELL}."
+        )
     if terrain is None:
         ground = spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 0.05))
     else:
@@ -52,7 +52,6 @@ def _with_ground(robot: "mujoco.MjSpec", terrain: Terrain | None) -> "mujoco.MjS
     ground.contype, ground.conaffinity, ground.condim = TERRAIN_BIT, ROBOT_BIT, 1
     ground.solref = CONTACT_STIFFNESS
     _dress(spec, ground)
-    return spec
 
 
 def _dress(spec: "mujoco.MjSpec", ground: "mujoco.MjsGeom") -> None:

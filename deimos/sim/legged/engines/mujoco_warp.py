@@ -12,7 +12,7 @@ from deimos.kernels.legged.contacts import CONTACTS, TERRAIN, UNWATCHED, Contact
 from deimos.kernels.legged.state import Simulation
 from deimos.sim.legged.engines import Physics, PhysicsConfig
 from deimos.sim.legged.engines.captured import Captured
-from deimos.sim.legged.engines.model import build_model
+from deimos.sim.legged.engines.model import build_spec
 from deimos.sim.legged.robots import Robot
 from deimos.sim.shared import Shared, warp_device
 from deimos.terrain import Terrain
@@ -32,10 +32,10 @@ class Engine(Physics):
     ) -> None:  # fmt: skip
         import mujoco_warp as mjw
 
-        self.config, self.num_envs, self.device = config, num_envs, device
+        self.robot, self.terrain, self.config = robot, terrain, config
+        self.num_envs, self.device = num_envs, device
         self.parts = (slice(0, num_envs),)
-        self.model, spec = build_model(robot, terrain, config)
-        model = spec.compile()
+        model = build_spec(robot, terrain, config, visual=False).compile()
         self.max_contacts, self.max_rows = _buffer_sizes(model, num_envs, config, plane=terrain is None)
         batched: dict[str, int] = {}
         if friction is not None:

@@ -18,7 +18,7 @@ from deimos.kernels.legged.state import SIMULATION
 from deimos.nn.threads import POOL, available
 from deimos.sim.legged.engines import Physics, PhysicsConfig
 from deimos.sim.legged.engines.captured import Captured
-from deimos.sim.legged.engines.model import build_model
+from deimos.sim.legged.engines.model import build_spec
 from deimos.sim.legged.robots import Robot
 from deimos.terrain import Terrain
 
@@ -56,9 +56,10 @@ class Engine(Physics):
         # the working directory. Whoever has a handler keeps it.
         if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(lambda message: None)
-        self.config, self.num_envs, self.device = config, num_envs, device
+        self.robot, self.terrain, self.config = robot, terrain, config
+        self.num_envs, self.device = num_envs, device
         self.parts = _divide(num_envs, available())
-        self.model, spec = build_model(robot, terrain, config)
+        spec = build_spec(robot, terrain, config, visual=False)
         part = _watch_contacts(spec, robot, plane=terrain is None)
         model = spec.compile()
         _set_options(model)
