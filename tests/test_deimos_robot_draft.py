@@ -139,6 +139,48 @@ def test_a_draft_says_what_the_model_says(tmp_path):
     assert any("the MJCF has others for other legs; write what suits all four" in note for note in notes)
 
 
+SERVO = '<{} joint="{}" gear="2" {}/>'
+SHARED = {
+    "alone": ('kp="10" kv="0.5"', None, (40.0, 2.0)),
+    "with a velocity actuator": ('kp="10"', 'kv="0.3" ctrlrange="-1 1"', (40.0, 1.2)),
+    "a velocity actuator alone": (None, 'kv="0.3" ctrlrange="-20 20"', None),
+}
+
+
+@pytest.mark.parametrize("case", SHARED)
+def test_gains_of_two_actuators_add_up(tmp_path, case):
+    """A joint's servo may be a position actuator and one of velocity, whose bound of speed limits no torque."""
+    position, velocity, gains = SHARED[case]
+    path = write_scout(tmp_path)
+
+    def servos(motor):
+        kinds = (("position", position), ("velocity", velocity))
+        return "".join(SERVO.format(kind, motor[1], numbers) for kind, numbers in kinds if numbers)
+
+    path.write_text(re.sub(r'<motor joint="(\w+)"/>', servos, path.read_text()))
+    robot, notes = robot_draft.draft(path)
+    guessed = {note.split()[0] for note in notes if "is a guess" in note}
+    assert guessed == {"pose", "max_torque", *(() if gains else ("stiffness", "damping"))}
+    if gains:
+        assert robot.stiffness == pytest.approx([gains[0]] * 3)
+        assert robot.damping == pytest.approx([gains[1]] * 3)
+
+
+def test_pieces_of_a_geom_have_names_of_their_own(tmp_path):
+    """Where another geom is called as a piece would be, both are there, and both are watched."""
+    path = write_scout(tmp_path)
+    ball = '<geom name="shell_0" size="0.03" pos="0.2 0 0" mass="0"/><geom name="shell"'
+    path.write_text(path.read_text().replace('<geom name="shell"', ball))
+    robot = robot_draft.draft(path)[0].build(tmp_path)
+    compiled = robot.spec.compile()
+    base = robot.parts[0]
+    assert len(set(base)) == len(base)
+    assert compiled.geom("shell_0").type == mujoco.mjtGeom.mjGEOM_SPHERE
+    on_base = [i for i in range(compiled.ngeom) if compiled.geom_bodyid[i] == 1 and compiled.geom_contype[i]]
+    assert {compiled.geom(i).name for i in on_base} <= set(base)
+    assert len(on_base) > 2
+
+
 def test_what_has_no_name_is_named_after_its_joint(tmp_path):
     """The draft of a model whose bodies and geoms have no names reads as the one with names, and builds."""
     path = write_scout(tmp_path)
@@ -217,6 +259,14 @@ def test_a_model_without_what_a_robot_needs_is_refused(tmp_path, old, new, messa
     with pytest.raises(ValueError, match=message) as error:
         robot_draft.draft(path)
     assert "\n" not in str(error.value)
+
+
+def test_the_base_is_not_held(tmp_path):
+    """A robot whose own free joint is to be held is told so in a line."""
+    path = write_scout(tmp_path)
+    path.write_text(path.read_text().replace("<freejoint/>", '<freejoint name="root"/>'))
+    with pytest.raises(ValueError, match="held must name joints of a head, tail or arm, but 'root' is what the base"):
+        robot_draft.draft(path, ("root",))
 
 
 def test_looks_that_weigh_are_named(tmp_path):

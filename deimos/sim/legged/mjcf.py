@@ -86,6 +86,8 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
     for name in held:
         if spec.joint(name) is None:
             raise ValueError(f"held must name joints of {path}, which has no '{name}'.")
+        if spec.joint(name).type == mujoco.mjtJoint.mjJNT_FREE:
+            raise ValueError(f"held must name joints of a head, tail or arm, but '{name}' is what the base floats by.")
         spec.delete(spec.joint(name))
     for things in (spec.keys, spec.sensors, spec.actuators, spec.excludes, spec.pairs):
         for thing in list(things):
@@ -145,14 +147,15 @@ def copy(source: Source, legs: Sequence[Sequence[int]]) -> "tuple[mujoco.MjSpec,
     spec.modelname = model.body(source.base).name
     trunk = _add_body(spec.worldbody, model, source.base)
     trunk.add_freejoint(name="base")
-    pieces = {trunk.name: _add_geoms(spec, trunk, model, source.base)}
+    names = {model.geom(i).name for i in range(model.ngeom)}
+    pieces = {trunk.name: _add_geoms(spec, trunk, model, source.base, names)}
     for leg in legs:
         parent = trunk
         for index in dict.fromkeys(model.jnt_bodyid[list(leg)].tolist()):
             parent = _add_body(parent, model, index)
             for joint in range(model.body_jntadr[index], model.body_jntadr[index] + model.body_jntnum[index]):
                 _add_joint(parent, model, joint)
-            pieces[parent.name] = _add_geoms(spec, parent, model, index)
+            pieces[parent.name] = _add_geoms(spec, parent, model, index, names)
     return spec, pieces
 
 
@@ -206,20 +209,24 @@ def _servos(model: "mujoco.MjModel") -> dict[str, Servo]:
     servos = {}
     for joint in range(model.njnt):
         limits = [model.jnt_actfrcrange[joint].max()] if model.jnt_actfrclimited[joint] else []
-        stiffness = damping = 0.0
+        stiffness = damping = 0.0  # a position and a velocity actuator may share the work
         for i in range(model.nu):
             if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[i, 0] != joint:
                 continue
-            gain, bias, gear = model.actuator_gainprm[i, 0], model.actuator_biasprm[i], abs(model.actuator_gear[i, 0])
+            gain, gear = model.actuator_gainprm[i, 0], abs(model.actuator_gear[i, 0])
+            is_affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+            by_angle, by_speed = model.actuator_biasprm[i, 1:3] * is_affine
             if model.actuator_forcelimited[i]:
                 limits.append(gear * model.actuator_forcerange[i].max())
-            if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and bias[1] == -gain:
-                stiffness, damping = gear**2 * gain, -(gear**2) * bias[2]
-            elif bias[1] == 0 and model.actuator_ctrllimited[i]:  # a motor
+            if by_angle or by_speed:
+                stiffness -= gear**2 * by_angle
+                damping -= gear**2 * by_speed
+            elif model.actuator_ctrllimited[i]:  # a motor
                 limits.append(gear * gain * model.actuator_ctrlrange[i].max())
         servos[model.joint(joint).name] = Servo(
-            stiffness=float(stiffness), damping=float(damping), max_torque=float(min(limits, default=0.0))
-        )
+            stiffness=float(stiffness), damping=float(damping if stiffness else 0.0),
+            max_torque=float(min(limits, default=0.0)),
+        )  # fmt: skip
     return servos
 
 
@@ -296,9 +303,12 @@ def _add_joint(body: "mujoco.MjsBody", model: "mujoco.MjModel", joint: int) -> N
 
 
 def _add_geoms(
-    spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjModel", index: int
+    spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjModel", index: int, taken: set[str]
 ) -> list[tuple[str, str]]:
-    """Add what a body looks like and what of it collides; a body that has no looks looks like what collides."""
+    """Add what a body looks like and what of it collides; a body that has no looks looks like what collides.
+
+    ``taken`` are names that no piece may get; those of the pieces join them.
+    """
     geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == index]
     hard = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
     for geom in [i for i in geoms if i not in hard] or hard:
@@ -309,6 +319,9 @@ def _add_geoms(
         for i, (start, end, radius) in enumerate(pieces):
             name = model.geom(geom).name
             piece = name if len(pieces) == 1 else f"{name}_{i}"
+            while len(pieces) > 1 and piece in taken:
+                piece += "_"
+            taken.add(piece)
             add_collision(body, piece, radius, start, end, contype=ROBOT_BIT, conaffinity=TERRAIN_BIT)
             added.append((name, piece))
     return added
