@@ -5,7 +5,7 @@ from the compiled numbers: the base, its legs in the order of ``Robot``, and sph
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,6 +33,10 @@ class Servo:
     """[N m s/rad]."""
     max_torque: float = 0.0
     """[N m]."""
+    armature: float = field(default=0.0, compare=False)
+    """What it adds to the joint's own [kg m^2]."""
+    drag: tuple[float, ...] = field(default=(0.0, 0.0, 0.0), compare=False)
+    """What it adds to the joint's own damping, which no largest torque cuts: MuJoCo's polynomial."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +158,7 @@ def copy(source: Source, legs: Sequence[Sequence[int]]) -> "tuple[mujoco.MjSpec,
         for index in dict.fromkeys(model.jnt_bodyid[list(leg)].tolist()):
             parent = _add_body(parent, model, index)
             for joint in range(model.body_jntadr[index], model.body_jntadr[index] + model.body_jntnum[index]):
-                _add_joint(parent, model, joint)
+                _add_joint(parent, model, joint, source.servos[source.name(joint)])
             pieces[parent.name] = _add_geoms(spec, parent, model, index, names)
     return spec, pieces
 
@@ -209,11 +213,14 @@ def _servos(model: "mujoco.MjModel") -> dict[str, Servo]:
     servos = {}
     for joint in range(model.njnt):
         limits = [model.jnt_actfrcrange[joint].max()] if model.jnt_actfrclimited[joint] else []
-        stiffness = damping = 0.0  # a position and a velocity actuator may share the work
+        stiffness = damping = armature = 0.0  # a position and a velocity actuator may share the work
+        drag = np.zeros(3)
         for i in range(model.nu):
             if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[i, 0] != joint:
                 continue
             gain, gear = model.actuator_gainprm[i, 0], abs(model.actuator_gear[i, 0])
+            armature += gear**2 * model.actuator_armature[i]
+            drag += gear**2 * np.array([model.actuator_damping[i], *model.actuator_dampingpoly[i]])
             is_affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
             by_angle, by_speed = model.actuator_biasprm[i, 1:3] * is_affine
             if model.actuator_forcelimited[i]:
@@ -225,7 +232,7 @@ def _servos(model: "mujoco.MjModel") -> dict[str, Servo]:
                 limits.append(gear * gain * model.actuator_ctrlrange[i].max())
         servos[model.joint(joint).name] = Servo(
             stiffness=float(stiffness), damping=float(damping if stiffness else 0.0),
-            max_torque=float(min(limits, default=0.0)),
+            max_torque=float(min(limits, default=0.0)), armature=float(armature), drag=tuple(drag.tolist()),
         )  # fmt: skip
     return servos
 
@@ -292,13 +299,14 @@ def _add_body(parent: "mujoco.MjsBody", model: "mujoco.MjModel", index: int) -> 
     return body
 
 
-def _add_joint(body: "mujoco.MjsBody", model: "mujoco.MjModel", joint: int) -> None:
+def _add_joint(body: "mujoco.MjsBody", model: "mujoco.MjModel", joint: int, servo: Servo) -> None:
     dof, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
+    damping = np.array([model.dof_damping[dof], *model.dof_dampingpoly[dof]])
     body.add_joint(
         name=model.joint(joint).name, axis=model.jnt_axis[joint], pos=model.jnt_pos[joint],
-        range=model.jnt_range[joint], limited=True, ref=model.qpos0[place], armature=model.dof_armature[dof],
-        damping=(model.dof_damping[dof], 0.0, 0.0), frictionloss=model.dof_frictionloss[dof],
-        stiffness=(model.jnt_stiffness[joint], 0.0, 0.0), springref=model.qpos_spring[place],
+        range=model.jnt_range[joint], limited=True, ref=model.qpos0[place], frictionloss=model.dof_frictionloss[dof],
+        armature=model.dof_armature[dof] + servo.armature, damping=damping + servo.drag,
+        stiffness=(model.jnt_stiffness[joint], *model.jnt_stiffnesspoly[joint]), springref=model.qpos_spring[place],
     )  # fmt: skip
 
 
