@@ -244,6 +244,8 @@ def test_unknown_and_broken_terrains_are_refused(tmp_path):
         Config(terrain="moon").load_terrain()
     with pytest.raises(ValueError, match=r"got 'h.stl'; make one of it by: deimos terrain import h.stl --out h.npz"):
         Config(terrain="h.stl").load_terrain()
+    with pytest.raises(ValueError, match=r"make one of it by: deimos terrain grid --file my.toml --out my.npz"):
+        Config(terrain="my.toml").load_terrain()
     (tmp_path / "x.npz").write_bytes(b"no terrain")
     with pytest.raises(ValueError, match="is not a terrain file"):
         Config(terrain=str(tmp_path / "x.npz")).load_terrain()

@@ -1,6 +1,7 @@
 """A robot from an MJCF that is not ours: what is read, what is built of it, and which models are refused."""
 
 import re
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -207,6 +208,34 @@ def test_a_guessed_pose_stands_over_its_feet(tmp_path, knee):
     assert 0.6 < drop < 0.85
 
 
+CORNERS = {"rr": (-0.2, -0.1), "rl": (-0.2, 0.1), "fr": (0.2, -0.1), "fl": (0.2, 0.1)}
+
+
+def link(name, origin, mass):
+    """A link of a URDF, with a ball that collides."""
+    place = f'<origin xyz="{origin}"/>' if origin else ""
+    inertia = '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+    ball = f'<collision>{place}<geometry><sphere radius="0.03"/></geometry></collision>'
+    return f'<link name="{name}"><inertial><mass value="{mass}"/>{inertia}</inertial>{ball}</link>'
+
+
+def urdf_leg(leg):
+    """Three links and three joints of a URDF."""
+    (x, y), parent, parts = CORNERS[leg], "base", []
+    limits = {"1": (-0.7, 0.7), "2": (-1.2, 2.4), "3": (-2.5, -0.4)}
+    for part, (axis, xyz) in zip(
+        "123", (("1 0 0", f"{x} {y} 0"), ("0 1 0", "0 0 0"), ("0 1 0", "0 0 -0.14")), strict=True
+    ):
+        low, high = limits[part]
+        parts.append(link(leg + part, "0 0 -0.14", 0.3))
+        parts.append(
+            f'<joint name="{leg}{part}" type="revolute"><parent link="{parent}"/><child link="{leg}{part}"/><origin '
+            f'xyz="{xyz}"/><axis xyz="{axis}"/><limit lower="{low}" upper="{high}" effort="9" velocity="9"/></joint>'
+        )
+        parent = leg + part
+    return "".join(parts)
+
+
 LEG = '<body><joint name="j{0}" axis="0 1 0" range="-1 1"/><geom size=".1"/></body>'
 SIX = "".join(
     f'<body pos="{x} {y} 0"><joint name="a{x}{y}" range="-1 1"/><geom size=".1"/><body><joint name="b{x}{y}" '
@@ -259,6 +288,22 @@ def test_a_model_without_what_a_robot_needs_is_refused(tmp_path, old, new, messa
     with pytest.raises(ValueError, match=message) as error:
         robot_draft.draft(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_urdf_is_refused_with_what_converts_it(tmp_path, monkeypatch, capsys):
+    """What the message says makes an MJCF of a URDF, with a base that floats and all of its weight."""
+    monkeypatch.chdir(tmp_path)
+    Path("robot.urdf").write_text(f"<robot name='r'>{link('base', None, 4.0)}{''.join(map(urdf_leg, CORNERS))}</robot>")
+    with pytest.raises(
+        ValueError, match=r"mjcf must be an MJCF file, got robot\.urdf, which Python converts: "
+    ) as error:
+        robot_draft.draft(Path("robot.urdf"))
+    exec(str(error.value).partition("converts: ")[2], {})
+    Path("robot.xml").write_text(capsys.readouterr().out)
+    robot, _ = robot_draft.draft(Path("robot.xml"))
+    assert [leg.joints[0] for leg in robot.legs] == ["fl1", "fr1", "rl1", "rr1"]
+    assert robot.max_torque == (9.0,) * 3
+    assert robot.build(tmp_path).spec.compile().body_mass.sum() == pytest.approx(4.0 + 4 * 0.9)
 
 
 def test_the_base_is_not_held(tmp_path):

@@ -149,8 +149,9 @@ class LocomotionConfig(EnvConfig):
         if self.terrain == "rough":
             return terrain.rough()
         path = self.files["terrain"]
-        if path.suffix.lower() in importing.OPTIONS.keys() - {".npz"}:
-            advice = f"deimos terrain import {path} --out {path.with_suffix('.npz')}"
+        makers = dict.fromkeys(importing.OPTIONS.keys() - {".npz"}, "import") | {".toml": "grid --file"}
+        if maker := makers.get(path.suffix.lower()):
+            advice = f"deimos terrain {maker} {path} --out {path.with_suffix('.npz')}"
             raise ValueError(
                 f"terrain must be flat, rough or a terrain file, got '{path}'; make one of it by: {advice}"
             )

@@ -78,6 +78,12 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
 
     if not path.is_file():
         raise ValueError(f"mjcf must be an MJCF file, but there is no {path}.")
+    if path.suffix.lower() == ".urdf":
+        raise ValueError(
+            f"mjcf must be an MJCF file, got {path}, which Python converts: import mujoco; "
+            f"s = mujoco.MjSpec.from_file('{path}'); s.compiler.fusestatic = False; "
+            "s.worldbody.first_body().add_freejoint(); s.compile(); print(s.to_xml())"
+        )
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         _name_all(spec)

@@ -135,7 +135,8 @@ class Locomotion(WarpEnv):
         )  # fmt: skip
         u = self._draw.array.numpy().astype(np.float64)
         low, high = config.friction
-        varied = high > low or low != 1.0
+        own = {self.robot.spec.geom(name).friction[0] for foot in self.robot.parts[1:5] for name in foot}
+        varied = high > low or own != {low}
         physics = engines.build(
             config.engine, self.robot, ground, n, self.device, config.physics,
             friction=low + (high - low) * u[:, 0] if varied else None,
