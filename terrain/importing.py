@@ -48,7 +48,8 @@ def import_file(
     ``.npy``, ``.npz``
         An array of heights [m] with x along the first axis and y along the second, or a saved terrain.
 
-    Files of ``deimos terrain`` give their heights back: meshes and arrays to the bit, pictures to half a grey value.
+    Files of ``deimos terrain`` give their heights back: meshes and arrays, at the resolution that they were made with,
+    to the bit, pictures to half a grey value.
     Such pictures know their place, their ``resolution`` and their ``height_range``. Other pictures, and arrays, lie
     around the origin.
 

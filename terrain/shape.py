@@ -32,10 +32,11 @@ class TileShape(abc.ABC):
     """Side of the flat middle [m], positive and smaller than the tile."""
 
     def __post_init__(self) -> None:
+        hints = get_type_hints(type(self))  # a field's own type is a string where annotations are
         for field in fields(self):
-            if field.type is float:
+            if hints[field.name] is float:
                 check_positive(field.name, getattr(self, field.name), finite=True)
-            elif field.type == Ramp:
+            elif hints[field.name] == Ramp:
                 check_ramp(field.name, getattr(self, field.name))
         if self.platform >= self.tile:
             raise ValueError(f"platform must be smaller than tile = {self.tile:g} m, got {self.platform:g} m.")

@@ -72,11 +72,11 @@ class Grid:
         for part in self.shapes:
             check_positive("share", part.share, finite=True)
         for shape in self.column_shapes:
-            highest = max(shape.step(self.easiest), shape.step(self.hardest))
-            if highest > self.max_step + 1e-9:
+            difficulty = max(self.easiest, self.hardest, key=shape.step)
+            if shape.step(difficulty) > self.max_step + 1e-9:
                 raise ValueError(
-                    f"max_step is {self.max_step:g} m, but {catalog.name_of(shape)} at difficulty "
-                    f"{max(self.easiest, self.hardest):g} has steps of {highest:g} m; lower them or raise max_step."
+                    f"max_step is {self.max_step:g} m, but {catalog.name_of(shape)} at difficulty {difficulty:g} has "
+                    f"steps of {shape.step(difficulty):g} m; lower them or raise max_step."
                 )
 
     @property

@@ -8,14 +8,15 @@ import trimesh
 PAGE = Path(__file__).parent.parent / "docs" / "add_a_robot.md"
 
 # As models of MuJoCo Menagerie are: classes, an included file, meshes for looks, position actuators, a keyframe. The
-# neck is one joint too many, the feet are on bodies of their own, and hip and thigh of a leg move one body.
+# neck is one joint too many, the feet are on bodies of their own, and hip and thigh of a leg move one body. Springs and
+# dampers are not linear, and what turns with a motor is said at its actuator.
 MULE = """
 <mujoco model="mule">
   <compiler angle="radian" meshdir="assets"/>
   <default>
     <default class="mule">
-      <joint damping="0.1" armature="0.01" frictionloss="0.05"/>
-      <position kp="60" kv="1.5" forcerange="-40 40"/>
+      <joint damping="0.1 0.02 0.01" stiffness="0.3 0.2 0.1" armature="0.01" frictionloss="0.05"/>
+      <position kp="15" kv="0.375" gear="2" forcerange="-20 20" armature="0.002" damping="0.03 0.02 0.01"/>
       <default class="looks"><geom type="mesh" contype="0" conaffinity="0" mass="0" rgba="0.2 0.3 0.4 1"/></default>
       <default class="hit"><geom group="3" mass="0"/></default>
     </default>

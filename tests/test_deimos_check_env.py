@@ -126,6 +126,18 @@ FORGOTTEN = {
         "step must not reset a world or change a goal, but goal_count changed",
     ),
     "a reward": ("worlds.reward[env] = 1.0", "worlds.reward[env] = -1.0", "Step.reward must be finite and at least 0"),
+    "any reward": (
+        "        worlds.reward[env] = 1.0 / (1.0 + wp.abs(position - worlds.goal[env, 0]))\n", "",
+        "Step.reward must be finite and at least 0: the step must write it in every world",
+    ),
+    "a crash's reward": (
+        "        worlds.reward[env] = 1.0", "        if not crashed:\n            worlds.reward[env] = 1.0",
+        "Step.reward must be finite: the step must write it, after a crash too",
+    ),
+    "the bound of actions": (
+        "wp.clamp(action, -1.0, 1.0)", "action",
+        "the step must clip actions to action_range, as a deployed policy does, but beyond it obs differs",
+    ),
     "the cause": ("cause = wp.static(ACTION)", "cause = 0", "check must stop the run after an action that is not fin"),
     "an array to resume": ("StructTable(Cart))", "StructTable(Cart), resume=False)", "clones must move alike, but obs"),
     "groups": (

@@ -15,6 +15,7 @@ from worlds import build_loop, mask_of, rows_of
 
 from deimos.sim.envs.quad import Config
 from deimos.sim.legged import robots
+from deimos.sim.legged.robots import go1
 
 POSE = np.tile([0.1, 0.8, -1.5, -0.1, 0.8, -1.5], 2)
 
@@ -177,6 +178,16 @@ def test_randomisation_is_drawn_per_world(simulator, uniform_reference):
         episode_steps=0,
     )  # fmt: skip
     assert "geom_friction" not in replace(quiet, engine=simulator.engine).build(2, simulator.device, 0).tensors
+
+
+def test_a_fixed_friction_is_that_of_any_robot(torch_device, monkeypatch):
+    """Feet that are slippery by their robot's own file have the configuration's friction all the same."""
+    robot = go1.build()
+    for foot in (name for part in robot.parts[1:5] for name in part):
+        robot.spec.geom(foot).friction = (0.6, 0.005, 0.0001)
+    monkeypatch.setattr(Config, "make_robot", lambda self: robot)
+    env = build(torch_device, engine="auto", friction=(1.0, 1.0))
+    assert set(env.physics.tensors["geom_friction"][:, :, 0].ravel().tolist()) == {1.0}
 
 
 def test_noise_is_uniform_and_keyed(torch_device):

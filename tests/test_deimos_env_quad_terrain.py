@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -172,6 +173,29 @@ def test_terrain_of_fine_cells_is_refused(torch_device, tmp_path):
         build(torch_device, terrain=str(tmp_path / "fine.npz"))
 
 
+@pytest.mark.parametrize("away", [(-1e5, 0.0, 0.0), (0.0, 1e5, 0.0), (0.0, 0.0, 1e5)])
+def test_terrain_far_from_the_origin_is_refused(torch_device, tmp_path, hills, away):
+    """Where single precision rounds a robot's way off, none is built; nearer by, robots move as their speed says."""
+    path, ground = tmp_path / "far.npz", terrain.load(hills)
+
+    def moved(by):
+        corner = ground.corner[0] + by[0], ground.corner[1] + by[1]
+        origins, heights = ground.origins + np.float32(by), ground.heights + np.float32(by[2])
+        replace(ground, corner=corner, origins=origins, heights=heights).save(path)
+        return build(torch_device, terrain=str(path), engine="auto")
+
+    with pytest.raises(ValueError, match=r"terrain must have the middles of its tiles within 4096 m .* got 1000\d\d m"):
+        moved(away)
+    env = moved(tuple(0.04 * each for each in away))
+    begin, way = env.tensors["qpos"][:, :2].double(), 0.0
+    for _ in range(10):
+        env.step(torch.zeros(6, 12, device=torch_device))
+        way = way + env.dt * env.tensors["qvel"][:, :2].double()
+    found = env.tensors["qpos"][:, :2] - begin
+    assert float(way.abs().max()) > 0.05
+    torch.testing.assert_close(found, way, rtol=0, atol=0.02)
+
+
 def test_robots_start_on_the_terrain(torch_device, tmp_path):
     """Ground that ends where robots start is refused with the border that it lacks; with it, none leaves at once."""
 
@@ -229,6 +253,8 @@ def test_unknown_and_broken_terrains_are_refused(tmp_path):
         Config(terrain="moon").load_terrain()
     with pytest.raises(ValueError, match=r"got 'h.stl'; make one of it by: deimos terrain import h.stl --out h.npz"):
         Config(terrain="h.stl").load_terrain()
+    with pytest.raises(ValueError, match=r"make one of it by: deimos terrain grid --file my.toml --out my.npz"):
+        Config(terrain="my.toml").load_terrain()
     (tmp_path / "x.npz").write_bytes(b"no terrain")
     with pytest.raises(ValueError, match="is not a terrain file"):
         Config(terrain=str(tmp_path / "x.npz")).load_terrain()

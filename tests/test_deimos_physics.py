@@ -287,6 +287,14 @@ def test_buffers_tell_their_use(device):
     assert np.all(small.arrays.overflow.numpy() & small.lost_contacts)
 
 
+def test_dry_friction_has_rows(device):
+    """Every joint of dry friction takes a row whatever the robot touches, and the buffer has it."""
+    robot = go1.build()
+    for leg in robot.spec.joints[1:]:
+        leg.frictionloss = 0.1
+    assert make(1, ("warp", device), robot=robot).max_rows == 53 + 12
+
+
 @pytest.mark.parametrize(
     ("bits", "message"),
     [

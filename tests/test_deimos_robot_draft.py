@@ -1,6 +1,7 @@
 """A robot from an MJCF that is not ours: what is read, what is built of it, and which models are refused."""
 
 import re
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -139,6 +140,48 @@ def test_a_draft_says_what_the_model_says(tmp_path):
     assert any("the MJCF has others for other legs; write what suits all four" in note for note in notes)
 
 
+SERVO = '<{} joint="{}" gear="2" {}/>'
+SHARED = {
+    "alone": ('kp="10" kv="0.5"', None, (40.0, 2.0)),
+    "with a velocity actuator": ('kp="10"', 'kv="0.3" ctrlrange="-1 1"', (40.0, 1.2)),
+    "a velocity actuator alone": (None, 'kv="0.3" ctrlrange="-20 20"', None),
+}
+
+
+@pytest.mark.parametrize("case", SHARED)
+def test_gains_of_two_actuators_add_up(tmp_path, case):
+    """A joint's servo may be a position actuator and one of velocity, whose bound of speed limits no torque."""
+    position, velocity, gains = SHARED[case]
+    path = write_scout(tmp_path)
+
+    def servos(motor):
+        kinds = (("position", position), ("velocity", velocity))
+        return "".join(SERVO.format(kind, motor[1], numbers) for kind, numbers in kinds if numbers)
+
+    path.write_text(re.sub(r'<motor joint="(\w+)"/>', servos, path.read_text()))
+    robot, notes = robot_draft.draft(path)
+    guessed = {note.split()[0] for note in notes if "is a guess" in note}
+    assert guessed == {"pose", "max_torque", *(() if gains else ("stiffness", "damping"))}
+    if gains:
+        assert robot.stiffness == pytest.approx([gains[0]] * 3)
+        assert robot.damping == pytest.approx([gains[1]] * 3)
+
+
+def test_pieces_of_a_geom_have_names_of_their_own(tmp_path):
+    """Where another geom is called as a piece would be, both are there, and both are watched."""
+    path = write_scout(tmp_path)
+    ball = '<geom name="shell_0" size="0.03" pos="0.2 0 0" mass="0"/><geom name="shell"'
+    path.write_text(path.read_text().replace('<geom name="shell"', ball))
+    robot = robot_draft.draft(path)[0].build(tmp_path)
+    compiled = robot.spec.compile()
+    base = robot.parts[0]
+    assert len(set(base)) == len(base)
+    assert compiled.geom("shell_0").type == mujoco.mjtGeom.mjGEOM_SPHERE
+    on_base = [i for i in range(compiled.ngeom) if compiled.geom_bodyid[i] == 1 and compiled.geom_contype[i]]
+    assert {compiled.geom(i).name for i in on_base} <= set(base)
+    assert len(on_base) > 2
+
+
 def test_what_has_no_name_is_named_after_its_joint(tmp_path):
     """The draft of a model whose bodies and geoms have no names reads as the one with names, and builds."""
     path = write_scout(tmp_path)
@@ -163,6 +206,34 @@ def test_a_guessed_pose_stands_over_its_feet(tmp_path, knee):
     drop = (np.cos(thigh) + np.cos(thigh + calf)) / 2
     assert abs(0.14 * forward) < 0.01
     assert 0.6 < drop < 0.85
+
+
+CORNERS = {"rr": (-0.2, -0.1), "rl": (-0.2, 0.1), "fr": (0.2, -0.1), "fl": (0.2, 0.1)}
+
+
+def link(name, origin, mass):
+    """A link of a URDF, with a ball that collides."""
+    place = f'<origin xyz="{origin}"/>' if origin else ""
+    inertia = '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+    ball = f'<collision>{place}<geometry><sphere radius="0.03"/></geometry></collision>'
+    return f'<link name="{name}"><inertial><mass value="{mass}"/>{inertia}</inertial>{ball}</link>'
+
+
+def urdf_leg(leg):
+    """Three links and three joints of a URDF."""
+    (x, y), parent, parts = CORNERS[leg], "base", []
+    limits = {"1": (-0.7, 0.7), "2": (-1.2, 2.4), "3": (-2.5, -0.4)}
+    for part, (axis, xyz) in zip(
+        "123", (("1 0 0", f"{x} {y} 0"), ("0 1 0", "0 0 0"), ("0 1 0", "0 0 -0.14")), strict=True
+    ):
+        low, high = limits[part]
+        parts.append(link(leg + part, "0 0 -0.14", 0.3))
+        parts.append(
+            f'<joint name="{leg}{part}" type="revolute"><parent link="{parent}"/><child link="{leg}{part}"/><origin '
+            f'xyz="{xyz}"/><axis xyz="{axis}"/><limit lower="{low}" upper="{high}" effort="9" velocity="9"/></joint>'
+        )
+        parent = leg + part
+    return "".join(parts)
 
 
 LEG = '<body><joint name="j{0}" axis="0 1 0" range="-1 1"/><geom size=".1"/></body>'
@@ -217,6 +288,30 @@ def test_a_model_without_what_a_robot_needs_is_refused(tmp_path, old, new, messa
     with pytest.raises(ValueError, match=message) as error:
         robot_draft.draft(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_urdf_is_refused_with_what_converts_it(tmp_path, monkeypatch, capsys):
+    """What the message says makes an MJCF of a URDF, with a base that floats and all of its weight."""
+    monkeypatch.chdir(tmp_path)
+    Path("robot.urdf").write_text(f"<robot name='r'>{link('base', None, 4.0)}{''.join(map(urdf_leg, CORNERS))}</robot>")
+    with pytest.raises(
+        ValueError, match=r"mjcf must be an MJCF file, got robot\.urdf, which Python converts: "
+    ) as error:
+        robot_draft.draft(Path("robot.urdf"))
+    exec(str(error.value).partition("converts: ")[2], {})
+    Path("robot.xml").write_text(capsys.readouterr().out)
+    robot, _ = robot_draft.draft(Path("robot.xml"))
+    assert [leg.joints[0] for leg in robot.legs] == ["fl1", "fr1", "rl1", "rr1"]
+    assert robot.max_torque == (9.0,) * 3
+    assert robot.build(tmp_path).spec.compile().body_mass.sum() == pytest.approx(4.0 + 4 * 0.9)
+
+
+def test_the_base_is_not_held(tmp_path):
+    """A robot whose own free joint is to be held is told so in a line."""
+    path = write_scout(tmp_path)
+    path.write_text(path.read_text().replace("<freejoint/>", '<freejoint name="root"/>'))
+    with pytest.raises(ValueError, match="held must name joints of a head, tail or arm, but 'root' is what the base"):
+        robot_draft.draft(path, ("root",))
 
 
 def test_looks_that_weigh_are_named(tmp_path):

@@ -1,6 +1,7 @@
 """The data file of a robot: read as it is written, refused with a reason, kept by a run."""
 
 import dataclasses
+import io
 import re
 import shutil
 import zipfile
@@ -127,6 +128,26 @@ def test_a_run_keeps_its_robot(tmp_path, capsys):
     assert "is not a robot that a run has kept" in capsys.readouterr().err
 
 
+def test_a_robot_that_no_run_could_keep_is_refused(tmp_path):
+    """Files named by absolute paths would stay behind when a run moves; a folder beside goes along."""
+    home, shared = tmp_path / "home", tmp_path / "shared"
+    home.mkdir()
+    path = write_mule(home)
+    (home / "assets").rename(shared)
+    file, text = home / "mule.toml", path.read_text()
+    for folder in (shared.as_posix(), "../shared"):
+        path.write_text(text.replace('meshdir="assets"', f'meshdir="{folder}"'))
+        file.write_text(robot_file.to_toml(robot_draft.draft(path, ("nod",))[0]))
+        if folder == "../shared":
+            with zipfile.ZipFile(io.BytesIO(robot_file.pack(file))) as archive:
+                assert "shared/bone.stl" in archive.namelist()
+        else:
+            with pytest.raises(
+                ValueError, match=r"mjcf must name its files by relative paths, .* names .*shared/bone.stl"
+            ):
+                robot_file.pack(file)
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -135,6 +156,10 @@ def test_a_run_keeps_its_robot(tmp_path, capsys):
         (
             ["--env.robot", "scout.toml", "--env.terrain", "fine.npz"],
             "terrain must have cells of at least 0.05 m under",
+        ),
+        (
+            ["--env.robot", "light.toml"],
+            "payload must be less than the 0.9 kg of 'chassis', from which it is taken too, got 1; take --env.pa",
         ),
         (["--env.robot", "scout.toml", "--num-envs", "2000000000"], "2000000000 worlds, each at least "),
         (["--env.robot", "bad.toml"], "joint 'abduct_rr' of body 'shoulder_rr' must have a range of angles; give it"),
@@ -151,6 +176,8 @@ def test_bad_input_of_a_training_ends_in_one_line(scout, monkeypatch, capsys, ar
     terrain.build(Grid(shapes=(shape,), levels=1, columns=1, tile=2.0, border=1.0, cell=0.025)).save("fine.npz")
     Path("bad.toml").write_text(scout.read_text().replace("scout.xml", "bad.xml"))
     Path("bad.xml").write_text(Path("scout.xml").read_text().replace('range="-0.7 0.7"', ""))
+    Path("light.toml").write_text(scout.read_text().replace("scout.xml", "light.xml"))
+    Path("light.xml").write_text(Path("scout.xml").read_text().replace('mass="4.5"', 'mass="0.9"'))
     assert cli.main(["train", "env:quad", *SMALL, *arguments, "--out", "run"]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"deimos: {line}")

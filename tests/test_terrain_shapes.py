@@ -291,20 +291,25 @@ def test_tiles_that_would_not_meet_are_refused(shape, message):
 
 
 def test_dropped_in_file_is_a_shape(tmp_path, monkeypatch):
-    """One file in the package's folder, and nothing else, makes a new shape."""
+    """One file in the package's folder, and nothing else, makes a new shape, whose numbers are checked."""
     (tmp_path / "one_bump.py").write_text('''
 """A block."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
 from deimos.terrain.mesh import rings
-from deimos.terrain.shape import TileShape
+from deimos.terrain.shape import Ramp, TileShape
 import numpy as np
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
     """A block in the middle."""
+
+    width: float = 1.0
+    slope: Ramp = (0.0, 1.0)
 
     def step(self, difficulty):
         """See ``TileShape.step``."""
@@ -321,6 +326,10 @@ class Shape(TileShape):
     assert isinstance(shape, TileShape)
     assert build(shape, 0.5).vertices[:, 2].max() == 0.5
     assert catalog.name_of(shape) == "one-bump"
+    with pytest.raises(ValueError, match="one-bump: width must be finite and positive, got -1"):
+        catalog.make("one-bump", {"width": -1})
+    with pytest.raises(ValueError, match="one-bump: slope must be two finite numbers of at least 0"):
+        catalog.make("one-bump", {"slope": [-1, 1]})
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,10 @@ def test_progress_counts_tiles_and_rays():
             {"max_step": 0.6},
             r"max_step is 0.6 m, but pit at difficulty 1 has steps of 1 m; lower them or raise max_step",
         ),
+        (
+            {"max_step": 0.6, "shapes": (world.Share(shape=catalog.make("pit", {"depth": [0.8, 0.1]})),)},
+            r"max_step is 0.6 m, but pit at difficulty 0 has steps of 0.8 m; lower them or raise max_step",
+        ),
     ],
 )
 def test_refuses_with_a_reason(changes, message):

@@ -45,8 +45,8 @@ def check_env(env: Env) -> None:
 
     for check in (
         _check_layout, _check_views, _check_start, _check_observation, _check_draws, _check_candidates, _check_step,
-        _check_clocks, _check_reset, _check_set_goals, _check_repeats, _check_clones, _check_resume, _check_penalty,
-        _check_faults,
+        _check_clocks, _check_reset, _check_set_goals, _check_repeats, _check_bounds, _check_clones, _check_resume,
+        _check_penalty, _check_faults,
     ):  # fmt: skip
         for holds, message in check(build(), build):
             if not torch.as_tensor(holds).all():
@@ -91,6 +91,13 @@ def _at(tensors: dict[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 def _results(step: Step) -> dict[str, Tensor]:
     found = {field.name: getattr(step, field.name) for field in fields(step)}
     return {name: value.clone() for name, value in found.items() if value is not None}
+
+
+def _spoil(step: Step) -> None:
+    """Leave no number of a step that the next one might pass off as its own."""
+    for tensor in (step.reward, step.tracking):
+        if tensor is not None:
+            tensor.fill_(torch.nan)
 
 
 def _advance(env: Env, action: Tensor) -> dict[str, Tensor]:
@@ -239,13 +246,16 @@ def _check_step(env: Env, build: Build) -> Claims:
         yield (step.tracking is None) == (groups == 1), "Step.tracking must be given where goals have groups."
         if step.tracking is not None:
             yield _has_type("Step.tracking", step.tracking, (WORLDS, groups), torch.float32)
-            yield (step.tracking >= 0) & (step.tracking <= 1), "Step.tracking must be in [0, 1]."
+            met = (step.tracking >= 0) & (step.tracking <= 1)
+            yield met, "Step.tracking must be in [0, 1]: the step must write it in every world."
         yield step.obs.isfinite(), "Step.obs must be finite: the step must write all of it."
-        yield step.reward.isfinite() & (step.reward >= 0), "Step.reward must be finite and at least 0."
+        sound = step.reward.isfinite() & (step.reward >= 0)
+        yield sound, "Step.reward must be finite and at least 0: the step must write it in every world."
         yield ~(step.terminated & step.truncated), "a world that crashed must not be truncated too."
         yield from _are_equal(env.tensors, counts, "step must not reset a world or change a goal, but {name} changed.")
         moved = env.episode_step == before + 1
         yield moved, f"step {age} must advance episode_step by one: the kernel must call end_step."
+        _spoil(step)
 
 
 def _check_clocks(env: Env, build: Build) -> Claims:
@@ -310,6 +320,16 @@ def _check_repeats(env: Env, build: Build) -> Claims:
     yield set(env.report()) == set(twin.report()), "report must have the same keys every time."
 
 
+def _check_bounds(env: Env, build: Build) -> Claims:
+    """Actions beyond their range do what its ends do."""
+    twin, (low, high) = build(), (end.to(env.device) for end in env.action_range)
+    for sign in _actions(env, 3).sign():
+        bound = torch.where(sign < 0, low, high)  # may be infinite
+        end, beyond = (torch.where(bound.isfinite(), each, sign) for each in (bound, bound + sign * (high - low)))
+        message = "the step must clip actions to action_range, as a deployed policy does, but beyond it {name} differs."
+        yield from _are_equal(_results(twin.step(beyond)), _results(env.step(end)), message)
+
+
 def _check_clones(env: Env, build: Build) -> Claims:
     """Clones of worlds, in another environment too, stay equal under the same actions where nothing is drawn."""
     quiet = env.config.for_evaluation()
@@ -348,7 +368,11 @@ def _check_penalty(env: Env, build: Build) -> Claims:
     yield punished.crash_penalty == cost, "crash_penalty must be the configuration's times its largest_reward."
     action = _actions(env, 1)[0].sign() * min(env.action_bound, 1.0)
     for _ in range(UNTIL_CRASH):
-        plain, step = _results(env.step(action)), _results(punished.step(action))
+        steps = env.step(action), punished.step(action)
+        plain, step = map(_results, steps)
+        yield plain["reward"].isfinite(), "Step.reward must be finite: the step must write it, after a crash too."
+        for each in steps:
+            _spoil(each)
         charged = plain.pop("reward") - step.pop("reward")
         right = torch.isclose(charged, cost * plain["terminated"], rtol=1e-4, atol=1e-5)
         yield (

@@ -46,8 +46,8 @@ class LocomotionConfig(EnvConfig):
     friction: tuple[float, float] = (0.5, 1.25)
     """Range of the feet's friction, drawn once per world; at least 0.05, below which contacts are ill-conditioned."""
     payload: float = 1.0
-    """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0. Off in Legged
-    Gym, but for its ANYmal."""
+    """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0 and less than
+    the base's own. Off in Legged Gym, but for its ANYmal."""
     push_interval: float = 15.0
     """Time from push to push, each robot in a phase of its own [s], at least 0; 0 disables them."""
     push_speed: float = 1.0
@@ -150,8 +150,9 @@ class LocomotionConfig(EnvConfig):
         if self.terrain == "rough":
             return _rough()
         path = self.files["terrain"]
-        if path.suffix.lower() in importing.OPTIONS.keys() - {".npz"}:
-            advice = f"deimos terrain import {path} --out {path.with_suffix('.npz')}"
+        makers = dict.fromkeys(importing.OPTIONS.keys() - {".npz"}, "import") | {".toml": "grid --file"}
+        if maker := makers.get(path.suffix.lower()):
+            advice = f"deimos terrain {maker} {path} --out {path.with_suffix('.npz')}"
             raise ValueError(
                 f"terrain must be flat, rough or a terrain file, got '{path}'; make one of it by: {advice}"
             )

@@ -5,7 +5,7 @@ from the compiled numbers: the base, its legs in the order of ``Robot``, and sph
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,6 +33,10 @@ class Servo:
     """[N m s/rad]."""
     max_torque: float = 0.0
     """[N m]."""
+    armature: float = field(default=0.0, compare=False)
+    """What it adds to the joint's own [kg m^2]."""
+    drag: tuple[float, ...] = field(default=(0.0, 0.0, 0.0), compare=False)
+    """What it adds to the joint's own damping, which no largest torque cuts: MuJoCo's polynomial."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +78,12 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
 
     if not path.is_file():
         raise ValueError(f"mjcf must be an MJCF file, but there is no {path}.")
+    if path.suffix.lower() == ".urdf":
+        raise ValueError(
+            f"mjcf must be an MJCF file, got {path}, which Python converts: import mujoco; "
+            f"s = mujoco.MjSpec.from_file('{path}'); s.compiler.fusestatic = False; "
+            "s.worldbody.first_body().add_freejoint(); s.compile(); print(s.to_xml())"
+        )
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         _name_all(spec)
@@ -86,6 +96,8 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
     for name in held:
         if spec.joint(name) is None:
             raise ValueError(f"held must name joints of {path}, which has no '{name}'.")
+        if spec.joint(name).type == mujoco.mjtJoint.mjJNT_FREE:
+            raise ValueError(f"held must name joints of a head, tail or arm, but '{name}' is what the base floats by.")
         spec.delete(spec.joint(name))
     for things in (spec.keys, spec.sensors, spec.actuators, spec.excludes, spec.pairs):
         for thing in list(things):
@@ -145,14 +157,15 @@ def copy(source: Source, legs: Sequence[Sequence[int]]) -> "tuple[mujoco.MjSpec,
     spec.modelname = model.body(source.base).name
     trunk = _add_body(spec.worldbody, model, source.base)
     trunk.add_freejoint(name="base")
-    pieces = {trunk.name: _add_geoms(spec, trunk, model, source.base)}
+    names = {model.geom(i).name for i in range(model.ngeom)}
+    pieces = {trunk.name: _add_geoms(spec, trunk, model, source.base, names)}
     for leg in legs:
         parent = trunk
         for index in dict.fromkeys(model.jnt_bodyid[list(leg)].tolist()):
             parent = _add_body(parent, model, index)
             for joint in range(model.body_jntadr[index], model.body_jntadr[index] + model.body_jntnum[index]):
-                _add_joint(parent, model, joint)
-            pieces[parent.name] = _add_geoms(spec, parent, model, index)
+                _add_joint(parent, model, joint, source.servos[source.name(joint)])
+            pieces[parent.name] = _add_geoms(spec, parent, model, index, names)
     return spec, pieces
 
 
@@ -206,20 +219,27 @@ def _servos(model: "mujoco.MjModel") -> dict[str, Servo]:
     servos = {}
     for joint in range(model.njnt):
         limits = [model.jnt_actfrcrange[joint].max()] if model.jnt_actfrclimited[joint] else []
-        stiffness = damping = 0.0
+        stiffness = damping = armature = 0.0  # a position and a velocity actuator may share the work
+        drag = np.zeros(3)
         for i in range(model.nu):
             if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[i, 0] != joint:
                 continue
-            gain, bias, gear = model.actuator_gainprm[i, 0], model.actuator_biasprm[i], abs(model.actuator_gear[i, 0])
+            gain, gear = model.actuator_gainprm[i, 0], abs(model.actuator_gear[i, 0])
+            armature += gear**2 * model.actuator_armature[i]
+            drag += gear**2 * np.array([model.actuator_damping[i], *model.actuator_dampingpoly[i]])
+            is_affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+            by_angle, by_speed = model.actuator_biasprm[i, 1:3] * is_affine
             if model.actuator_forcelimited[i]:
                 limits.append(gear * model.actuator_forcerange[i].max())
-            if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and bias[1] == -gain:
-                stiffness, damping = gear**2 * gain, -(gear**2) * bias[2]
-            elif bias[1] == 0 and model.actuator_ctrllimited[i]:  # a motor
+            if by_angle or by_speed:
+                stiffness -= gear**2 * by_angle
+                damping -= gear**2 * by_speed
+            elif model.actuator_ctrllimited[i]:  # a motor
                 limits.append(gear * gain * model.actuator_ctrlrange[i].max())
         servos[model.joint(joint).name] = Servo(
-            stiffness=float(stiffness), damping=float(damping), max_torque=float(min(limits, default=0.0))
-        )
+            stiffness=float(stiffness), damping=float(damping if stiffness else 0.0),
+            max_torque=float(min(limits, default=0.0)), armature=float(armature), drag=tuple(drag.tolist()),
+        )  # fmt: skip
     return servos
 
 
@@ -285,20 +305,24 @@ def _add_body(parent: "mujoco.MjsBody", model: "mujoco.MjModel", index: int) -> 
     return body
 
 
-def _add_joint(body: "mujoco.MjsBody", model: "mujoco.MjModel", joint: int) -> None:
+def _add_joint(body: "mujoco.MjsBody", model: "mujoco.MjModel", joint: int, servo: Servo) -> None:
     dof, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
+    damping = np.array([model.dof_damping[dof], *model.dof_dampingpoly[dof]])
     body.add_joint(
         name=model.joint(joint).name, axis=model.jnt_axis[joint], pos=model.jnt_pos[joint],
-        range=model.jnt_range[joint], limited=True, ref=model.qpos0[place], armature=model.dof_armature[dof],
-        damping=(model.dof_damping[dof], 0.0, 0.0), frictionloss=model.dof_frictionloss[dof],
-        stiffness=(model.jnt_stiffness[joint], 0.0, 0.0), springref=model.qpos_spring[place],
+        range=model.jnt_range[joint], limited=True, ref=model.qpos0[place], frictionloss=model.dof_frictionloss[dof],
+        armature=model.dof_armature[dof] + servo.armature, damping=damping + servo.drag,
+        stiffness=(model.jnt_stiffness[joint], *model.jnt_stiffnesspoly[joint]), springref=model.qpos_spring[place],
     )  # fmt: skip
 
 
 def _add_geoms(
-    spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjModel", index: int
+    spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjModel", index: int, taken: set[str]
 ) -> list[tuple[str, str]]:
-    """Add what a body looks like and what of it collides; a body that has no looks looks like what collides."""
+    """Add what a body looks like and what of it collides; a body that has no looks looks like what collides.
+
+    ``taken`` are names that no piece may get; those of the pieces join them.
+    """
     geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == index]
     hard = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
     for geom in [i for i in geoms if i not in hard] or hard:
@@ -309,6 +333,9 @@ def _add_geoms(
         for i, (start, end, radius) in enumerate(pieces):
             name = model.geom(geom).name
             piece = name if len(pieces) == 1 else f"{name}_{i}"
+            while len(pieces) > 1 and piece in taken:
+                piece += "_"
+            taken.add(piece)
             add_collision(body, piece, radius, start, end, contype=ROBOT_BIT, conaffinity=TERRAIN_BIT)
             added.append((name, piece))
     return added

@@ -172,7 +172,11 @@ def opened(path: Path) -> Iterator[tuple[RobotFile, Path]]:
 
 
 def pack(path: Path) -> bytes:
-    """A robot file in one, with the MJCF and all that it includes: what a run keeps."""
+    """A robot file in one, with the MJCF and all that it includes: what a run keeps.
+
+    Raises:
+        ValueError: If the MJCF names a file by an absolute path, which would not be found where the run is moved to.
+    """
     import mujoco
 
     if path.suffix.lower() == ".zip":
@@ -190,7 +194,22 @@ def pack(path: Path) -> bytes:
             *((file.relative_to(top).as_posix(), file.read_bytes()) for file in files),
         ]:
             archive.writestr(zipfile.ZipInfo(name), data)  # without the time: the same robot gives the same bytes
+    _require_whole(buffer, kept)
     return buffer.getvalue()
+
+
+def _require_whole(packed: io.BytesIO, robot: RobotFile) -> None:
+    """Raise ``ValueError`` if what is packed, once unpacked elsewhere, still reads files from where it was."""
+    import mujoco
+
+    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed) as archive:
+        archive.extractall(folder)
+        home = Path(folder).resolve()
+        files = [Path(name).resolve() for name in mujoco.mju_getXMLDependencies(str(home / robot.mjcf))]
+    if left := sorted(file for file in files if home not in file.parents):
+        raise ValueError(
+            f"mjcf must name its files by relative paths, so that a run can keep them, but it names {left[0]}."
+        )
 
 
 def to_toml(robot: RobotFile) -> str:

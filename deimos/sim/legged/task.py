@@ -43,6 +43,7 @@ from deimos.sim.legged.config import LocomotionConfig
 from deimos.sim.legged.engines import Physics
 from deimos.sim.legged.engines.captured import Captured
 from deimos.sim.legged.goal_parts import GoalPart, Launches
+from deimos.sim.legged.robot_check import PAYLOAD
 from deimos.sim.legged.robots import Robot
 from deimos.sim.shared import warp_device
 from deimos.sim.warp_env import WarpEnv
@@ -57,6 +58,7 @@ SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
 STEP_IN_SIGHT = 0.02  # [m]; the lowest step of the stairs is 5 cm high
 EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
 NOWHERE = 1e9  # [m]; a plane has no edge
+FARTHEST = 4096.0  # [m] from the origin; beyond, float32 tells 0.5 mm at best, and who moves by less in a step stands
 SETTLED = 2.0  # [s] after which a robot that stands is at rest
 GOALS_AT_REST = 2**18  # mean tracking by a robot at rest is then known to 0.001
 NOISE = {
@@ -104,6 +106,7 @@ class Locomotion(WarpEnv):
         ground = config.load_terrain()
         if ground:
             _require_room(ground)
+            _require_nearness(ground)
         self.terrain = ground or terrain.flat()
         self.physics = self._build_physics(ground)
         self.recordable = self.physics.recordable
@@ -119,7 +122,11 @@ class Locomotion(WarpEnv):
         self._begin()
 
     def _build_physics(self, ground: Terrain | None) -> Physics:
-        """The simulator, with a friction and a payload for every world unless they are fixed."""
+        """The simulator, with a friction and a payload for every world unless they are fixed.
+
+        Raises:
+            ValueError: If a payload could take away all of the base.
+        """
         config, n = self.config, self.num_envs
         self._set_rows(torch.arange(n))
         draw_uniforms(
@@ -128,12 +135,20 @@ class Locomotion(WarpEnv):
         )  # fmt: skip
         u = self._draw.array.numpy().astype(np.float64)
         low, high = config.friction
-        varied = high > low or low != 1.0
-        return engines.build(
+        own = {self.robot.spec.geom(name).friction[0] for foot in self.robot.parts[1:5] for name in foot}
+        varied = high > low or own != {low}
+        physics = engines.build(
             config.engine, self.robot, ground, n, self.device, config.physics,
             friction=low + (high - low) * u[:, 0] if varied else None,
             payload=config.payload * (2.0 * u[:, 1] - 1.0) if config.payload > 0 else None,
         )  # fmt: skip
+        base = physics.model.body(physics.model.jnt_bodyid[0])
+        if config.payload >= base.mass[0]:
+            raise ValueError(
+                f"payload must be less than the {base.mass[0]:.3g} kg of '{base.name}', from which it is taken too, "
+                f"got {config.payload:g}; take --env.payload {PAYLOAD * base.mass[0]:.2g}."
+            )
+        return physics
 
     def _join(self, ground: Terrain | None) -> LeggedWorlds:
         """Join the arrays of worlds, simulator, robot and terrain for the kernels."""
@@ -362,6 +377,16 @@ def _require_room(ground: Terrain) -> None:
         raise ValueError(
             f"terrain must reach {need:g} m beyond the middle of every tile, around which robots start, got "
             f"{room:.3g} m; make its tiles larger, or its border wider by {need - room:.3g} m."
+        )
+
+
+def _require_nearness(ground: Terrain) -> None:
+    """Raise ``ValueError`` if robots start where single precision is too coarse for their positions."""
+    farthest = np.abs(ground.origins).max()
+    if farthest > FARTHEST:
+        raise ValueError(
+            f"terrain must have the middles of its tiles within {FARTHEST:g} m of the origin under a robot, whose "
+            f"position is in single precision, got {farthest:g} m; move it there before it is imported."
         )
 
 

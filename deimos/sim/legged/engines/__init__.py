@@ -46,8 +46,8 @@ class PhysicsConfig:
     quarter on a height field, but one for every pair of geoms that can touch at least, and all of it for 16 worlds
     more. That is 69 % and 28 % for 512 Go1s. Of mujoco-warp; the native engine has an arena for each thread."""
     rows: int = 0
-    """Buffer size for constraint rows in each world; 0 takes what touching with every geom, all joints at limits,
-    needs, four fifths of it on a height field. Of mujoco-warp, as above."""
+    """Buffer size for constraint rows in each world; 0 takes what touching with every geom needs, with all joints
+    at limits and their dry friction, four fifths of it on a height field. Of mujoco-warp, as above."""
     deterministic: bool = False
     """Whether contacts and sums come in the same order every time on a GPU too, as exact resumes and clones there need;
     it takes time. Of mujoco-warp; on a CPU everything always does."""

@@ -188,7 +188,7 @@ def _largest_demand(model: "mujoco.MjModel", *, plane: bool) -> tuple[int, int, 
 
     A sphere touches anything in one point, a capsule a plane or another capsule in two; on a height field the
     simulator keeps four of each. A contact without friction takes one row, one on a pyramid of four edges four, a joint
-    at its limit one.
+    at its limit one, and one of dry friction another at all times.
     """
     import mujoco
 
@@ -199,8 +199,8 @@ def _largest_demand(model: "mujoco.MjModel", *, plane: bool) -> tuple[int, int, 
     if not plane:
         points[(model.geom_bodyid[pairs] == 0).any(axis=1)] = 4
     edges = np.where(model.geom_condim[pairs].max(axis=1) == 1, 1, 4)
-    limits = int(model.jnt_limited.sum())
-    return int(points.sum()), len(pairs), int((points * edges).sum()) + limits
+    joints = int(model.jnt_limited.sum() + (model.dof_frictionloss > 0.0).sum())
+    return int(points.sum()), len(pairs), int((points * edges).sum()) + joints
 
 
 def _pairs(model: "mujoco.MjModel") -> np.ndarray:
