@@ -273,9 +273,10 @@ def evaluate(
         if goals != "naive":
             attack = attacker(goals).prepare(replace(target, progress=partial(progress, f"{goals} learns")))
         env = target.build(identity["worlds"], config.seed)
-        row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals)) | attack.facts
-        row["score"] = (row[measure] - low) / (high - low)
-        rows.append({"goals": goals} | row | identity)
+        row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals))
+        facts = attack.facts_beside(["score", *row, *identity], goals)
+        score = (row[measure] - low) / (high - low)
+        rows.append({"goals": goals} | row | facts | {"score": score} | identity)
         keep(rows[-1])
     return rows
 

@@ -289,7 +289,7 @@ class Trial:
             (all that were asked for, refused or not), and ``tracking``, how well the goals that were given instead
             are met, in [0, 1]; see ``evaluation.play``. With the facts of an attacker.
         """
-        target, rows = replace(self._target, guard=guard and guard(), learnt={}), []
+        target, rows = replace(self._target, guard=guard and guard(), learnt=[]), []
         for goals in ("naive", *attackers):
             stage = f"{shield}, {goals}"
             attack = Attack(uniform_goals)
@@ -298,12 +298,13 @@ class Trial:
             env, own = target.build(self._eval.worlds_against(goals), self._eval.seed), guard and guard()
             row = play(
                 env, target.policy, attack.selector(env), self._eval.steps, partial(self._progress, stage), guard=own
-            ) | attack.facts  # fmt: skip
+            )
+            facts = attack.facts_beside(["shield", "goals", "refused", *row], goals)
             tracking = row.get("matching", row["return_per_step"])
             rows.append({
                 "shield": shield, "goals": goals, "refused": own.refused if own else 0.0, "tracking": tracking,
                 **{name: row[name] for name in ("crash_rate", "interactions", "interaction_crashes", "crashes")},
-                **attack.facts,
+                **facts,
             })  # fmt: skip
         return rows
 
