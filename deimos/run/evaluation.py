@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import RunError, check_at_least, check_range
+from deimos.checks import RunError, check_at_least, check_is, check_names, check_range, check_whole
 from deimos.files import read_bytes
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
@@ -69,7 +69,10 @@ class EvalConfig:
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "oracle_worlds"):
             check_at_least(name, getattr(self, name), 1)
+        check_whole("seed", self.seed)
         check_range("seed", self.seed, 0, 2**32 - 2)
+        check_is("fear", self.fear, FearConfig)
+        check_names("attackers", self.attackers)
         for name in self.attackers:
             if attacker(name).needs_pool and self.pool is None:
                 raise ValueError(f"pool must be a file of deimos pool for the attacker {name}, got none.")
