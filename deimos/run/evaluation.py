@@ -126,6 +126,7 @@ def evaluate_run(
     same = [row for row in known if any(row.items() >= identity for identity in identities)]
     if len(same) == len(identities) and not again:
         return same
+    folder.require_writable()
 
     def keep(row: dict) -> None:
         """Write a row as soon as it is made: a kill loses the one that is under way."""

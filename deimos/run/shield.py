@@ -365,6 +365,7 @@ def shield_run(
         RunError: If the run has no fear network, there are too few crashes to calibrate on, or too many worlds for the
             memory.
     """
+    folder.require_writable()
     policy = load_policy(folder.path, str(device))
     env_config = config.env.resolved(device)
     check_memory(env_config, replace(eval_config, worlds=shield.worlds, attackers=()), device)
