@@ -30,10 +30,21 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-def check_at_least(name: str, value: int, least: int) -> None:
-    """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
+def check_is(name: str, value: object, kind: type) -> None:
+    """Raise ``ValueError`` unless ``value`` is an object of the class ``kind``."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be a {kind.__module__}.{kind.__name__}, got {value!r:.80}.")
+
+
+def check_whole(name: str, value: int) -> None:
+    """Raise ``ValueError`` unless ``value`` is a whole number."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):  # NumPy's whole numbers too
         raise ValueError(f"{name} must be a whole number, got {value!r}.")
+
+
+def check_at_least(name: str, value: int, least: int) -> None:
+    """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
+    check_whole(name, value)
     if not value >= least:
         raise ValueError(f"{name} must be at least {least}, got {value}.")
     if value >= 2**31:
@@ -61,12 +72,18 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
 
 def check_device(name: str, value: str) -> None:
     """Raise ``ValueError`` unless ``value`` names a device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
-    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", value):
-        raise ValueError(f"{name} must be auto, cpu, cuda or cuda:N, got '{value}'.")
+    if not isinstance(value, str) or not re.fullmatch(r"auto|cpu|cuda(:\d+)?", value):
+        raise ValueError(f"{name} must be auto, cpu, cuda or cuda:N, got {value!r}.")
+
+
+def check_names(name: str, value: Iterable[str]) -> None:
+    """Raise ``ValueError`` unless ``value`` is several names: one text would be taken for as many as it has letters."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise ValueError(f"{name} must be a tuple of names, got {value!r}.")
 
 
 def check_hidden(name: str, sizes: Iterable[int]) -> None:
     """Raise ``ValueError`` unless there is a hidden layer and each has at least one unit."""
-    sizes = tuple(sizes)
-    if not sizes or min(sizes) < 1:
+    sound = [isinstance(size, numbers.Integral) and size > 0 for size in sizes] if isinstance(sizes, Iterable) else []
+    if not sound or not all(sound):
         raise ValueError(f"{name} must be one or more positive layer sizes, got {sizes}.")

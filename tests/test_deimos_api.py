@@ -11,12 +11,17 @@ import torch
 import deimos
 from deimos.app import cli
 from deimos.checks import RunError
+from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
 from deimos.sim.envs import particle
 
 OLD = Path(__file__).parent / "data" / "run_0_1_0"  # python train.py of 0.1.0 with 32 worlds, 48 steps, hidden 8
+
+
+class Unknown(uniform.Config):
+    """A selector's configuration in a module that is registered nowhere."""
 
 
 @pytest.fixture(scope="module")
@@ -76,12 +81,58 @@ def test_another_evaluation_stands_beside(run, changes):
         ({"steps": 10}, "steps must be at least 2 T = 16, got 10"),
         ({"worlds": 0}, "worlds must be at least 1, got 0"),
         ({"words": 3}, "words"),
+        ({"seed": 1e3}, "seed must be a whole number, got 1000.0"),
+        ({"attackers": "oracle"}, "attackers must be a tuple of names, got 'oracle'"),
+        ({"fear": {"epochs": 3}}, "fear must be a deimos.goals.fear.FearConfig, got {'epochs': 3}"),
+        ({"pool": 3}, "pool must be a path, got 3"),
+        ({"device": torch.device("cpu")}, r"device must be auto, cpu, cuda or cuda:N, got device\(type='cpu'\)"),
     ],
 )
 def test_evaluation_refuses(run, changes, message):
     """A value that is not allowed, or a name that is none, is said in one line."""
     with pytest.raises(RunError, match=message):
         deimos.evaluate(run, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"env": "particle"}, "env must be a deimos.sim.env.EnvConfig, got 'particle'"),
+        ({"selector": "p25"}, "selector must be a deimos.goals.selector.SelectorConfig, got 'p25'"),
+        ({"ppo": {"hidden": [8]}}, "ppo must be a deimos.learn.ppo.PPOConfig, got {'hidden': "),
+        ({"seed": 1e3}, "seed must be a whole number, got 1000.0"),
+        ({"threads": 1.5}, "threads must be a whole number, got 1.5"),
+        ({"log": "tensorboard"}, "log must be a tuple of names, got 'tensorboard'"),
+        ({"device": torch.device("cpu")}, "device must be auto, cpu, cuda or cuda:N, got device"),
+        ({"num_envs": 1, "ppo": PPOConfig(num_steps=1, minibatches=1)}, "hold 2 transitions or more, got 1"),
+    ],
+)
+def test_a_configuration_refuses_other_types(changes, message):
+    """A value of another type than its field's is said when the configuration is made, by the name of the field."""
+    with pytest.raises(ValueError, match=message):
+        deimos.TrainConfig(**changes)
+
+
+@pytest.mark.parametrize("sizes", [64, (64.0,), ("64",), (8, 0)])
+def test_hidden_layers_are_whole_numbers(sizes):
+    """One number, or anything but whole ones, makes no layers."""
+    with pytest.raises(ValueError, match=r"hidden must be one or more positive layer sizes, got \(?['68]"):
+        PPOConfig(hidden=sizes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"evaluation": "no"}, "evaluation must be true or false, got 'no'"),
+        ({"ppo": PPOConfig(hidden=(8,), clip_value=0)}, "clip_value must be true or false, got 0"),
+        ({"selector": Unknown()}, "is not the Config of a plugin of deimos.goals.selectors; register its module by"),
+    ],
+)
+def test_a_run_that_could_not_be_read_again_does_not_begin(tmp_path, changes, message):
+    """What Python takes for true, or a selector that nobody could find again, is refused before there is a folder."""
+    with pytest.raises(RunError, match=message):
+        deimos.train(deimos.TrainConfig(num_envs=16, device="cpu", threads=1, **changes), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_folder_is_not_overwritten(run):

@@ -1,6 +1,5 @@
 """Attackers: what each asks for, that their budgets do not depend on the policy, and planted policies."""
 
-import importlib
 import math
 import re
 import shutil
@@ -16,7 +15,7 @@ from deimos.app import cli
 from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig
 from deimos.goals.interactions import Resolved
-from deimos.run import attack, attackers
+from deimos.run import attack
 from deimos.run.attack import Explorer, argmax_director, attacker, learn_fear, names, quality, uniform_goals
 from deimos.run.attackers import q_fear, search
 from deimos.run.attackers.pooled import make_pool
@@ -321,38 +320,6 @@ def test_rows_tell_tasks_apart(tmp_path):
         identities(replace(config, terrain="none.npz"))
     for old, new in zip(before, identities(replace(config, engine="warp")), strict=True):
         assert old | {"engine": "warp"} == new
-
-
-ATTACKER = """
-from dataclasses import dataclass
-from deimos.run.attack import Attack, AttackerConfig, uniform_goals
-
-@dataclass(frozen=True)
-class Config(AttackerConfig):
-    def prepare(self, target):
-        return Attack(uniform_goals, {"uninformed": True})
-"""
-
-
-def test_a_file_is_an_attacker(tmp_path, monkeypatch):
-    """One file in the package's folder, and nothing else, makes an attacker of its name, with hyphens."""
-    (tmp_path / "like_naive.py").write_text(ATTACKER)
-    monkeypatch.setattr(attackers, "__path__", [*attackers.__path__, str(tmp_path)])
-    importlib.invalidate_caches()
-    assert "like-naive" in names()
-    naive, same = evaluate(stay, particle.Config(), replace(SMALL, attackers=("like-naive",)), CPU)
-    assert (same["goals"], same["reward"]) == ("like-naive", naive["reward"])
-
-
-def test_an_entry_point_is_an_attacker(tmp_path, monkeypatch):
-    """A module of another distribution that is registered under ``deimos.attackers`` is an attacker too."""
-    (tmp_path / "other_attacker.py").write_text(ATTACKER)
-    (tmp_path / "other-1.0.dist-info").mkdir()
-    (tmp_path / "other-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (tmp_path / "other-1.0.dist-info/entry_points.txt").write_text("[deimos.attackers]\nfar-off = other_attacker\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    assert "far-off" in names()
-    assert EvalConfig(attackers=("far-off",)).worlds_against("far-off") == 2000
 
 
 def test_argmax_finds_what_crashes_a_policy():

@@ -15,6 +15,7 @@ from command_line import contents, refused
 
 import deimos
 from deimos.app import cli
+from deimos.checks import RunError
 from deimos.run import training
 from deimos.run.config import from_dict
 from deimos.run.folder import RunFolder
@@ -216,10 +217,15 @@ def test_evaluation_of_a_run_without_policy_is_refused(copied, capfd):
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(copied, capfd, monkeypatch):
-    """An evaluation that could not be kept is not begun."""
-    monkeypatch.setattr("deimos.run.evaluation.evaluate", lambda *args, **options: pytest.fail("evaluated in vain"))
+    """An evaluation, or a shield, that could not be kept is not begun, neither by a command nor by a program."""
+    for name in ("evaluation.evaluate", "shield.Trial"):
+        monkeypatch.setattr(f"deimos.run.{name}", lambda *args, **options: pytest.fail("worked in vain"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert refused(["evaluate", copied], capfd) == f"deimos: {copied} cannot be written to; evaluate a copy of it.\n"
+    said = f"{copied} cannot be written to; work on a copy of it."
+    for command in (["evaluate", copied], ["evaluate", copied, "--contexts", "1"], ["shield", copied]):
+        assert refused(command, capfd) == f"deimos: {said}\n"
+    with pytest.raises(RunError, match=re.escape(said)):
+        deimos.evaluate(copied)
 
 
 def test_broken_evaluation_is_refused_before_the_work(copied, capfd, monkeypatch):

@@ -328,6 +328,23 @@ def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
         export_controller.main(folder)
 
 
+def test_large_actions_are_compared_by_their_size(tmp_path):
+    """Where actions are thousands, the check allows their rounding in float32, and a tenth of one is still found."""
+    policy = make_policy("elu", False, float("inf"))
+    with torch.no_grad():
+        policy.actor.mean[-1].weight *= 3e4
+    data = policy_model(policy, {})
+    (tmp_path / "policy.onnx").write_bytes(data)
+    deploy = {"policy": {"file": "policy.onnx", "sha256": hashlib.sha256(data).hexdigest()}, "fear": None}
+    obs = torch.randn(4096, 9, generator=torch.Generator().manual_seed(1))
+    action = policy(obs).numpy()
+    known = {"policy.observation": obs[:, policy.actor.seen].numpy(), "policy.action": action}
+    assert np.abs(action).max() > 3000.0
+    assert export_controller.compare_networks(tmp_path, deploy, known)
+    action[5, 1] += 0.1
+    assert not export_controller.compare_networks(tmp_path, deploy, known)
+
+
 def test_particles_with_fear_and_shield(particles, tmp_path, capsys):
     """A run's fear network and shield leave with it, the check holds, and the run-time example decides over a goal."""
     small = "--worlds 1000 --eval.worlds 64 --eval.steps 100 --alphas 0.5 --attackers scripted --device cpu".split()

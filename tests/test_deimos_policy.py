@@ -68,3 +68,10 @@ def test_missing_or_foreign_policy_is_refused(tmp_path):
     torch.save({"schema": 1, "layout": [], "actor": {}}, tmp_path / "policy.pt")
     with pytest.raises(RunError, match="is not a policy of this version"):
         deimos.load_policy(tmp_path)
+
+
+def test_a_device_that_is_none_is_no_fault_of_the_file(tmp_path):
+    """A name that torch does not know is said in torch's words, and the policy is not called one of another version."""
+    training.save(training.Trainer(CONFIG, torch.device("cpu")), RunFolder.create(tmp_path / "run"))
+    with pytest.raises(RuntimeError, match="device string: auto"):
+        deimos.load_policy(tmp_path / "run", "auto")

@@ -233,6 +233,19 @@ def test_too_few_transitions_teach_nothing(counting):
     ppo.check()
 
 
+@pytest.mark.parametrize("weight", [0.5, 0.01])
+def test_transitions_of_small_weight_teach(weight):
+    """What all count alike for, however little, is learnt as if all weighed 1: even from one minibatch of all."""
+    learnt = []
+    for each in (1.0, weight):
+        ppo = small_learner(minibatches=1)
+        rollout = filled(ppo)
+        rollout.weight.fill_(each)
+        row = ppo.update(rollout, torch.arange(NUM_ENVS * NUM_STEPS))
+        learnt.append([row["value_loss"], row["kl"]])
+    assert learnt[1] == pytest.approx(learnt[0], rel=0.2)  # the divisor of a variance is the sum of weights, less 1
+
+
 def test_rows_that_do_not_divide_are_left_out():
     """A rollout that does not split evenly is learnt from without its remainder, on equal minibatches."""
     ppo = small_learner(minibatches=7)

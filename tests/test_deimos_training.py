@@ -427,9 +427,13 @@ def test_checkpoint_of_another_task_is_refused(undisturbed, other):
         training.load(RunFolder.open(undisturbed), replace(CONFIG, **other))
 
 
-def test_init_from_refuses_another_size(undisturbed, tmp_path):
-    """Networks of another size are refused, and no folder is made."""
-    config = replace(CONFIG, ppo=replace(CONFIG.ppo, hidden=(16, 8)))
-    with pytest.raises(RunError, match=r"do not fit this run: .*size mismatch"):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"hidden": (16, 8)}, "size mismatch"), ({"activation": "tanh"}, "ppo.activation must be relu, as it was there")],
+)
+def test_init_from_refuses_other_networks(undisturbed, tmp_path, change, message):
+    """Networks of another size, or that would compute something else, are refused, and no folder is made."""
+    config = replace(CONFIG, ppo=replace(CONFIG.ppo, **change))
+    with pytest.raises(RunError, match=f"do not fit this run: .*{message}"):
         training.start(config, tmp_path / "run", undisturbed)
     assert not (tmp_path / "run").exists()

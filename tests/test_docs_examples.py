@@ -23,6 +23,7 @@ from pathlib import Path
 import pytest
 
 import deimos
+from deimos import plugins
 from deimos.app import cli
 from deimos.run.evaluation import EvalConfig
 
@@ -247,12 +248,15 @@ class Session:
 
 @pytest.fixture
 def session(tmp_path, monkeypatch):
-    """An empty session; modules that a page has written are forgotten afterwards."""
+    """An empty session; modules that a page has written or registered are forgotten afterwards."""
     known = set(sys.modules)
     yield Session(tmp_path, monkeypatch)
     for name, module in list(sys.modules.items()):
         if name not in known and str(getattr(module, "__file__", "")).startswith(str(tmp_path)):
             del sys.modules[name]
+            for registered in plugins._registered.values():
+                for plugin in [plugin for plugin, its_module in registered.items() if its_module == name]:
+                    del registered[plugin]
 
 
 @pytest.mark.parametrize("page", LAB, ids=lambda page: page.stem)

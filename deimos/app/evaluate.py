@@ -1,6 +1,5 @@
 """``deimos evaluate``: the policy of a run under Naive and attackers, or its fear network against what happened."""
 
-import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -11,7 +10,7 @@ import tyro
 from deimos.app import console, figures
 from deimos.app.console import table
 from deimos.app.findings import describe, known
-from deimos.checks import RunError, check_at_least
+from deimos.checks import check_at_least
 from deimos.nn.threads import torch_on_one
 from deimos.run import api, audit, training
 from deimos.run.config import kind
@@ -92,8 +91,7 @@ def main(arguments: list[str], program: str) -> None:
     """Run ``deimos evaluate``."""
     options: EvaluateOptions = console.parse(EvaluateOptions, arguments, program)
     folder = RunFolder.open(options.run)
-    if not os.access(folder.path, os.W_OK):  # it is said before the work, which would be lost
-        raise RunError(f"{folder.path} cannot be written to; evaluate a copy of it.")
+    folder.require_writable()
     config = training.read_config(folder)
     console.quiet_warp()
     device = training.resolve_device(options.device)

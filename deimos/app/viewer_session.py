@@ -332,7 +332,7 @@ def prepare(
     attacks = {}
     for name in names:
         attacks[name] = attacker(name).prepare(replace(target, progress=partial(report, name)))
-    fitted = [(fear, facts) for fear, facts in learnt.values() if fear.fitted]
+    fitted = [(known.fear, known.facts) for known in learnt if known.fear.fitted]
     if not fitted:
         return attacks, None
     fear, facts = fitted[0]

@@ -78,11 +78,13 @@ def load_policy(path: Path | str, device: str = "cpu") -> Policy:
 
     Args:
         path: A ``policy.pt``, or the run folder that holds one.
-        device: Where it shall act.
+        device: Where it shall act, one of torch's.
 
     Raises:
         RunError: If there is no policy.
+        RuntimeError, AssertionError: If there is no such device; the words are torch's.
     """
+    torch.empty(0, dtype=torch.float32, device=device)  # raises here: below it would be taken for a fault of the file
     path = Path(path)
     path = path / "policy.pt" if path.is_dir() else path
     data = load_tensors(path, "policy", SCHEMA)

@@ -246,7 +246,7 @@ class PPO(Stateful):
             self._order.copy_(order)
         value_loss = surrogate_loss = kl = math.nan
         learns = learn_policy or critic is None
-        if learns and bool(sum_over_ranks(rollout.weight.sum()) >= self._size):
+        if learns and self._has_enough(rollout.weight):
             options = {"policy": learn_policy, "value": critic is None}
             key = tuple(options.values()) if place().size == 1 else None  # what ranks send each other is not recorded
             value_loss, surrogate_loss, kl = self._fit(partial(self._fit_batch, **options), key).tolist()
@@ -265,6 +265,11 @@ class PPO(Stateful):
             "kl": kl,
             **dict(zip(after, torch.stack(list(after.values())).tolist(), strict=True)),
         }
+
+    def _has_enough(self, weight: Tensor) -> bool:
+        """Whether as many transitions count as a minibatch has, however little each, and more than one in all."""
+        count, total = sum_over_ranks(torch.stack([(weight > 0).sum(dtype=torch.float64), weight.sum().double()]))
+        return bool((count >= self._size) & (total > 1.0))
 
     @torch.no_grad()
     def batch(self, rollout: Rollout, critic: Callable[[Tensor], Tensor] | None = None) -> tuple[Batch, Tensor]:

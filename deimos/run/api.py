@@ -12,7 +12,7 @@ from deimos.nn import ranks
 from deimos.nn.threads import on_threads
 from deimos.run import training
 from deimos.run.branch import branch_config
-from deimos.run.config import from_dict, to_dict, with_plain_numbers
+from deimos.run.config import from_dict, require_readable, to_dict, with_plain_numbers
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -41,8 +41,8 @@ def train(
         The run's folder, for ``evaluate`` and ``load_policy``.
 
     Raises:
-        RunError: If the folder exists, the worlds do not fit into memory, a file cannot be written, or the other
-            processes of torchrun cannot be reached.
+        RunError: If the folder exists, a value in ``config`` is not of its field's type, the worlds do not fit into
+            memory, a file cannot be written, or the other processes of torchrun cannot be reached.
         SimulationError: If a number is not finite; the last checkpoint is intact.
     """
     if config is None and branch_from is not None:
@@ -103,6 +103,7 @@ def configure_evaluation(
         period = config.env.goal_period if goal_period is None else goal_period
         env_config = config.env.with_goal_period(period)
         eval_config = with_plain_numbers(replace(config.eval, **changes))
+        require_readable(eval_config)
         if engine is not None:
             env_config = from_dict(EnvConfig, to_dict(env_config) | {"engine": engine})
         if eval_config.steps < 2 * period:

@@ -7,15 +7,17 @@ go on until it has seen enough crashes would be stronger against unsafe policies
 
 import abc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from deimos import plugins
+from deimos.checks import RunError
 from deimos.goals.fear import Fear, FearConfig, auroc
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Proposal
@@ -29,6 +31,7 @@ Policy = Callable[[Tensor], Tensor]
 
 FITS = 15  # of an attacker's network while it chooses goals itself
 HELD_OUT = 5  # every fifth world is kept for the network's AUROC
+_NUMBERS = np.generic, Tensor  # what holds a number as Python has it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +54,22 @@ class Target:
     """The file of ``pooled``."""
     guard: GoalGuard | None = None
     """Has the last word on the goals of its worlds, such as a shield; ``None`` for nobody."""
-    progress: Callable[[float], None] = lambda share: None
+    progress: Callable[[float], None] = field(default=lambda share: None, compare=False)
     """Called now and then with the share of the preparation that is done."""
-    learnt: dict[tuple[int, bool], tuple[Fear, dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
-    """What ``learn_fear`` has given so far, by its arguments: several attackers ask for the same network."""
+    learnt: list["Learnt"] = field(default_factory=list, repr=False, compare=False)
+    """What ``learn_fear`` has given so far: several attackers ask for the same network."""
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """A fear network that ``learn_fear`` has trained, and what it was asked for."""
+
+    target: Target
+    """The policy, and with what network, where and under which seed it was learnt about: an attacker may change it."""
+    steps: int
+    own_goals: bool
+    fear: Fear
+    facts: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -64,7 +79,25 @@ class Attack:
     selector: Callable[[Env], GoalSelector]
     """Makes who chooses the goals of some worlds."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """Numbers that stand in the row of the evaluation beside what came out; see ``learn_fear``."""
+    """Numbers and texts that stand in the row of the evaluation beside what came out; see ``learn_fear``."""
+
+    def facts_beside(self, row: Iterable[str], who: str) -> dict[str, Any]:
+        """``facts`` for a row of an evaluation, as its file holds them.
+
+        Args:
+            row: Names that the row has itself.
+            who: Name of the attacker.
+
+        Raises:
+            RunError: If a fact has one of these names, or is neither a number nor a text.
+        """
+        facts = {name: value.item() if isinstance(value, _NUMBERS) else value for name, value in self.facts.items()}
+        if taken := sorted({*row} & facts.keys()):
+            raise RunError(f"Facts of the attacker {who} must have names of their own, got {', '.join(taken)}.")
+        for name, value in facts.items():
+            if not isinstance(value, int | float | str | None):
+                raise RunError(f"The fact {name} of the attacker {who} must be a number or a text, got {value!r:.80}.")
+        return facts
 
 
 class AttackerConfig(abc.ABC):
@@ -119,16 +152,21 @@ def argmax_director(env: Env, fear: Fear) -> director.Director:
 
 
 def learn_fear(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, dict[str, Any]]:
-    """Train a fear network on a finished policy, once for all attackers; for the arguments see ``collect``.
+    """Train a fear network on a finished policy; for the arguments see ``collect``.
+
+    It is trained once for all attackers of an evaluation that ask for the same of the same target.
 
     Returns:
         The network, and ``adversary_steps``, ``adversary_interactions``, ``adversary_crashes``, ``adversary_auroc`` (on
         every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``uninformed``: whether
         it has learnt nothing, for want of a crash or of a survival, so that goals are uniform.
     """
-    if (steps, own_goals) not in target.learnt:
-        target.learnt[steps, own_goals] = fear_of([target], steps, own_goals=own_goals)
-    return target.learnt[steps, own_goals]
+    asked = target, steps, own_goals
+    known = next((each for each in target.learnt if (each.target, each.steps, each.own_goals) == asked), None)
+    if known is None:
+        known = Learnt(*asked, *fear_of([target], steps, own_goals=own_goals))
+        target.learnt.append(known)
+    return known.fear, dict(known.facts)
 
 
 def fear_of(targets: Sequence[Target], steps: int, *, own_goals: bool) -> tuple[Fear, dict[str, Any]]:

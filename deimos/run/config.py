@@ -53,6 +53,14 @@ def with_plain_numbers(value: Any) -> Any:
     return dataclasses.replace(value, **{name: with_plain_numbers(getattr(value, name)) for name in fields})
 
 
+def require_readable(config: Any) -> None:
+    """Raise ``ValueError`` if a configuration would not come back from a run's folder, naming what is in the way.
+
+    Python asks for no types: ``evaluation="no"`` is true, and a folder that says so could not be read any more.
+    """
+    from_dict(type(config), to_dict(config))
+
+
 def kind(config: EnvConfig | SelectorConfig) -> str:
     """Name of the plugin that a configuration belongs to.
 
@@ -62,7 +70,10 @@ def kind(config: EnvConfig | SelectorConfig) -> str:
     package = next(package for base, package in _PLUGINS.items() if isinstance(config, base))
     name = plugins.name_of(package, type(config).__module__)  # without importing the others, one of which may be broken
     if name is None or plugins.load(package, name).Config is not type(config):
-        raise ValueError(f"{type(config)} is not the Config of a plugin of {package.__name__}.")
+        raise ValueError(
+            f"{type(config)} is not the Config of a plugin of {package.__name__}; register its module by "
+            "deimos.plugins.register, or install it."
+        )
     return name
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import RunError, check_at_least, check_range
+from deimos.checks import RunError, check_at_least, check_is, check_names, check_range, check_whole
 from deimos.files import read_bytes
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
@@ -69,7 +69,10 @@ class EvalConfig:
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "oracle_worlds"):
             check_at_least(name, getattr(self, name), 1)
+        check_whole("seed", self.seed)
         check_range("seed", self.seed, 0, 2**32 - 2)
+        check_is("fear", self.fear, FearConfig)
+        check_names("attackers", self.attackers)
         for name in self.attackers:
             if attacker(name).needs_pool and self.pool is None:
                 raise ValueError(f"pool must be a file of deimos pool for the attacker {name}, got none.")
@@ -123,6 +126,7 @@ def evaluate_run(
     same = [row for row in known if any(row.items() >= identity for identity in identities)]
     if len(same) == len(identities) and not again:
         return same
+    folder.require_writable()
 
     def keep(row: dict) -> None:
         """Write a row as soon as it is made: a kill loses the one that is under way."""
@@ -273,9 +277,10 @@ def evaluate(
         if goals != "naive":
             attack = attacker(goals).prepare(replace(target, progress=partial(progress, f"{goals} learns")))
         env = target.build(identity["worlds"], config.seed)
-        row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals)) | attack.facts
-        row["score"] = (row[measure] - low) / (high - low)
-        rows.append({"goals": goals} | row | identity)
+        row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals))
+        facts = attack.facts_beside(["score", *row, *identity], goals)
+        score = (row[measure] - low) / (high - low)
+        rows.append({"goals": goals} | row | facts | {"score": score} | identity)
         keep(rows[-1])
     return rows
 

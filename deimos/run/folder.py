@@ -5,6 +5,7 @@ import io
 import json
 import math
 import numbers
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -47,6 +48,11 @@ class RunFolder:
         if not (path / "config.json").is_file():
             raise RunError(f"{path} is not a run folder: it holds no config.json.")
         return cls(path)
+
+    def require_writable(self) -> None:
+        """Refuse a folder that cannot be written to: for those who would find out after long work, which were lost."""
+        if not os.access(self.path, os.W_OK):
+            raise RunError(f"{self.path} cannot be written to; work on a copy of it.")
 
     @contextmanager
     def hold(self) -> Iterator[None]:

@@ -289,7 +289,7 @@ class Trial:
             (all that were asked for, refused or not), and ``tracking``, how well the goals that were given instead
             are met, in [0, 1]; see ``evaluation.play``. With the facts of an attacker.
         """
-        target, rows = replace(self._target, guard=guard and guard(), learnt={}), []
+        target, rows = replace(self._target, guard=guard and guard(), learnt=[]), []
         for goals in ("naive", *attackers):
             stage = f"{shield}, {goals}"
             attack = Attack(uniform_goals)
@@ -298,12 +298,13 @@ class Trial:
             env, own = target.build(self._eval.worlds_against(goals), self._eval.seed), guard and guard()
             row = play(
                 env, target.policy, attack.selector(env), self._eval.steps, partial(self._progress, stage), guard=own
-            ) | attack.facts  # fmt: skip
+            )
+            facts = attack.facts_beside(["shield", "goals", "refused", *row], goals)
             tracking = row.get("matching", row["return_per_step"])
             rows.append({
                 "shield": shield, "goals": goals, "refused": own.refused if own else 0.0, "tracking": tracking,
                 **{name: row[name] for name in ("crash_rate", "interactions", "interaction_crashes", "crashes")},
-                **attack.facts,
+                **facts,
             })  # fmt: skip
         return rows
 
@@ -364,6 +365,7 @@ def shield_run(
         RunError: If the run has no fear network, there are too few crashes to calibrate on, or too many worlds for the
             memory.
     """
+    folder.require_writable()
     policy = load_policy(folder.path, str(device))
     env_config = config.env.resolved(device)
     check_memory(env_config, replace(eval_config, worlds=shield.worlds, attackers=()), device)

@@ -10,7 +10,18 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from deimos.checks import RunError, SimulationError, check_at_least, check_choice, check_device, check_range, one_line
+from deimos.checks import (
+    RunError,
+    SimulationError,
+    check_at_least,
+    check_choice,
+    check_device,
+    check_is,
+    check_names,
+    check_range,
+    check_whole,
+    one_line,
+)
 from deimos.goals.core import window_between
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig, with_parts
@@ -77,13 +88,20 @@ class TrainConfig:
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 
     def __post_init__(self) -> None:
+        for name, kind_of_it in (("env", EnvConfig), ("ppo", PPOConfig), ("eval", EvalConfig)):
+            check_is(name, getattr(self, name), kind_of_it)
+        if self.selector is not None:
+            check_is("selector", self.selector, SelectorConfig)
         check_at_least("num_envs", self.num_envs, 1)
         check_at_least("env_steps", self.env_steps, 1)
         for name in ("critic_warmup", "video_every"):
             check_at_least(name, getattr(self, name), 0)
+        for name in ("seed", "threads"):
+            check_whole(name, getattr(self, name))
         check_range("threads", self.threads, 0, MOST_THREADS)
         check_device("device", self.device)
         check_choice("graph", self.graph, MODES)
+        check_names("log", self.log)
         for name in self.log:
             check_choice("log", name, LOGS)
         if not 0 <= self.seed < 2**32:
@@ -95,7 +113,9 @@ class TrainConfig:
         if self.evaluation and self.eval.steps < 2 * self.env.goal_period:
             raise ValueError(f"eval.steps must be at least 2 T = {2 * self.env.goal_period}, got {self.eval.steps}.")
         transitions = self.num_envs * self.ppo.num_steps
-        if transitions < 2 or self.ppo.minibatches > transitions:
+        if transitions < 2:
+            raise ValueError(f"A rollout must hold 2 transitions or more, got {transitions}.")
+        if self.ppo.minibatches > transitions:
             raise ValueError(
                 f"A rollout must hold ppo.minibatches = {self.ppo.minibatches} transitions or more, got {transitions}."
             )

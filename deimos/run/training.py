@@ -21,7 +21,7 @@ from deimos.nn import ranks
 from deimos.run import memory
 from deimos.run.branch import check_branch
 from deimos.run.clips import Camera, cut_clips
-from deimos.run.config import from_dict, kind, to_dict, with_plain_numbers
+from deimos.run.config import from_dict, kind, require_readable, to_dict, with_plain_numbers
 from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory
 from deimos.run.failure import check_finite, dumped
@@ -94,12 +94,16 @@ def start(
         branch_from: Folder of a run that it branches off, see ``branch``.
 
     Raises:
-        RunError: If the folder exists, or the other run does not fit.
+        RunError: If the folder exists, the other run does not fit, or ``config`` would not come back from the folder.
     """
     if init_from is not None and branch_from is not None:
         raise RunError("--init-from and --branch-from cannot be combined; the latter takes over the networks too.")
     device = resolve_device(config.device)
     config = with_plain_numbers(config)
+    try:
+        require_readable(config)
+    except ValueError as error:
+        raise RunError(str(error)) from error
     config = replace(
         config, env=config.env.resolved(device), threads=config.threads or max(1, cores() // ranks.place().local_size),
         device=_stored_name(device),
@@ -178,9 +182,14 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
     """Load the networks of another run, whose observations must mean the same."""
     state = load_checkpoint(origin)
     try:
-        layout = load_policy(origin.path).layout
+        policy = load_policy(origin.path)
+        layout, activation = policy.layout, policy.activation
         if layout != trainer.env.layout:
             raise ValueError(f"it observes {layout}, this one {trainer.env.layout}")
+        if activation != trainer.config.ppo.activation:
+            raise ValueError(
+                f"ppo.activation must be {activation}, as it was there, got {trainer.config.ppo.activation}"
+            )
         trainer.ppo.load_weights(state["ppo"])
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise RunError(f"The networks of {origin.path} do not fit this run: {one_line(error)}") from error
