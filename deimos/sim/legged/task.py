@@ -137,18 +137,21 @@ class Locomotion(WarpEnv):
         low, high = config.friction
         own = {self.robot.spec.geom(name).friction[0] for foot in self.robot.parts[1:5] for name in foot}
         varied = high > low or own != {low}
-        physics = engines.build(
+        self._require_base_mass()
+        return engines.build(
             config.engine, self.robot, ground, n, self.device, config.physics,
             friction=low + (high - low) * u[:, 0] if varied else None,
             payload=config.payload * (2.0 * u[:, 1] - 1.0) if config.payload > 0 else None,
         )  # fmt: skip
-        base = physics.model.body(physics.model.jnt_bodyid[0])
-        if config.payload >= base.mass[0]:
+
+    def _require_base_mass(self) -> None:
+        model = self.robot.spec.compile()
+        base, payload = model.body(model.jnt_bodyid[0]), self.config.payload
+        if payload >= base.mass[0]:
             raise ValueError(
                 f"payload must be less than the {base.mass[0]:.3g} kg of '{base.name}', from which it is taken too, "
-                f"got {config.payload:g}; take --env.payload {PAYLOAD * base.mass[0]:.2g}."
+                f"got {payload:g}; take --env.payload {PAYLOAD * base.mass[0]:.2g}."
             )
-        return physics
 
     def _join(self, ground: Terrain | None) -> LeggedWorlds:
         """Join the arrays of worlds, simulator, robot and terrain for the kernels."""
