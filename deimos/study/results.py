@@ -1,7 +1,8 @@
 """The results of a study: a row per policy and evaluation, and one per training curve.
 
 A cell leaves its own in ``result.json``. The tables ``results.csv`` and ``curves.csv`` are what is exported, merged and
-kept; a folder's results are those of its cells, and those of its tables that are of no cell there.
+kept; a folder's results are those of its cells, and of its tables those that no cell there has: other cells, and what
+other attackers have done to the policies of these.
 """
 
 import csv
@@ -95,7 +96,8 @@ class Results:
             own = cls.of_cell(path.parent)
             found.rows += own.rows
             found.curves += own.curves
-        found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())))
+        # A merge puts what attackers did elsewhere to the policies of these cells into the tables alone.
+        found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())), attacks=True)
         found.find_worst()
         if not found.rows and not may_be_empty:
             raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
