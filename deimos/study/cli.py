@@ -105,7 +105,8 @@ class RunOptions(_WorkOptions):
     device: str | None = None
     """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
-    """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell."""
+    """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell, but
+    belong to what it is named by: give a study the same."""
     retry_failed: bool = False
     """Whether to try the cells again that were given up."""
     estimate: bool = False

@@ -295,6 +295,13 @@ def settings(folder: Path) -> dict[str, dict]:
     return found
 
 
+def without_results(folder: Path, results: Results) -> list[str]:
+    """Names of the cells of a study's folder that none of its results are of: given up, or not finished yet."""
+    there = {row["hash"][:8] for row in results.rows}  # as a cell's name ends
+    names = [path.parent.name for path in sorted(folder.glob("cells/*/cell.json"))]
+    return [name for name in names if name.rpartition("-")[2] not in there]
+
+
 def _evaluation(row: Row) -> tuple:
     """Of what cell and what evaluation a row is."""
     return row["hash"], row["goals"], row["goal_period"]
