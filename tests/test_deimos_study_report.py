@@ -240,6 +240,13 @@ def test_tables_say_nothing_of_what_is_not_there(folder):
     assert "P(safer than uniform)" not in second[0]
 
 
+def test_means_of_some_policies_are_not_taken_for_all(folder):
+    """An attacker that some policies met stands in the table of means, which says so; nobody else is named."""
+    rows = [row for row in Results.read(folder).rows if row["goals"] == "naive" or row["seed"] < 2]
+    assert "the goals (adversary: of some policies):" in report.outcomes(Data(Results(rows, [])), "quad", 100)[3]
+    assert report.outcomes(Data.read(folder), "quad", 100)[3].endswith("by who chooses the goals:")
+
+
 def test_small_populations_are_told_what_so_few_can_say(folder):
     """Four policies have the median between them in 1 - 2 / 2^4 of studies; thirty have no such limit."""
     results = Results.read(folder)

@@ -144,8 +144,8 @@ class RunOptions(_WorkOptions):
         if self.retry_failed:
             study.forget_failures()
         open_ = _open(study)
-        if open_:
-            print(estimate(study, open_), file=sys.stderr, flush=True)
+        if open_ or self.estimate:
+            print(estimate(study, open_) if open_ else "All cells are finished.", file=sys.stderr, flush=True)
         if not self.estimate:
             self._work(study, stopped, report)
 

@@ -197,10 +197,11 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
     hard, easy = attacked(data, environment, period), Where(environment, "naive", period)
     names = data.methods(environment, period)
     under_attack = {name: data.sample(hard.where, name, hard.metric) for name in names}
-    met = [
-        goals for goals in data.goals
-        if any(len(data.sample(Where(environment, goals, period), name, "crash_rate")) for name in names)
-    ]  # fmt: skip
+    rates = {goals: [len(data.sample(Where(environment, goals, period), name, "crash_rate")) for name in names]
+             for goals in data.goals}  # fmt: skip
+    met = [goals for goals, sizes in rates.items() if any(sizes)]
+    few = ", ".join(goals for goals in met if sum(rates[goals]) < max(map(sum, rates.values())))
+    of_some = f" ({few}: of some policies)" if few else ""
     by = hard.by if any(map(len, under_attack.values())) else f"{hard.by} (nobody attacked)"
     rows, by_attacker = [], []
     for name, rate in under_attack.items():
@@ -223,7 +224,7 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
         f"### {environment}, T = {period}: outcomes",
         f"Crashes per interaction under {by}, the score under uniform goals; with 95 % intervals over policies."
         + late_doses(data, environment),
-        told(rows), "Mean crashes per interaction [%] by who chooses the goals:", by_attacker,
+        told(rows), f"Mean crashes per interaction [%] by who chooses the goals{of_some}:", by_attacker,
     ]  # fmt: skip
 
 
