@@ -67,7 +67,10 @@ class Ordered:
             more, less = permutation.p_values_in_blocks(centred, statistic)
         else:
             more, less = map(float, self.p_values(values, numbers))
-        found = stats.bootstrap(values, statistic, resamples=RESAMPLES, paired=paired)
+        if paired and not self.spread and len(pairs) == 1:  # a bootstrap of bases that agree has no width
+            found = stats.share_of_pairs(*values)
+        else:
+            found = stats.bootstrap(values, statistic, resamples=RESAMPLES, paired=paired)
         return Finding(
             effect=effect, interval=_exp(found) if self.spread else found, no_difference=at,
             p_for=min(1.0, 2 * more), p_against=min(1.0, 2 * less), detectable=self._detectable(samples, pairs, paired),
@@ -209,8 +212,7 @@ class Mostly:
             x = np.array([np.mean([own[seed] for own in numbers.values() if seed in own]) for seed in seeds])
         else:
             x = np.array([number for own in numbers.values() for number in own.values()])
-        n = len(x)
-        if n < LEAST:
+        if (n := len(x)) < LEAST:
             return None
         positive = round(n * (np.sign(x) + 1).mean() / 2)
         p_for, p_against = (min(1.0, 2 * float(p)) for p in self.p_values(x))
@@ -435,9 +437,7 @@ def detectable_spread(n: int, m: int, studies: int = 400) -> float:
         return POWER - float((2 * found <= ALPHA).mean())
 
     top = math.log(100)
-    if lacking(top) > 0:
-        return math.inf
-    return math.exp(optimize.bisect(lacking, 0.0, top, xtol=0.03))
+    return math.inf if lacking(top) > 0 else math.exp(optimize.bisect(lacking, 0.0, top, xtol=0.03))
 
 
 def versus(first: Sequence[str], second: Sequence[str]) -> tuple[tuple[str, str], ...]:

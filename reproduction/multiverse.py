@@ -275,8 +275,10 @@ def standings(settings: Sequence[Setting]) -> list[Standing]:
 
 
 def mean(values: Array) -> Interval:
-    """Over settings, which the bootstrap draws anew; NaN over none."""
-    return stats.bootstrap([values], lambda x: x.mean(axis=-1)) if len(values) else Interval(np.nan, np.nan, np.nan)
+    """Over settings, which the bootstrap draws anew; of one setting without an interval, NaN over none."""
+    if len(values) < 2:
+        return Interval(float(values.mean()) if len(values) else np.nan, np.nan, np.nan)
+    return stats.bootstrap([values], lambda x: x.mean(axis=-1))
 
 
 def best_new(found: Sequence[Standing]) -> str:

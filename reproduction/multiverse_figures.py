@@ -41,7 +41,7 @@ ROOM = (
 )
 SHARES = (
     "Share of the settings with headroom in which a clause holds, with its exact 95 % interval. A clause that compares "
-    "two methods holds in half of them where the two do not differ."
+    "two methods holds in half of them where the two do not differ, and not where they crash equally often, as never."
 )
 MOVES = (
     "By how much a factor moves the margin of a clause, towards the level that is named, with 95 % intervals that "
@@ -92,7 +92,8 @@ def curve(settings: Sequence[Setting], method: str) -> "Figure":
         panel.grid(axis="y", alpha=0.3)
         panel.tick_params(axis="x", which="both", length=0)
     middle = mean(safer)
-    axes[0, 0].axhspan(middle.low, middle.high, color=GREY, alpha=0.2, linewidth=0)
+    if np.isfinite(middle.low):
+        axes[0, 0].axhspan(middle.low, middle.high, color=GREY, alpha=0.2, linewidth=0)
     axes[0, 0].axhline(middle.estimate, color=GREY, linewidth=1)
     axes[0, 0].set_ylabel("fewer crashes than\nUniform [points]")
     axes[1, 0].set_ylabel("score minus\nUniform's")

@@ -54,6 +54,7 @@ def write(options: MultiverseOptions) -> Path:
     (options.out / FIGURES).mkdir(parents=True, exist_ok=True)
     blocks: list[Block] = ["# The map", *_screened(settings)]
     if options.map is not None:
+        Roles.of(settings)  # is it a map?
         new = multiverse.best_new(multiverse.standings(settings))
         with figures.print_size():
             pictures = figures.write(draw(settings), options.out / FIGURES)
@@ -159,9 +160,19 @@ def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
     chosen = multiverse.most_headroom(settings)
     return [
         *_clauses(settings), "## Methods", standing, *_missing(settings),
-        f"The best new selector is {new}: the most policies below 1 % at {LEAST_SCORE} of Uniform's score or more. "
+        f"The best new selector is {new}: {_why(settings, new)}. "
         f"Confirmation: --methods with {new}" + (f", and --environments {chosen.name}." if chosen else "."),
     ]  # fmt: skip
+
+
+def _why(settings: Sequence[Setting], new: str) -> str:
+    """What made a new selector the best one."""
+    score = next(each.score.estimate for each in multiverse.standings(settings) if each.method == new)
+    if np.isnan(score):
+        return "the safest; scores can be compared nowhere"
+    if score < LEAST_SCORE:
+        return f"none has {LEAST_SCORE} of Uniform's score, and it comes nearest"
+    return f"the most policies below 1 % at {LEAST_SCORE} of Uniform's score or more"
 
 
 def _confirmed(data: Data, new: str) -> list[Block]:

@@ -24,9 +24,10 @@ CLAUSES = "clauses"
 """Name of the figure on the first page."""
 PAIRED = (
     "Policies that branched off the same base are compared with each other alone: clauses permute and resample within "
-    "bases. Two methods on five bases cannot be ordered by that, for even five of five is p = 1/16 on both sides. That "
-    "two methods are alike could be held on five bases (p = 1/32), but not refused (1/16), so such clauses are "
-    "undecided too. Fewer than five bases give estimates without a verdict."
+    "bases, and two methods have the exact interval of a share of bases. Two methods on five bases cannot be ordered "
+    "by that, for even five of five is p = 1/16 on both sides. That two methods are alike could be held on five bases "
+    "(p = 1/32), but not refused (1/16), so such clauses are undecided too. Fewer than five bases give estimates "
+    "without a verdict."
 )
 
 
@@ -109,7 +110,7 @@ def _row(each: Result) -> dict[str, str]:
         "where": str(each.place), "clause": each.clause.text, "line": str(each.clause.line or "-"),
         "n": " + ".join(map(str, finding.n.values())), "without": ", ".join(each.missing) or "-",
         "effect": finding.effect + (f" ({finding.chosen})" if finding.chosen else ""),
-        "size [95 %]": f"{finding.interval:.3g}", "no difference": f"{finding.no_difference:g}",
+        "size [95 %; of equivalences 90 %]": f"{finding.interval:.3g}", "no difference": f"{finding.no_difference:g}",
         "equivalent within": "-" if within is None else f"{within:.3g}",
         "minimum detectable effect": "none" if math.isinf(smallest) else f"{smallest:.2g}",
         "verdict": each.verdict,

@@ -1,6 +1,7 @@
 """The report: complete, self-contained, and the figures that stand in it."""
 
 import base64
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -200,8 +201,77 @@ def test_mean_without_an_interval_says_so(tmp_path, monkeypatch):
     assert "(no interval)" in text
     assert "inf]" not in text
     assert "crashes: median" in text
+    assert max(float(high) for high in re.findall(r"\[[\d.]+, ([\d.e+]+)\]", text.split("## Distributions")[1])) <= 100
     assert "| 50 [50, 50] |" in text
     assert "Run on v, v." in text
+
+
+def changed(folder, *changes):
+    """The rows of a study, those of each change, (where, what), with what it says."""
+    rows = Results.read(folder).rows
+    for where, what in changes:
+        for row in rows:
+            if all(row[name] == value for name, value in where.items()):
+                row |= what
+    return Data(Results(rows, []))
+
+
+def test_pairs_leave_out_what_one_of_them_does_not_have(folder):
+    """A policy without a rate takes its pair with it; bases that all agree have an interval as wide as so few leave."""
+    in_pairs = [({"seed": seed}, {"block": str(seed)}) for seed in range(4)]
+    rates = [({"method": name}, {"crash_rate": rate}) for name, rate in (("uniform", 0.3), ("p25", 0.1))]
+    unknown = ({"method": "p25", "seed": 2}, {"crash_rate": math.nan})
+    (_, _, rows, *_) = report.outcomes(changed(folder, *in_pairs, *rates, unknown), "quad", 100)
+    shown = {row["method"]: row["P(safer than uniform)"] for row in rows}
+    assert shown["p25"] == "1.00 [0.29, 1.00]"  # Clopper and Pearson, 3 of 3
+
+
+def test_tables_say_nothing_of_what_is_not_there(folder):
+    """Columns that no method has are left out, and methods that nobody evaluated at a T; policies count without one."""
+    easy = [row for row in changed(folder, ({}, {"score": math.nan})).rows if row["goals"] == "naive"]
+    (_, text, rows, *_) = report.outcomes(Data(Results(easy, [])), "quad", 100)
+    assert "under the Adversary (nobody attacked)" in text
+    assert {tuple(row) for row in rows} == {("method", "seeds", "delivered dose")}
+    assert {row["seeds"] for row in rows} == {"4"}
+    two = changed(folder, ({"method": "p75", "environment": "quad"}, {"goal_period": 200}))
+    (_, _, first, *_), (_, _, second, *_) = (report.outcomes(two, "quad", period) for period in (100, 200))
+    assert {row["method"] for row in first} == {*METHODS} - {"p75"}
+    assert [row["method"] for row in second] == ["p75"]
+    assert "P(safer than uniform)" not in second[0]
+
+
+def test_means_of_some_policies_are_not_taken_for_all(folder):
+    """An attacker that some policies met stands in the table of means, which says so; nobody else is named."""
+    rows = [row for row in Results.read(folder).rows if row["goals"] == "naive" or row["seed"] < 2]
+    assert "the goals (adversary: of some policies):" in report.outcomes(Data(Results(rows, [])), "quad", 100)[3]
+    assert report.outcomes(Data.read(folder), "quad", 100)[3].endswith("by who chooses the goals:")
+
+
+def test_small_populations_are_told_what_so_few_can_say(folder):
+    """Four policies have the median between them in 1 - 2 / 2^4 of studies; thirty have no such limit."""
+    results = Results.read(folder)
+    assert "The smallest population here has 4 policies." in report.limits(Data(results))[1]
+    assert "of 4 of its policies in 87.5 % of studies" in report.limits(Data(results))[1]
+    one = Data(Results([row for row in results.rows if row["seed"] == 0], []))
+    assert "has 1 policy. With" in report.limits(one)[1]
+    assert "% of studies" not in report.limits(one)[1]
+
+
+def test_cells_without_results_are_named(folder, tmp_path):
+    """A report of what is left says that it is not all; cells whose rows are in the tables are not missing."""
+    fill(tmp_path)
+    for name in ("quad-p25-literal-s3-0123abcd", "quad-p25-literal-s4-4567abcd", "quad-vds-s0-89ab89ab"):
+        (tmp_path / "cells" / name).mkdir(parents=True)
+        (tmp_path / "cells" / name / "cell.json").write_text('{"environment": "quad", "config": {}}')
+    results = Results.read(tmp_path)
+    for row in results.rows:
+        row["hash"] = row["hash"].replace("quad-vds-0", "89ab89ab0123")
+    results.write(tmp_path)
+    data = Data.read(tmp_path)
+    said = [block for block in report.what_was_run(data) if "Cells without results" in block]
+    assert said == ["Cells without results: quad-p25-literal 2. They were given up or have not finished yet, and count "
+                    "nowhere."]  # fmt: skip
+    assert not any("Cells without results" in block for block in report.what_was_run(Data.read(folder)))
 
 
 def test_share_of_safe_policies_has_its_exact_interval(tmp_path):

@@ -266,6 +266,16 @@ def test_merge_adds_what_other_attackers_did_to_the_same_policies(tmp_path):
         merge(tmp_path / "all", [tmp_path / "d"])
 
 
+def test_attacks_of_elsewhere_stay_beside_the_cells(tmp_path):
+    """What was merged into a folder that has the cells counts there, and an export keeps it; other weights do not."""
+    fill_cell(tmp_path / "a", [result("1")], curve("1"))
+    fill(tmp_path / "b", [result("1"), result("1", goals="mine"), result("1", goals="theirs", weights="y")])
+    assert merge(tmp_path / "a", [tmp_path / "b"]) == (1, 1, 0)
+    for _ in range(2):
+        assert [row["goals"] for row in Results.read(tmp_path / "a").rows] == ["naive", "mine"]
+        assert merge(tmp_path / "a", [tmp_path / "a"]) == (0, 2, 0)
+
+
 def test_export_writes_the_tables_of_cells(tmp_path):
     """A folder that is merged with itself has tables that give the results of its cells again."""
     fill_cell(tmp_path / "a", [result("1")], curve("1"))

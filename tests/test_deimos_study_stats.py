@@ -64,6 +64,16 @@ def test_bootstrap_of_the_mean_has_its_known_spread():
     assert one != other
 
 
+def test_share_of_pairs_has_an_exact_interval():
+    """It is that of the wins; ties count half in the share, are lost at one end and won at the other."""
+    x = np.array([3.0, 3.0, 3.0, 3.0, 1.0])
+    found = stats.share_of_pairs(x, np.array([2.0, 2.0, 2.0, 3.0, 1.0]))
+    low, high = (scipy_stats.binomtest(k, 5).proportion_ci(0.95) for k in (3, 5))
+    assert (found.estimate, found.low, found.high) == (0.8, low.low, high.high)
+    every = stats.share_of_pairs(x + 1, x)
+    assert (every.estimate, every.low, every.high) == (1.0, pytest.approx(0.025 ** (1 / 5)), 1.0)
+
+
 def test_share_has_an_exact_interval():
     """None of ten is at most 31 % with 97.5 % certainty, and 9 of 10 has SciPy's interval of Clopper and Pearson."""
     none = stats.share(np.zeros(10, bool))

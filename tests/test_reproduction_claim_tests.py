@@ -176,6 +176,7 @@ def test_five_bases_cannot_order_two_methods():
     """Five signs of five are p = 1/16 on both sides: the clause is undecided, and says that nothing would be found."""
     found = Ordered(NAIVE, (("vds", "uniform"),)).find(in_blocks({"vds": 2 * BASE[:5], "uniform": BASE[:5]}), HERE)
     assert (found.p_for, found.verdict, found.detectable) == (2 / 32, "undecided", math.inf)
+    assert (found.interval.low, found.interval.high) == (pytest.approx(0.025 ** (1 / 5)), 1.0)  # Clopper and Pearson
     groups = Ordered(NAIVE, versus(["rnd", "vds"], ["uniform"]))
     values = {"vds": 2 * BASE[:5], "rnd": 2.1 * BASE[:5], "uniform": BASE[:5]}
     assert groups.find(in_blocks(values), HERE).verdict == "holds"  # of three in five blocks there are 6^5 orders

@@ -397,6 +397,35 @@ def test_page_of_a_map_that_is_not_finished(folders, tmp_path):
     assert (tmp_path / "page" / "figures" / "curve-p75.png").exists()
 
 
+def test_page_of_one_setting(folders, tmp_path):
+    """Of one setting, or of one where scores can be compared, there are means without intervals."""
+    table = folders[1] / "results.csv"
+    lines = table.read_text().splitlines(keepends=True)
+    table.write_text("".join([lines[0], *(line for line in lines if line.startswith("map.03"))]))
+    write(MultiverseOptions(out=tmp_path / "page", screening=folders[0], map=folders[1]))
+    assert "| p75 crashes less than uniform | 1 | " in (tmp_path / "page" / "multiverse.md").read_text()
+    assert f"{multiverse.mean(np.array([0.5])):g}" == "0.5"
+
+
+def test_page_says_why_a_selector_is_the_best():
+    """It names the rule that chose: safety at enough score, else the score, else safety alone."""
+    for score, words in ((1.0, "the most policies below 1 %"), (0.8, "none has 0.95 of Uniform's score"),
+                         (0.1, "scores can be compared nowhere")):  # fmt: skip
+        settings = simulated(
+            lambda method, levels, base: base,
+            lambda method, levels, own=score: own if method in NEW or own < 0.3 else 1.0,
+        )
+        new = multiverse.best_new(multiverse.standings(settings))
+        assert words in multiverse_page._mapped(settings, new)[-1]
+
+
+def test_page_of_other_methods_is_refused(folders, tmp_path):
+    """A study that is no map is refused by what it lacks, before anything is chosen of it."""
+    without(folders[1], *(f"{name},{method}," for name in points() for method in NEW))
+    with pytest.raises(RunError, match="one pNN and one penalty; it has: p75, penalty-30, rnd, uniform"):
+        write(MultiverseOptions(out=tmp_path / "page", screening=folders[0], map=folders[1]))
+
+
 def test_page_says_as_much_as_has_run(folders, tmp_path, capsys):
     """After the screening headroom; after the map clauses, methods, the best and pictures; then the confirmation."""
     out = tmp_path / "page"

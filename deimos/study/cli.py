@@ -107,7 +107,8 @@ class RunOptions(_WorkOptions):
     device: str | None = None
     """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
-    """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell."""
+    """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell, but
+    belong to what it is named by: give a study the same."""
     retry_failed: bool = False
     """Whether to try the cells again that were given up."""
     estimate: bool = False
@@ -149,6 +150,8 @@ class RunOptions(_WorkOptions):
             takes = estimate(study, open_)
             print(takes.text, file=sys.stderr, flush=True)
             seconds = takes.seconds
+        elif self.estimate:
+            print("All cells are finished.", file=sys.stderr)
         if not self.estimate:
             self._work(study, stopped, report, seconds)
 

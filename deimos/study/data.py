@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deimos.study.results import Results, Row, settings
+from deimos.study.results import Results, Row, settings, without_results
 from deimos.study.stats import Array
 
 _COLOURS = "#0072B2 #E69F00 #009E73 #CC79A7 #D55E00 #56B4E9 #7f7f7f #a6761d #332288 #e7298a".split()
@@ -70,11 +70,14 @@ class Data:
     """
 
     def __init__(
-        self, results: Results, style: Style | None = None, settings: Mapping[str, Mapping] | None = None
-    ) -> None:
+        self, results: Results, style: Style | None = None, settings: Mapping[str, Mapping] | None = None,
+        lacking: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         results.check()
         self.settings = settings or {}
         """Configurations by environment, as JSON types; none where the tables are all that there is."""
+        self.lacking = lacking
+        """Names of cells that have no results: they were given up, or have not run yet."""
         self._results, self.rows = results, results.rows
         self.style = (style or Style()).complete(sorted({row["method"] for row in self.rows}))
         self._samples: dict[tuple[Where, str], dict[int, Row]] = defaultdict(dict)
@@ -86,12 +89,13 @@ class Data:
     @classmethod
     def read(cls, folder: Path, style: Style | None = None) -> "Data":
         """The results of a folder; raises ``RunError`` if there are none, or as ``Results.read`` and ``check`` do."""
-        return cls(Results.read(folder, may_be_empty=False), style, settings(folder))
+        results = Results.read(folder, may_be_empty=False)
+        return cls(results, style, settings(folder), without_results(folder, results))
 
     def only(self, methods: Collection[str]) -> "Data":
         """The same results without those of other methods."""
         rows, curves = ([row for row in rows if row["method"] in methods] for rows in (self.rows, self._results.curves))
-        return Data(Results(rows, curves), self.style, self.settings)
+        return Data(Results(rows, curves), self.style, self.settings, self.lacking)
 
     @property
     def curve_rows(self) -> list[Row]:
@@ -117,9 +121,10 @@ class Data:
         """The evaluations of an environment under one kind of goals."""
         return [Where(environment, goals, period) for period in self.periods(environment)]
 
-    def methods(self, environment: str) -> list[str]:
-        """Methods that an environment has results of, in order."""
-        return self._sorted({row["method"] for row in self.rows if row["environment"] == environment})
+    def methods(self, environment: str, period: int | None = None) -> list[str]:
+        """Methods that an environment has results of, at one T or at any, in order."""
+        own = [row for row in self.rows if row["environment"] == environment and period in (None, row["goal_period"])]
+        return self._sorted({row["method"] for row in own})
 
     def _sorted(self, names: Collection[str]) -> list[str]:
         """Names in order; the numbers in those that have no place in it count as numbers."""
@@ -146,6 +151,14 @@ class Data:
         chosen = sorted(rows) if seeds is None else [seed for seed in seeds if seed in rows]
         values = np.array([_metric(rows[seed], metric) for seed in chosen], float)
         return values[~np.isnan(values)]
+
+    def in_pairs(self, where: Where, methods: Sequence[str], metric: str) -> list[Array]:
+        """The samples of some methods over the seeds of which all of them have the metric."""
+        both = [
+            [self.sample(where, name, metric, [seed]) for name in methods] for seed in self.seeds(where, methods)
+        ]  # fmt: skip
+        known = [[float(x[0]) for x in values] for values in both if all(map(len, values))]
+        return [*np.array(known, float).reshape(-1, len(methods)).T]
 
     def parts(self, where: Where) -> dict[str, str]:
         """The metrics ``tracking:...`` and ``errors:...`` that an evaluation has, with what they are."""

@@ -19,6 +19,7 @@ from deimos.sim.shared import one_stream
 from deimos.study.audits import points
 from deimos.study.folder import StudyFolder
 from deimos.study.plan import Cell
+from deimos.study.results import Results
 
 SECONDS = 10.0  # of training that a kind of cells is measured for, at most; a period of goals if that is less
 PLAYED = 50  # steps of a policy that evaluations are measured by
@@ -57,7 +58,8 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> Estimate:
     for cell in cells:
         kinds[cell.setting, kind(cell.config.goals)].append(cell)
     ran: dict[tuple[str, str], list[float]] = defaultdict(list)
-    for row in study.results().rows:
+    results = study.results()
+    for row in results.rows:
         ran[row["setting"], row["method"]].append(row["fps"])
     sample = random.Random(0).sample([*kinds], min(MOST_KINDS, len(kinds)))
     measures = {name: _measure(kinds[name][0]) for name in sample}
@@ -69,7 +71,7 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> Estimate:
         for cell in own:
             known = [fps for fps in ran[cell.setting, cell.config.label] if fps > 0]
             measured |= not known
-            transitions, steps = cost(study, cell)
+            transitions, steps = cost(study, cell, results)
             trained, acted = trained + transitions, acted + steps
             rate = median(known) if known else speed.training
             seconds[cell.name] = transitions / rate, steps / speed.acting
@@ -83,11 +85,14 @@ def estimate(study: StudyFolder, cells: Iterable[Cell]) -> Estimate:
     )
 
 
-def cost(study: StudyFolder, cell: Cell) -> tuple[int, int]:
-    """Transitions that a cell still has to be trained for at most, and world-steps of all else that it lacks."""
+def cost(study: StudyFolder, cell: Cell, results: Results | None = None) -> tuple[int, int]:
+    """Transitions that a cell still has to be trained for at most, and world-steps of all else that it lacks.
+
+    For ``results`` see ``StudyFolder.missing``.
+    """
     config = cell.config
     if (study.cell_path(cell) / "result.json").exists():
-        return 0, sum(evaluation_steps(config.eval, names) for names in study.missing(cell).values())
+        return 0, sum(evaluation_steps(config.eval, names) for names in study.missing(cell, results).values())
     transitions = config.iterations * config.ppo.num_steps * config.num_envs
     parts = [("naive", *config.eval.attackers)] + ([added] if (added := study.added(cell)) else [])
     evaluated = len(cell.goal_periods) * sum(evaluation_steps(config.eval, part) for part in parts)

@@ -79,16 +79,15 @@ class StudyFolder:
         wanted = [each for each in self.rounds() if not each.seeds or cell.config.seed in each.seeds]
         return tuple(dict.fromkeys(name for each in wanted for name in each.attackers))
 
-    def missing(self, cell: Cell) -> dict[int, tuple[str, ...]]:
-        """The added attackers that a finished cell has not met yet, by T; none where it has met all."""
+    def missing(self, cell: Cell, results: Results | None = None) -> dict[int, tuple[str, ...]]:
+        """The added attackers that a finished cell has not met yet, by T; none where it has met all.
+
+        ``results`` are those of the study, from a caller who asks for many cells.
+        """
         if not (names := self.added(cell)):
             return {}
-        rows = Results.of_cell(self.cell_path(cell)).rows or [
-            row for row in self.results().rows if row["hash"] == cell.digest
-        ]
-        met = {(row["goal_period"], row["goals"]) for row in rows}
-        left = {period: tuple(n for n in names if (period, n) not in met) for period in cell.goal_periods}
-        return {period: attackers for period, attackers in left.items() if attackers}
+        left = _left(cell, names, results or Results.of_cell(self.cell_path(cell)))
+        return _left(cell, names, self.results()) if left and results is None else left
 
     def scale(self, task: dict, compute: Callable[[], Scale]) -> Scale:
         """The scale of the score in a task: as an earlier cell found it, or computed and kept for the later ones."""
@@ -133,8 +132,10 @@ class StudyFolder:
         cells = list(cells)
         there = {cell.digest for cell in cells if (self.cell_path(cell) / "result.json").exists()}
         others = {cell.digest for cell in cells} - there
-        there |= others & {row["hash"] for row in self.results().rows} if others else set()
-        return {cell.digest for cell in cells if cell.digest in there and not self.missing(cell)}
+        found = self.results() if others or (len(cells) > 1 and self.rounds()) else None
+        if found is not None:
+            there |= others & {row["hash"] for row in found.rows}
+        return {cell.digest for cell in cells if cell.digest in there and not self.missing(cell, found)}
 
     def failures(self, cell: Cell) -> list[str]:
         """How a cell's workers have died so far, one line each."""
@@ -159,6 +160,13 @@ class StudyFolder:
         """Let every failed cell be tried again."""
         for path in self.path.glob("cells/*/failures.jsonl"):
             path.unlink(missing_ok=True)
+
+
+def _left(cell: Cell, names: Iterable[str], results: Results) -> dict[int, tuple[str, ...]]:
+    """Those of some attackers that a cell has not met by some results, by T."""
+    met = {(row["goal_period"], row["goals"]) for row in results.rows if row["hash"] == cell.digest}
+    left = {period: tuple(name for name in names if (period, name) not in met) for period in cell.goal_periods}
+    return {period: attackers for period, attackers in left.items() if attackers}
 
 
 def _made_as(cell: Cell, row: Row) -> Cell:

@@ -1,8 +1,9 @@
 """Tests of populations by permutation: exact where the populations are equal, and close to it where they are not.
 
 A sample is a float array of shape (..., n), one value per trained policy; leading axes hold many studies at once, each
-tested by itself. Every statistic is divided by its own standard error before it is compared with those of relabelled
-samples, so that its level holds, for more and more policies, also where populations differ in what is not tested [1]_.
+tested by itself. Except in blocks, every statistic is divided by its own standard error before it is compared with
+those of relabelled samples, so that its level holds, for more and more policies, also where populations differ in what
+is not tested [1]_.
 
 References:
     .. [1] Chung and Romano, *Exact and Asymptotically Robust Permutation Tests*, Annals of Statistics 41, 2013.

@@ -31,7 +31,6 @@ from deimos.study.outcomes import (
     of_factors,
     settings_of,
 )
-from deimos.study.permutation import superiority_in_blocks
 from deimos.study.stats import Array
 
 Pictures = Mapping[str, Sequence[Block]]
@@ -39,12 +38,14 @@ Pictures = Mapping[str, Sequence[Block]]
 
 FIGURES = "figures"
 FACTORS = ""
+MOST_OF_FEW = 5  # policies, whose lowest and highest have the median between them in less than 95 % of studies
 COVERAGE = (  # docs/lab/study.md; `python -m reproduction coverage` simulates it again
-    "Intervals of shares of policies are exact, but for those over all environments; all others are percentile "
-    "bootstraps over policies, but for the means under Distributions. Those of IQMs and medians cover 93 to 94 % at "
-    "n = 10, of normal, lognormal and bimodal data alike; ratios of spreads 94, 90 and 90 %; those of means 91, 81 and "
-    "80 %, so read the mean rates of skewed populations with care. The means under Distributions have bootstrap-t "
-    "intervals (95, 91 and 95 %); of few seeds, or many equal values, a mean has none there."
+    "Intervals of shares of policies and of pairs are exact, but for those over all environments; all others are "
+    "percentile bootstraps over policies, but for the means under Distributions. Those of IQMs and medians cover 93 to "
+    "94 % at n = 10, of normal, lognormal and bimodal data alike; ratios of spreads 94, 90 and 90 %; those of means "
+    "91, 81 and 80 %, so read the mean rates of skewed populations with care. The means under Distributions have "
+    "bootstrap-t intervals (95, 91 and 95 %); of few seeds, or many equal values, a mean has none there. A bootstrap "
+    "interval without width says that these policies agree, not that all would."
 )
 _median = partial(np.median, axis=-1)
 
@@ -102,7 +103,9 @@ def what_was_run(data: Data) -> list[Block]:
         policies = {(row["method"], row["seed"]): row["env_steps"] * row["num_envs"] for row in own}
         rows.append({
             "environment": environment, "methods": ", ".join(methods),
-            "runs": ", ".join(f"{n} seeds x {k} methods" for n, k in sorted(counts.items())),
+            "runs": ", ".join(
+                f"{n} seed{'s' * (n > 1)} x {k} method{'s' * (k > 1)}" for n, k in sorted(counts.items())
+            ),
             "worlds": _values(own, "num_envs"), "parallel steps": _values(own, "env_steps"),
             "transitions, all": f"{sum(policies.values()) / 1e6:.0f} M" if trained_in == environment
             else f"those of {trained_in}",
@@ -112,7 +115,7 @@ def what_was_run(data: Data) -> list[Block]:
         })  # fmt: skip
     versions = sorted({f"{row['device']}, {row['versions']}" for row in data.rows})
     return [
-        "## What was run", rows, *_uninformed(data), "Run on " + "; ".join(versions) + ".",
+        "## What was run", rows, *_lacking(data), *_uninformed(data), "Run on " + "; ".join(versions) + ".",
         "### Hyper-parameters", *hyper_parameters(data.settings),
     ]  # fmt: skip
 
@@ -146,6 +149,15 @@ def _flat(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 
 def _values(rows: Sequence[dict], column: str) -> str:
     return ", ".join(map(str, sorted({row[column] for row in rows})))
+
+
+def _lacking(data: Data) -> list[Block]:
+    """Which cells have no results, so that nobody takes those that have for all."""
+    counts = Counter(name.rsplit("-", 2)[0] for name in data.lacking)  # without seed and hash
+    if not counts:
+        return []
+    names = ", ".join(f"{name} {count}" for name, count in counts.items())
+    return [f"Cells without results: {names}. They were given up or have not finished yet, and count nowhere."]
 
 
 def _uninformed(data: Data) -> list[Block]:
@@ -183,12 +195,13 @@ def environments(data: Data, pictures: Pictures) -> list[Block]:
 def outcomes(data: Data, environment: str, period: int) -> list[Block]:
     """The primary outcomes of every method, and its mean rates under each attacker."""
     hard, easy = attacked(data, environment, period), Where(environment, "naive", period)
-    names = data.methods(environment)
+    names = data.methods(environment, period)
     under_attack = {name: data.sample(hard.where, name, hard.metric) for name in names}
-    met = [
-        goals for goals in data.goals
-        if any(len(data.sample(Where(environment, goals, period), name, "crash_rate")) for name in names)
-    ]  # fmt: skip
+    rates = {goals: [len(data.sample(Where(environment, goals, period), name, "crash_rate")) for name in names]
+             for goals in data.goals}  # fmt: skip
+    met = [goals for goals, sizes in rates.items() if any(sizes)]
+    few = ", ".join(goals for goals in met if sum(rates[goals]) < max(map(sum, rates.values())))
+    of_some = f" ({few}: of some policies)" if few else ""
     by = hard.by if any(map(len, under_attack.values())) else f"{hard.by} (nobody attacked)"
     rows, by_attacker = [], []
     for name, rate in under_attack.items():
@@ -196,7 +209,7 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
         doses = [*data.delivered(environment, name).values()]
         better = _safer(data, hard, name) if name != data.style.reference else "-"
         rows.append({
-            "method": name, "seeds": str(max(len(rate), len(score))),
+            "method": name, "seeds": str(max(len(rate), len(score)) or len(data.seeds(easy, [name]))),
             f"policies below {SAFE:g} % [%]": _share(100 * rate < SAFE),
             "mean rate [%]": _boot(100 * rate, _mean),
             f"P(safer than {data.style.reference})": better,
@@ -211,20 +224,26 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
         f"### {environment}, T = {period}: outcomes",
         f"Crashes per interaction under {by}, the score under uniform goals; with 95 % intervals over policies."
         + late_doses(data, environment),
-        rows, "Mean crashes per interaction [%] by who chooses the goals:", by_attacker,
+        told(rows), f"Mean crashes per interaction [%] by who chooses the goals{of_some}:", by_attacker,
     ]  # fmt: skip
+
+
+def told(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    """The rows of a table without the columns that none of them says anything in."""
+    kept = [title for title in rows[0] if any(row[title] != "-" for row in rows)]
+    return [{title: row[title] for title in kept} for row in rows]
 
 
 def _safer(data: Data, hard: Attacked, method: str) -> str:
     """P(safer than the reference); where methods are compared seed by seed, how often it is, over seeds."""
     both, paired = (data.style.reference, method), data.paired(hard.where.environment)
-    seeds = data.seeds(hard.where, both) if paired else None
-    base, rate = (data.sample(hard.where, name, hard.metric, seeds) for name in both)
+    base, rate = (
+        data.in_pairs(hard.where, both, hard.metric) if paired
+        else (data.sample(hard.where, name, hard.metric) for name in both)
+    )  # fmt: skip
     if min(len(base), len(rate)) < 2:
         return "-"
-    if paired:
-        return f"{stats.bootstrap([base, rate], superiority_in_blocks([(0, 1)]), paired=True):.2f}"
-    return f"{stats.probability_of_improvement([(base, rate)]):.2f}"
+    return f"{stats.share_of_pairs(base, rate) if paired else stats.probability_of_improvement([(base, rate)]):.2f}"
 
 
 def distributions(data: Data) -> list[Block]:
@@ -244,13 +263,12 @@ def _table(data: Data, where: Where) -> list[Block]:
         if len(crashes) < 2:
             continue
         reward, score = (data.sample(where, name, metric) for metric in ("reward", "score"))
-        mean = stats.bootstrap_t(crashes)
+        mean = stats.bootstrap_t(crashes)  # wide of few policies, or where most do not crash
+        within = replace(mean, low=max(mean.low, 0.0), high=min(mean.high, 100.0))  # as shares are
         rows.append({
             "method": name, "seeds": str(len(crashes)),
             "crashes: median": _boot(crashes, _median), "IQM": _boot(crashes, stats.iqm),
-            # Where most policies do not crash, the bootstrap-t is wide on both sides; shares are not below 0.
-            "mean": f"{replace(mean, low=max(mean.low, 0.0)):.3g}" if math.isfinite(mean.high)
-            else f"{mean.estimate:.3g} (no interval)",
+            "mean": f"{within:.3g}" if math.isfinite(mean.high) else f"{mean.estimate:.3g} (no interval)",
             "worst 20 % (CVaR)": _boot(crashes, stats.cvar), "IQR": _boot(crashes, stats.iqr),
             "10 % to 90 %": " to ".join(f"{x:.3g}" for x in np.quantile(crashes, [0.1, 0.9])),
             "reward: IQM": _boot(reward, stats.iqm, ".4f"), "score: IQM": _boot(score, stats.iqm, ".3f"),
@@ -315,22 +333,26 @@ def speed(data: Data) -> list[Block]:
         "Frames per second over all worlds during training, learning included: mean over seeds ± standard error. They "
         "say what a study costs; runs shared the machine, so methods are compared by `python -m benchmarks table41`."
     )
-    return ["## Speed", text, rows] if rows else []
+    return ["## Speed", text, told(rows)] if rows else []
 
 
 def limits(data: Data) -> list[str]:
     """What a reader must bear in mind, one text each."""
-    apart = [name for name in data.environments if not data.paired(name)]
-    sizes = [len(data.sample(place, name, "crashes")) for environment in apart
-             for place in data.places(environment, "naive") for name in data.methods(environment)]  # fmt: skip
+    sizes = [
+        len(data.seeds(place, [name])) for environment in data.environments
+        for place in data.places(environment, "naive") for name in data.methods(environment, place.period)
+    ]  # fmt: skip
+    least = min((size for size in sizes if size), default=0)
     p10, p30 = (stats.detectable_probability(n, n) for n in (10, 30))
-    power = [
-        f"The smallest population here has {min(sizes)} policies. With a power of 80 %, a rank-sum test finds P(x > y) "
-        f"= {p10:.2f} with 10 a side and {p30:.2f} with 30."
-    ] if sizes else []  # fmt: skip
+    size = f"The smallest population here has {least} {'policy' if least == 1 else 'policies'}."
+    power = f" With a power of 80 %, a rank-sum test finds P(x > y) = {p10:.2f} with 10 a side and {p30:.2f} with 30."
+    few = (
+        f" A population's median lies between the lowest and the highest of {least} of its policies in "
+        f"{100 - 100 * 0.5 ** (least - 1):.3g} % of studies, and no percentile interval reaches beyond these."
+    )
     return [
         "The unit is one trained policy. Its worlds and episodes are no replicates.",
-        *power,
+        size + power * (not all(map(data.paired, data.environments))) + few * (2 <= least <= MOST_OF_FEW),
         COVERAGE,
         "CVaR over seeds is too low in small populations.",
         "The mean reward per transition pays for crashing where a crash puts the robot back to safety; the score does "

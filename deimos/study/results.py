@@ -1,7 +1,8 @@
 """The results of a study: a row per policy and evaluation, and one per training curve.
 
 A cell leaves its own in ``result.json``. The tables ``results.csv`` and ``curves.csv`` are what is exported, merged and
-kept; a folder's results are those of its cells, and those of its tables that are of no cell there.
+kept; a folder's results are those of its cells, and of its tables those that no cell there has: other cells, and what
+other attackers have done to the policies of these.
 """
 
 import csv
@@ -95,7 +96,8 @@ class Results:
             own = cls.of_cell(path.parent)
             found.rows += own.rows
             found.curves += own.curves
-        found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())))
+        # A merge puts what attackers did elsewhere to the policies of these cells into the tables alone.
+        found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())), attacks=True)
         found.find_worst()
         if not found.rows and not may_be_empty:
             raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
@@ -291,6 +293,13 @@ def settings(folder: Path) -> dict[str, dict]:
         except (KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path} does not describe a cell ({one_line(error)}).") from error
     return found
+
+
+def without_results(folder: Path, results: Results) -> list[str]:
+    """Names of the cells of a study's folder that none of its results are of: given up, or not finished yet."""
+    there = {row["hash"][:8] for row in results.rows}  # as a cell's name ends
+    names = [path.parent.name for path in sorted(folder.glob("cells/*/cell.json"))]
+    return [name for name in names if name.rpartition("-")[2] not in there]
 
 
 def _evaluation(row: Row) -> tuple:

@@ -141,6 +141,16 @@ def share(holds: NDArray[np.bool_]) -> Interval:
     return Interval(float(found.statistic), float(interval.low), float(interval.high))
 
 
+def share_of_pairs(x: Array, y: Array) -> Interval:
+    """P(X > Y) of values that belong together, ties counting half, with the exact interval of ``share``.
+
+    Ties are lost at its lower end and won at its upper one.
+    """
+    x, y = _checked(x), _checked(y)
+    lost, won = share(x > y), share(x >= y)
+    return Interval((lost.estimate + won.estimate) / 2, lost.low, won.high)
+
+
 def probability_of_improvement(
     pairs: Sequence[tuple[Array, Array]], *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
