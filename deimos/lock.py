@@ -14,6 +14,7 @@ from deimos.checks import RunError
 from deimos.files import open_file
 
 POLL_SECONDS = 0.1
+NAME_POLLS = 10  # for the name of one that has just taken a lock
 
 if sys.platform == "win32":
     import msvcrt
@@ -49,7 +50,7 @@ def hold(path: Path, what: str, *, patience: float = 0.0, one_machine: bool = Fa
             file = stack.enter_context(open_file(path, "a+"))
             while not _is_taken(file):
                 if patience <= 0.0:
-                    raise RunError(f"{what} is being worked on by {_holder(file)[1]}.")
+                    raise RunError(f"{what} is being worked on by {_name_of_holder(file)}.")
                 time.sleep(POLL_SECONDS)
                 patience -= POLL_SECONDS
         except OSError as error:
@@ -76,6 +77,16 @@ def _is_taken(file: IO[str]) -> bool:
     return True
 
 
+def _name_of_holder(file: IO[str]) -> str:
+    """Who has taken the lock of a file, in words; waits for one that has only just taken it to write its name."""
+    for _ in range(NAME_POLLS):
+        machine, holder = _holder(file)
+        if machine:
+            break
+        time.sleep(POLL_SECONDS)
+    return holder
+
+
 def _holder(file: IO[str]) -> tuple[str, str]:
     """Machine that a lock file names, and machine and process in words; an empty machine if it names none."""
     file.seek(0)
@@ -83,4 +94,4 @@ def _holder(file: IO[str]) -> tuple[str, str]:
         found = json.loads(file.read())
         return found["machine"], f"process {found['process']} on {found['machine']}"
     except (ValueError, KeyError, TypeError):
-        return "", "another process"  # it is just being written
+        return "", "another process"  # it is just being written, or has just been wiped

@@ -110,3 +110,17 @@ def test_file_system_without_locks_is_refused(tmp_path, monkeypatch):
         pass
     with pytest.raises(RunError, match="No such file"), lock.hold(tmp_path / "missing" / "lock", "It"):
         pass
+
+
+def test_who_has_only_just_taken_it_is_named(tmp_path, monkeypatch):
+    """Between taking a lock and writing its name lies a moment; who comes then waits for the name."""
+    path, name = tmp_path / "lock", json.dumps({"machine": "there", "process": 7})
+    with path.open("a+") as file:
+        lock._lock(file)
+        monkeypatch.setattr(lock.time, "sleep", lambda seconds: print(name, end="", file=file, flush=True))
+        with pytest.raises(RunError, match="It is being worked on by process 7 on there"), lock.hold(path, "It"):
+            pass
+        file.truncate(0)
+        monkeypatch.setattr(lock.time, "sleep", lambda seconds: None)
+        with pytest.raises(RunError, match="It is being worked on by another process"), lock.hold(path, "It"):
+            pass
