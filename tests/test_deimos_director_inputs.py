@@ -9,7 +9,7 @@ import torch
 
 from deimos import GoalDirector
 from deimos.goals.fear import FearConfig
-from deimos.goals.selectors import director
+from deimos.goals.selectors import director, uniform
 
 AFRAID = director.Config(percentile=75, candidates=20, fear=FearConfig(min_per_class=4))
 N = 64
@@ -266,6 +266,21 @@ def test_horizons_are_checked(horizon):
     )
     with pytest.raises(ValueError, match=r"horizon must be (in \[1, 5\]|a whole number or 2 of them), got "):
         goals.propose([0, 1], torch.zeros(2, 2), torch.zeros(2, 1), horizon=horizon)
+
+
+def test_goals_of_a_fixed_period_are_not_announced_shorter():
+    """Too few outcomes are kept for shorter ones; the message says what takes them."""
+    goals = GoalDirector("uniform", 5, num_envs=2, state_dim=2, goal_dim=1, device="cpu", goal_box=([0], [1]))
+    goals.propose(None, torch.zeros(2, 2), torch.zeros(2, 1), horizon=5)
+    with pytest.raises(ValueError, match=r"horizon must be goal_period, 5, got \[5, 4\]; GoalDirector\(max_"):
+        goals.propose(None, torch.zeros(2, 2), torch.zeros(2, 1), horizon=[5, 4])
+
+
+@pytest.mark.parametrize("selector", [uniform.Config, uniform, 75])
+def test_a_selector_is_a_name_or_a_configuration(selector):
+    """A class, a module or a number is none."""
+    with pytest.raises(ValueError, match=r"selector must be a deimos.goals.selector.SelectorConfig, got "):
+        GoalDirector(selector, 5)
 
 
 OPTIONS = [

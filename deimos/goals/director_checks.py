@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice, check_range
+from deimos.checks import check_at_least, check_choice, check_is, check_range
 from deimos.goals import given
 from deimos.goals.given import Bound, Candidates, Inputs
 from deimos.goals.selector import SelectorConfig
@@ -52,7 +52,11 @@ def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **oth
         config: The selector's; its plain fields count, and those of the dataclasses in it.
         goal_box: Lowest and highest goal.
         **others: What else counts, plain.
+
+    Raises:
+        ValueError: If the configuration is none, but a selector or its class.
     """
+    check_is("selector", config, SelectorConfig)
     box = None if goal_box is None else [_numbers(end) for end in goal_box]
     kind = f"{type(config).__module__}.{type(config).__qualname__}"
     return {"selector": kind, **_plain_fields(config), **others, "goal_box": box}
