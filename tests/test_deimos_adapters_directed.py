@@ -239,6 +239,12 @@ def test_refuses_what_does_not_fit():
         ValueError, match="reward must be a function where observations have no achieved_goal, got None"
     ):
         DirectedVecEnv(flat, director, slice(2, 3))
+    column = {"where": slice(2, 3), "reward": lambda obs, own: -np.abs(obs[:, 2:])}
+    two = DummyVecEnv([Counter] * 2), SyncVectorEnv([Counter] * 2)
+    for envs in (DirectedVecEnv(two[0], director, **column), DirectedVectorEnv(two[1], director, **column)):
+        envs.reset()
+        with pytest.raises(ValueError, match=r"reward must give the shape \(2,\), got \(2, 1\)"):
+            envs.step(np.zeros((2, 1), np.float32))
 
 
 def test_hindsight_experience_replay_runs():
