@@ -74,7 +74,7 @@ class GoalDirector:
             Outcomes are kept for 2 T steps or, if more, ``learn_every + T``: ``4 (state_dim + 2 goal_dim + 12)`` bytes
             per world for every T; where goals may be shorter, the newest, up to 32 MiB in all or 8 per world.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
-        seed: Seed of the selector's networks and of every choice, in [0, 2^32).
+        seed: Of the selector's networks and of every choice, in [0, 2^32); two Directors of one seed choose alike.
 
     Raises:
         ValueError: If an option is not valid, here or at the first call where sizes are left to it.
