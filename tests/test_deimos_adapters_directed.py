@@ -321,6 +321,18 @@ def test_a_director_that_expects_other_resets_is_refused(mode):
         play(envs, LIMIT)
 
 
+def test_a_vector_may_name_its_mode_by_its_value():
+    """It is that mode, not the other one; a vector that says nothing is refused."""
+    worlds = SyncVectorEnv([Counter] * 4, autoreset_mode=AutoresetMode.NEXT_STEP)
+    worlds.metadata = {"autoreset_mode": "NextStep"}
+    director = GoalDirector("uniform", PERIOD, goal_box=BOX)
+    with pytest.raises(ValueError, match="director must be made with autoreset='NextStep'"):
+        play(DirectedVectorEnv(worlds, director, slice(2, 3), closeness), LIMIT)
+    worlds.metadata = {}
+    with pytest.raises(ValueError, match=r"worlds that are done by itself, got None for its metadata"):
+        DirectedVectorEnv(worlds, director, slice(2, 3), closeness)
+
+
 def test_fear_is_learnt_in_a_wrapped_vector():
     """The wrapper hands over outcomes from which the Director's network learns."""
     _, director = histories(AutoresetMode.NEXT_STEP, parted=False, selector="p75", steps=200)

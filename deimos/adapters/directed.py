@@ -135,16 +135,19 @@ class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
         reward: Rewards for the goals in force; see ``Reward``.
 
     Raises:
-        ValueError: If observations have no such place, or if nothing resets a world that is done.
+        ValueError: If observations have no such place, or if nothing resets a world that is done, or does not say how.
     """
 
     def __init__(
         self, env: gymnasium.vector.VectorEnv, director: GoalDirector, where: slice | str, reward: Reward
     ) -> None:
         super().__init__(env)
-        self._mode = env.metadata["autoreset_mode"]
+        known = env.metadata.get("autoreset_mode")
+        self._mode = AutoresetMode(known or AutoresetMode.DISABLED)  # some name the mode by its value
         if self._mode is AutoresetMode.DISABLED:
-            raise ValueError("env must reset worlds that are done by itself, got AutoresetMode.DISABLED.")
+            raise ValueError(
+                f"env must reset worlds that are done by itself, got {known} for its metadata['autoreset_mode']."
+            )
         next_step = self._mode is AutoresetMode.NEXT_STEP
         self.slot = GoalSlot(director, env.single_observation_space, env.num_envs, where, next_step)
         self._reward, self._over = reward, np.zeros(env.num_envs, dtype=bool)
