@@ -289,6 +289,7 @@ OPTIONS = [
     ({"max_horizon": 0}, "max_horizon must be at least 1, got 0"),
     ({"goal_period": 5, "num_envs": 0}, "num_envs must be at least 1, got 0"),
     ({"goal_period": 5, "autoreset": "Sometimes"}, "autoreset must be one of SameStep, NextStep, Disabled, got 'Some"),
+    ({"goal_period": 5, "device": "gpu"}, "device must be one that torch has, got 'gpu': "),
     ({"goal_period": 5, "first_goals": "any"}, "first_goals must be one of uniform, chosen, got 'any'"),
 ]
 KNOWN = {"num_envs": 2, "state_dim": 3, "goal_dim": 1, "device": "cpu", "goal_period": 5}

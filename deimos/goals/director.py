@@ -14,7 +14,7 @@ from deimos.checks import check_at_least
 from deimos.goals import given
 from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore, window_between
-from deimos.goals.director_checks import check_candidates, check_options, refuse_unsound, settings, unpacked
+from deimos.goals.director_checks import check_candidates, check_options, placed, refuse_unsound, settings, unpacked
 from deimos.goals.fear_selector import FearEstimate, fear_selector
 from deimos.goals.given import A, Array, Bound, Candidates, GoalBox, Inputs, Rows
 from deimos.goals.horizons import Horizons
@@ -105,8 +105,7 @@ class GoalDirector:
             self._config, goal_box, **periods, horizon_input=horizon_input, first_goals=first_goals, seed=seed,
             next_step=self._next_step, groups=[str(part) for part in self._groups],
         )  # fmt: skip
-        known = None if device is None else torch.empty(0, dtype=torch.float32, device=device).device
-        self._told = [*sizes.values()], known
+        self._told = [*sizes.values()], None if device is None else placed(device)
         self._start_anew()
 
     def _start_anew(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice, check_is, check_range
+from deimos.checks import check_at_least, check_choice, check_is, check_range, one_line
 from deimos.goals import given
 from deimos.goals.given import Bound, Candidates, Inputs
 from deimos.goals.selector import SelectorConfig
@@ -43,6 +43,18 @@ def check_options(
     check_at_least("learn_every", learn_every, 1)
     check_at_least("total_steps", total_steps, 0)
     check_range("seed", seed, 0, 2**32 - 1)
+
+
+def placed(device: torch.device | str) -> torch.device:
+    """The device with its number, as tensors there have it.
+
+    Raises:
+        ValueError: If torch has no such device.
+    """
+    try:
+        return torch.empty(0, dtype=torch.float32, device=device).device
+    except (AssertionError, RuntimeError) as error:  # the former where torch was built without CUDA
+        raise ValueError(f"device must be one that torch has, got {str(device)!r}: {one_line(error)}") from error
 
 
 def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **others: Any) -> dict[str, Any]:
