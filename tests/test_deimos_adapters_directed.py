@@ -239,6 +239,12 @@ def test_refuses_what_does_not_fit():
         ValueError, match="reward must be a function where observations have no achieved_goal, got None"
     ):
         DirectedVecEnv(flat, director, slice(2, 3))
+    column = {"where": slice(2, 3), "reward": lambda obs, own: -np.abs(obs[:, 2:])}
+    two = DummyVecEnv([Counter] * 2), SyncVectorEnv([Counter] * 2)
+    for envs in (DirectedVecEnv(two[0], director, **column), DirectedVectorEnv(two[1], director, **column)):
+        envs.reset()
+        with pytest.raises(ValueError, match=r"reward must give the shape \(2,\), got \(2, 1\)"):
+            envs.step(np.zeros((2, 1), np.float32))
 
 
 def test_hindsight_experience_replay_runs():
@@ -313,6 +319,18 @@ def test_a_director_that_expects_other_resets_is_refused(mode):
     envs = DirectedVectorEnv(SyncVectorEnv([Counter] * 4, autoreset_mode=mode), director, slice(2, 3), closeness)
     with pytest.raises(ValueError, match=f"director must be made with autoreset='{mode.value}'"):
         play(envs, LIMIT)
+
+
+def test_a_vector_may_name_its_mode_by_its_value():
+    """It is that mode, not the other one; a vector that says nothing is refused."""
+    worlds = SyncVectorEnv([Counter] * 4, autoreset_mode=AutoresetMode.NEXT_STEP)
+    worlds.metadata = {"autoreset_mode": "NextStep"}
+    director = GoalDirector("uniform", PERIOD, goal_box=BOX)
+    with pytest.raises(ValueError, match="director must be made with autoreset='NextStep'"):
+        play(DirectedVectorEnv(worlds, director, slice(2, 3), closeness), LIMIT)
+    worlds.metadata = {}
+    with pytest.raises(ValueError, match=r"worlds that are done by itself, got None for its metadata"):
+        DirectedVectorEnv(worlds, director, slice(2, 3), closeness)
 
 
 def test_fear_is_learnt_in_a_wrapped_vector():

@@ -9,7 +9,7 @@ import torch
 
 from deimos import GoalDirector
 from deimos.goals.fear import FearConfig
-from deimos.goals.selectors import director
+from deimos.goals.selectors import director, uniform
 
 AFRAID = director.Config(percentile=75, candidates=20, fear=FearConfig(min_per_class=4))
 N = 64
@@ -268,12 +268,28 @@ def test_horizons_are_checked(horizon):
         goals.propose([0, 1], torch.zeros(2, 2), torch.zeros(2, 1), horizon=horizon)
 
 
+def test_goals_of_a_fixed_period_are_not_announced_shorter():
+    """Too few outcomes are kept for shorter ones; the message says what takes them."""
+    goals = GoalDirector("uniform", 5, num_envs=2, state_dim=2, goal_dim=1, device="cpu", goal_box=([0], [1]))
+    goals.propose(None, torch.zeros(2, 2), torch.zeros(2, 1), horizon=5)
+    with pytest.raises(ValueError, match=r"horizon must be goal_period, 5, got \[5, 4\]; GoalDirector\(max_"):
+        goals.propose(None, torch.zeros(2, 2), torch.zeros(2, 1), horizon=[5, 4])
+
+
+@pytest.mark.parametrize("selector", [uniform.Config, uniform, 75])
+def test_a_selector_is_a_name_or_a_configuration(selector):
+    """A class, a module or a number is none."""
+    with pytest.raises(ValueError, match=r"selector must be a deimos.goals.selector.SelectorConfig, got "):
+        GoalDirector(selector, 5)
+
+
 OPTIONS = [
     ({}, "goal_period must be the steps that a goal is active or, .* max_horizon .*; got None and None"),
     ({"goal_period": 5, "max_horizon": 9}, "goal_period must be .*; got 5 and 9"),
     ({"max_horizon": 0}, "max_horizon must be at least 1, got 0"),
     ({"goal_period": 5, "num_envs": 0}, "num_envs must be at least 1, got 0"),
     ({"goal_period": 5, "autoreset": "Sometimes"}, "autoreset must be one of SameStep, NextStep, Disabled, got 'Some"),
+    ({"goal_period": 5, "device": "gpu"}, "device must be one that torch has, got 'gpu': "),
     ({"goal_period": 5, "first_goals": "any"}, "first_goals must be one of uniform, chosen, got 'any'"),
 ]
 KNOWN = {"num_envs": 2, "state_dim": 3, "goal_dim": 1, "device": "cpu", "goal_period": 5}

@@ -156,6 +156,23 @@ def test_memory_for_short_goals_is_bounded(monkeypatch):
     assert done.resolved.min() == 20 - core.SPARE + 1
 
 
+def test_fear_is_learnt_where_goals_are_far_shorter_than_they_may_be(monkeypatch):
+    """Outcomes make way long before T steps have passed; crashes are remembered all the same."""
+    monkeypatch.setattr(core, "RING", 0)
+    sizes = {"num_envs": N, "state_dim": 2, "goal_dim": 1, "device": "cpu"}
+    goals = GoalDirector(AFRAID, max_horizon=100, goal_box=BOX, first_goals="chosen", learn_every=10, **sizes)
+    state, worlds = torch.zeros(N, 2), torch.arange(N)
+    goal, crashes = goals.propose(None, state, torch.zeros(N, 1)), 0
+    for step in range(1, 202):
+        crashed = crashes_at(step, 0.15) & (worlds >= 2)  # the first two pursue one goal for T steps
+        goals.observe(crashed, NO)
+        rows = crashed | ((worlds + step) % torch.where(worlds < 2, 100, 5) == 0)
+        goal[rows] = goals.propose(rows, state[rows], goal[rows])
+        crashes += int(crashed.sum())
+    assert goals.selector.fear.fitted
+    assert 0.8 * crashes < goals.selector.memory.stored <= crashes
+
+
 OTHERS = {
     "selector": ({"selector": "uniform"}, "selector='.*director.Config', got one with selector='.*uniform.Config'"),
     "percentile": ({"selector": director.Config(percentile=25, candidates=8)}, "percentile=75"),

@@ -80,6 +80,16 @@ def test_a_stream_continues_from_its_state():
     assert torch.equal(torch.rand(5, generator=first), torch.rand(5, generator=second))
 
 
+def test_a_state_may_lie_on_another_device(monkeypatch):
+    """Whoever loads a checkpoint onto a GPU has the states of generators there."""
+    first, second = (generator(seed, "a", torch.device("cpu")) for seed in (0, 1))
+    state = first.get_state()
+    elsewhere = state.to("meta")
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: state)
+    restore(second, elsewhere)
+    assert torch.equal(torch.rand(5, generator=first), torch.rand(5, generator=second))
+
+
 def test_a_stream_of_another_kind_of_device_continues_as_one_of_its_own():
     """After the 16 bytes of a GPU a CPU continues as they and the seed determine, and warns that it is another."""
     states = [torch.tensor([0] * 8 + [offset] + [0] * 7, dtype=torch.uint8) for offset in (4, 4, 8)]

@@ -94,6 +94,16 @@ class GoalSlot:
         self.goal = chosen.goal
         return self.write(obs)
 
+    def checked(self, reward: np.ndarray) -> np.ndarray:
+        """Rewards, if there is one for each world: others would be broadcast.
+
+        Raises:
+            ValueError: If they have another shape.
+        """
+        if np.shape(reward) != (len(self.goal),):
+            raise ValueError(f"reward must give the shape {(len(self.goal),)}, got {np.shape(reward)}.")
+        return reward
+
     def state(self, obs: Observation) -> np.ndarray:
         """Everything but the goal, float32, shape (num_envs, state_dim)."""
         if isinstance(obs, Mapping):
@@ -125,16 +135,19 @@ class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
         reward: Rewards for the goals in force; see ``Reward``.
 
     Raises:
-        ValueError: If observations have no such place, or if nothing resets a world that is done.
+        ValueError: If observations have no such place, or if nothing resets a world that is done, or does not say how.
     """
 
     def __init__(
         self, env: gymnasium.vector.VectorEnv, director: GoalDirector, where: slice | str, reward: Reward
     ) -> None:
         super().__init__(env)
-        self._mode = env.metadata["autoreset_mode"]
+        known = env.metadata.get("autoreset_mode")
+        self._mode = AutoresetMode(known or AutoresetMode.DISABLED)  # some name the mode by its value
         if self._mode is AutoresetMode.DISABLED:
-            raise ValueError("env must reset worlds that are done by itself, got AutoresetMode.DISABLED.")
+            raise ValueError(
+                f"env must reset worlds that are done by itself, got {known} for its metadata['autoreset_mode']."
+            )
         next_step = self._mode is AutoresetMode.NEXT_STEP
         self.slot = GoalSlot(director, env.single_observation_space, env.num_envs, where, next_step)
         self._reward, self._over = reward, np.zeros(env.num_envs, dtype=bool)
@@ -149,10 +162,14 @@ class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
         return self.slot.begin(obs, where), infos
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """See ``VectorEnv.step``; what an episode ended in, and its reward, are of the goal that was in force."""
+        """See ``VectorEnv.step``; what an episode ended in, and its reward, are of the goal that was in force.
+
+        Raises:
+            ValueError: If there are not as many rewards as worlds, or as in ``GoalDirector.step``.
+        """
         obs, reward, terminated, truncated, infos = self.env.step(actions)
         last = {int(world): infos["final_obs"][world] for world in np.flatnonzero(infos.get("_final_obs", False))}
-        reward = np.where(self._over, reward, self._reward(self.slot.ended(obs, last), reward))
+        reward = np.where(self._over, reward, self.slot.checked(self._reward(self.slot.ended(obs, last), reward)))
         for world, observation in last.items():
             infos["final_obs"][world] = observation
         if self._mode is AutoresetMode.NEXT_STEP:  # the next step of these worlds is their reset

@@ -42,6 +42,9 @@ class DirectedVecEnv(VecEnvWrapper):
         """See ``VecEnv.step_wait``; the terminal observation of a world that is done holds the goal that was in force.
 
         The reward is for that goal, too.
+
+        Raises:
+            ValueError: If there are not as many rewards as worlds, or as in ``GoalDirector.step``.
         """
         obs, reward, dones, infos = self.venv.step_wait()
         last = {int(world): infos[world]["terminal_observation"] for world in np.flatnonzero(dones)}
@@ -55,4 +58,5 @@ class DirectedVecEnv(VecEnvWrapper):
         else:
             reward = self._reward(ended, reward)
         truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        reward = self.slot.checked(reward)
         return self.slot.advance(obs, dones & ~truncated, truncated), reward, dones, infos

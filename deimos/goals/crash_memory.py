@@ -55,19 +55,25 @@ class CrashMemory(Stateful):
         return {**super().must_be_sound(), "crash": self._crash[:, inputs], "partners": self._partners[..., inputs]}
 
     @torch.no_grad()
-    def store(self, rows: Tensor, window: Resolved, now: int) -> None:
+    def store(self, rows: Tensor, window: Resolved, now: int, kept_since: int = 0) -> None:
         """Take over the new crashes among what was issued at least T steps ago, each with survivals of that time.
 
         Of what was issued later only the crashes are known yet. Crashes of a time without survivals wait for some.
         Partners are the survivals that were issued next to a crash, before or after it.
 
+        Where outcomes of goals that were issued later than T steps ago have made way, so that nothing would come of
+        waiting, it takes over what has resolved since the last time instead.
+
         Args:
             rows: What to keep of every interaction of the window, shape (n, width).
             window: The recently resolved interactions.
             now: Steps so far.
+            kept_since: See ``Interactions.kept_since``.
         """
-        upto = now - self._period
-        new = (window.issued > self._upto) & (window.issued <= upto)
+        moment, upto = window.issued, now - self._period
+        if kept_since > max(0, upto):
+            moment, upto = window.resolved, now
+        new = (moment > self._upto) & (moment <= upto)
         crashed, survived = ((new & own).nonzero().squeeze(1) for own in (window.crashed, ~window.crashed))
         if len(crashed) and not len(survived):
             return

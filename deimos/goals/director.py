@@ -14,7 +14,7 @@ from deimos.checks import check_at_least
 from deimos.goals import given
 from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore, window_between
-from deimos.goals.director_checks import check_candidates, check_options, refuse_unsound, settings, unpacked
+from deimos.goals.director_checks import check_candidates, check_options, placed, refuse_unsound, settings, unpacked
 from deimos.goals.fear_selector import FearEstimate, fear_selector
 from deimos.goals.given import A, Array, Bound, Candidates, GoalBox, Inputs, Rows
 from deimos.goals.horizons import Horizons
@@ -74,7 +74,7 @@ class GoalDirector:
             Outcomes are kept for 2 T steps or, if more, ``learn_every + T``: ``4 (state_dim + 2 goal_dim + 12)`` bytes
             per world for every T; where goals may be shorter, the newest, up to 32 MiB in all or 8 per world.
         total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
-        seed: Seed of the selector's networks and of every choice, in [0, 2^32).
+        seed: Of the selector's networks and of every choice, in [0, 2^32); two Directors of one seed choose alike.
 
     Raises:
         ValueError: If an option is not valid, here or at the first call where sizes are left to it.
@@ -105,8 +105,7 @@ class GoalDirector:
             self._config, goal_box, **periods, horizon_input=horizon_input, first_goals=first_goals, seed=seed,
             next_step=self._next_step, groups=[str(part) for part in self._groups],
         )  # fmt: skip
-        known = None if device is None else torch.empty(0, dtype=torch.float32, device=device).device
-        self._told = [*sizes.values()], known
+        self._told = [*sizes.values()], None if device is None else placed(device)
         self._start_anew()
 
     def _start_anew(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice, check_range
+from deimos.checks import check_at_least, check_choice, check_is, check_range, one_line
 from deimos.goals import given
 from deimos.goals.given import Bound, Candidates, Inputs
 from deimos.goals.selector import SelectorConfig
@@ -45,6 +45,18 @@ def check_options(
     check_range("seed", seed, 0, 2**32 - 1)
 
 
+def placed(device: torch.device | str) -> torch.device:
+    """The device with its number, as tensors there have it.
+
+    Raises:
+        ValueError: If torch has no such device.
+    """
+    try:
+        return torch.empty(0, dtype=torch.float32, device=device).device
+    except (AssertionError, RuntimeError) as error:  # the former where torch was built without CUDA
+        raise ValueError(f"device must be one that torch has, got {str(device)!r}: {one_line(error)}") from error
+
+
 def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **others: Any) -> dict[str, Any]:
     """What two Directors must have in common where one continues from the other's state: plain values by name.
 
@@ -52,7 +64,11 @@ def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **oth
         config: The selector's; its plain fields count, and those of the dataclasses in it.
         goal_box: Lowest and highest goal.
         **others: What else counts, plain.
+
+    Raises:
+        ValueError: If the configuration is none, but a selector or its class.
     """
+    check_is("selector", config, SelectorConfig)
     box = None if goal_box is None else [_numbers(end) for end in goal_box]
     kind = f"{type(config).__module__}.{type(config).__qualname__}"
     return {"selector": kind, **_plain_fields(config), **others, "goal_box": box}

@@ -197,7 +197,7 @@ class FearSelector(GoalSelector):
         rows = self.rows(window, interactions)
         if self.memory is None:
             return self.fit(rows, window.crashed, torch.ones_like(rows[:, 0]))
-        self.memory.store(rows, window, interactions.now)
+        self.memory.store(rows, window, interactions.now, interactions.kept_since())
         rows, crashed, weight = self.memory.sample(rows, window)
         return self.fit(rows, crashed, weight)
 

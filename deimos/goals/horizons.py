@@ -23,7 +23,8 @@ class Horizons:
         """Announced steps, int64, shape (count,); the most where nobody knows, ``None`` where it is always T.
 
         Raises:
-            ValueError: If they do not fit, or are missing where the fear network sees them.
+            ValueError: If they do not fit, are not T where it is always the same, or are missing where the fear network
+                sees them.
         """
         if horizon is None:
             if self.period is not None:
@@ -31,7 +32,13 @@ class Horizons:
             if self.seen:
                 raise ValueError("horizon must be given where it is an input of the fear network, got None.")
             horizon = self.most
-        return inputs.horizons(horizon, count, self.most)
+        steps = inputs.horizons(horizon, count, self.most)
+        if self.period is not None and bool((steps < self.period).any()):  # outcomes are kept for goals of T steps
+            raise ValueError(
+                f"horizon must be goal_period, {self.period}, got {steps.tolist()}; "
+                f"GoalDirector(max_horizon={self.period}) has goals of fewer steps."
+            )
+        return steps
 
     def behind(self, states: Tensor, steps: Tensor | None = None) -> Tensor:
         """What the selector sees of states, shape (m, state_dim): behind them ``steps / most``, if it may; 1 for T."""

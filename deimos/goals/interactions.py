@@ -244,6 +244,12 @@ class Interactions(Stateful):
         state, goal, next_goal, *_ = known.split(self._sizes, dim=1)
         return torch.cat([pending, env]), state, goal, next_goal
 
+    def kept_since(self) -> int:
+        """Step after which no goal was issued whose outcome has made way for a newer one; 0 where none has."""
+        slot = self._cursor % self._capacity  # of the oldest, where the ring is full
+        oldest = self._marks[torch.arange(len(slot), device=slot.device), slot, 1]
+        return int(oldest.masked_fill(self._cursor <= self._capacity, 0).max())
+
     @property
     def horizon(self) -> Tensor:
         """Steps that the pending interaction is to last, int64, shape (num_envs,)."""

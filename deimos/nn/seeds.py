@@ -37,6 +37,7 @@ def restore(generator: torch.Generator, state: torch.Tensor) -> None:
     States of CPUs and of GPUs cannot be converted into each other. The stream then continues from a seed that follows
     from the saved state: as good a stream, and the same whenever it is done, but not the saved one.
     """
+    state = state.cpu()  # where generators keep it; ``torch.load(map_location=...)`` takes it elsewhere
     if state.numel() == generator.get_state().numel():
         generator.set_state(state)
         return
