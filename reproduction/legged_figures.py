@@ -21,7 +21,10 @@ CURVES = {"quad": "A.1", "quad_arm": "A.2"}
 """Those of trainings."""
 ORIGIN = "Fine-tuned from common base policies, 12 M of the thesis's 295 M transitions."
 """What every caption on robots says."""
-PAIRS = "every line is a base, every dot the policy of a method that branched off it; bars are means."
+PAIRS = (
+    "every line is a base, every dot the policy of a method that branched off it; bars are means over bases, of "
+    "crashes themselves and not of their logarithms, which contrasts compare."
+)
 DIFFERENCES = (
     "differences from Uniform. Every dot is a base; bars are 95 % t intervals of the mean. To the right is more: of "
     "scores better, of rates worse. A log rate is that of crashes per interaction."
@@ -84,7 +87,6 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
         panel.set_title(f"under {title}")
         panel.grid(axis="y", alpha=0.3)
         panel.set_xticks(range(len(methods)), methods, rotation=45, ha="right", rotation_mode="anchor")
-        panel.tick_params(axis="x", labelbottom=panel not in axes[0, :2])
         panel.set_xlim(-0.5, len(methods) - 0.5)
     as_rates(axes[0, 0], "y", "crashes per interaction [%]")
     rates = [x for panel in axes[0] for line in panel.lines for x in line.get_ydata()]
