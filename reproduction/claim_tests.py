@@ -19,7 +19,7 @@ from scipy import stats as scipy_stats
 from deimos.study import permutation, stats
 from deimos.study.permutation import Pairs
 from deimos.study.stats import POWER, Array, Interval
-from reproduction.claims import ALPHA, LEAST, Finding, Test
+from reproduction.claims import ALPHA, LEAST, LEAST_BASES, Finding, Test
 from reproduction.measures import Evidence, Measure, Numbers, Place
 
 SETTLED_RATIO = 1.5  # an equivalence is settled within this ratio,
@@ -414,13 +414,18 @@ class Best:
 
 
 def samples_of(measure: Measure, evidence: Evidence, place: Place, methods: Sequence[str]) -> dict[str, Array]:
-    """The samples of the methods that have enough policies; in blocks, of those blocks that all of them have."""
+    """The samples of the methods that have enough policies; in blocks, of those blocks that all of them have.
+
+    Methods that lack blocks which a verdict needs take no part beside two or more that have them.
+    """
     return _enough({name: measure(evidence, place, name) for name in methods}, evidence.paired(place, methods))
 
 
 def _enough(numbers: Mapping[str, Numbers], paired: bool) -> dict[str, Array]:
     found = {name: own for name, own in numbers.items() if len(own) >= LEAST}
     if paired and found:
+        whole = {name: own for name, own in found.items() if len(own) >= LEAST_BASES}
+        found = whole if len(whole) > 1 else found
         shared = set.intersection(*map(set, found.values()))
         found = {name: {seed: own[seed] for seed in own if seed in shared} for name, own in found.items()}
     return {name: np.array([own[seed] for seed in sorted(own)]) for name, own in found.items() if len(own) >= LEAST}

@@ -33,8 +33,9 @@ TRAINING = "every line is a base, in grey Uniform's of the same bases; rolling m
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")  # Okabe and Ito's
 _MARKERS = "osD^vP"
 _COLUMNS = 5
+_MOST_TICKS = 6
 RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
-"""Ticks of a logarithmic axis of rates [% of interactions]."""
+"""Ticks of a logarithmic axis of rates [% of interactions, or per 1000 transitions]."""
 LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
@@ -171,8 +172,11 @@ def training(data: Data, environment: str) -> "Figure | None":
         _share_limits(axes[which::2], label)
     for panel in axes[::2].flat:
         low, high = panel.get_ylim()
-        if np.floor(np.log10(high)) <= np.ceil(np.log10(max(low, LINEAR))):  # powers of ten: one tick or none
+        shown = [x for x in RATES if max(low, LINEAR) <= x <= high]
+        if len(shown) < 2:
             panel.yaxis.set_major_locator(MaxNLocator(4))
+        elif len(shown) <= _MOST_TICKS:  # of more, powers of ten are enough
+            panel.set_yticks(shown)
     _legend(figure, bases(data, environment))
     return figure
 

@@ -174,6 +174,10 @@ def test_policies_are_compared_within_their_bases():
     assert apart.verdict == "undecided"
     three = Ordered(NAIVE, versus(["vds", "rnd"], ["uniform"])).find(in_blocks(values), HERE)
     assert three.n == {"vds": 5, "uniform": 5, "rnd": 5}  # the bases that all of them have
+    begun = in_blocks(values | {"cl": 0.9 * BASE[:3]})
+    three = Ordered(NAIVE, versus(["vds", "rnd", "cl"], ["uniform"])).find(begun, HERE)
+    assert three.n == {"vds": 5, "uniform": 5, "rnd": 5}  # what has not finished takes no bases from what has
+    assert Ordered(NAIVE, (("cl", "uniform"),)).find(begun, HERE).n == {"cl": 3, "uniform": 3}
 
 
 def test_five_bases_cannot_order_two_methods():
