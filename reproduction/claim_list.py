@@ -310,7 +310,7 @@ DISCUSSION = (
         *_headline(660, "either matches or bests the best baseline method", NAIVE),
         *_headline(662, "produces better policy populations than the baseline methods", ATTACKED),
         *_headline(711, "improves trained policy population variance", ATTACKED, spread=True),
-    ), note="The best are chosen on every other seed and tested on the rest."),
+    ), note="The best are chosen on every other seed and tested on the rest; five bases are too few for both."),
     Claim("C29", "Halfway through training, VDS's policies crash rarely.", (
         *_say(505, "VDS-trained policies start experiencing very few crashes", LEGGED, _mostly(HALFWAY, ["vds"])),
     ), note="Rarely: less than a tenth of what they did in the first tenth. Nothing is told of policies that branched "

@@ -11,17 +11,16 @@ permuted within them, and resamples are of blocks.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from itertools import product
 
 import numpy as np
-from scipy import optimize
 from scipy import stats as scipy_stats
 
 from deimos.study import permutation, stats
 from deimos.study.permutation import Pairs
 from deimos.study.stats import POWER, Array, Interval
-from reproduction.claims import ALPHA, LEAST, Finding, Test
-from reproduction.measures import NAIVE, Evidence, Measure, Numbers, Place
+from reproduction.claims import ALPHA, LEAST, LEAST_BASES, Finding, Test
+from reproduction.measures import Evidence, Measure, Numbers, Place
 
 SETTLED_RATIO = 1.5  # an equivalence is settled within this ratio,
 SETTLED_SHARE = 0.05  # or, of what has no ratios, within this share of the score's range from 0 to 1
@@ -82,7 +81,7 @@ class Ordered:
         sizes = [sum(len(samples[name]) for name in dict.fromkeys(side)) for side in zip(*pairs, strict=True)]
         if paired and len(pairs) == 1 and math.isinf(stats.detectable_share(sizes[0])):
             return math.inf
-        return detectable_spread(*sizes) if self.spread else stats.detectable_probability(*sizes)
+        return permutation.detectable_spread(*sizes) if self.spread else stats.detectable_probability(*sizes)
 
     def p_values(self, samples: Sequence[Array], pairs: Pairs, permutations: int | None = None) -> tuple[Array, Array]:
         """One-sided p-values for and against, of samples of shape (studies, n)."""
@@ -138,11 +137,13 @@ class Alike:
         within = max(interval.high, 0.0 if self.at_most else -interval.low)
         p_for, p_against = map(float, self.p_values(x, y, sides=sides))
         error = (interval.high - interval.low) / (2 * scipy_stats.norm.ppf(1 - ALPHA))
-        reach = float(scipy_stats.norm.ppf(1 - ALPHA) + scipy_stats.norm.ppf((1 + POWER) / 2)) * error
+        power = POWER if self.at_most else (1 + POWER) / 2  # of two one-sided tests each must find it
+        reach = float(scipy_stats.norm.ppf(1 - ALPHA) + scipy_stats.norm.ppf(power)) * error
         effect, within = "difference", max(within, 0.0)
         if self.measure.ratio:
             effect, interval = "ratio", _exp(interval)
-            within, reach = (float(np.exp(min(z, 50.0))) for z in (within, reach))
+            with np.errstate(over="ignore"):
+                within, reach = np.exp([within, reach]).tolist()
         return Finding(
             effect=effect, interval=interval, no_difference=1.0 if self.measure.ratio else 0.0, p_for=p_for,
             p_against=p_against, detectable=math.inf if max(reachable) > ALPHA else reach,
@@ -322,6 +323,8 @@ class Matters:
         ranks = scipy_stats.rankdata(values, axis=-1)
         interval, error = self._interval(ranks, sizes, paired)
         reach = float(scipy_stats.norm.ppf(1 - ALPHA / 2) + scipy_stats.norm.ppf(POWER)) * error
+        if paired and math.isinf(stats.detectable_share(sizes[0])):  # blocks are exchanged as signs are flipped
+            reach = math.inf
         return Finding(
             effect="difference in omega^2", interval=interval, no_difference=0.0, p_for=p_for, p_against=p_against,
             detectable=reach, n={name: len(x) for name, x in both},
@@ -332,12 +335,17 @@ class Matters:
     ) -> tuple[Array, Array]:
         """One-sided p-values for and against, of values of shape (studies, 2, policies).
 
-        If they are ``paired``, sizes are equal, and the policies of a block are exchanged together.
+        If they are ``paired``, sizes are equal, and the policies of a block are exchanged together; where there are not
+        more ways to do so than ``permutations``, the p-values are exact.
         """
         ranks = scipy_stats.rankdata(values, axis=-1)
-        swapped = np.random.default_rng(0).random((permutations + 1, 1, sizes[0] if paired else sum(sizes))) < 0.5
+        number = sizes[0] if paired else sum(sizes)
+        if paired and 2**number <= permutations:
+            swapped = np.array([*product((False, True), repeat=number)])[:, None]  # the first of them is their own
+        else:
+            swapped = np.random.default_rng(0).random((permutations + 1, 1, number)) < 0.5
+            swapped[0] = False
         swapped = np.tile(swapped, len(sizes)) if paired else swapped
-        swapped[0] = False
         found = []
         for own in ranks:
             mixed = np.where(swapped, own[::-1], own)
@@ -406,13 +414,18 @@ class Best:
 
 
 def samples_of(measure: Measure, evidence: Evidence, place: Place, methods: Sequence[str]) -> dict[str, Array]:
-    """The samples of the methods that have enough policies; in blocks, of those blocks that all of them have."""
+    """The samples of the methods that have enough policies; in blocks, of those blocks that all of them have.
+
+    Methods that lack blocks which a verdict needs take no part beside two or more that have them.
+    """
     return _enough({name: measure(evidence, place, name) for name in methods}, evidence.paired(place, methods))
 
 
 def _enough(numbers: Mapping[str, Numbers], paired: bool) -> dict[str, Array]:
     found = {name: own for name, own in numbers.items() if len(own) >= LEAST}
     if paired and found:
+        whole = {name: own for name, own in found.items() if len(own) >= LEAST_BASES}
+        found = whole if len(whole) > 1 else found
         shared = set.intersection(*map(set, found.values()))
         found = {name: {seed: own[seed] for seed in own if seed in shared} for name, own in found.items()}
     return {name: np.array([own[seed] for seed in sorted(own)]) for name, own in found.items() if len(own) >= LEAST}
@@ -421,23 +434,6 @@ def _enough(numbers: Mapping[str, Numbers], paired: bool) -> dict[str, Array]:
 def _exp(interval: Interval) -> Interval:
     with np.errstate(over="ignore"):
         return Interval(*np.exp([interval.estimate, interval.low, interval.high]).tolist())
-
-
-@lru_cache
-def detectable_spread(n: int, m: int, studies: int = 400) -> float:
-    """Smallest ratio of standard deviations of normal samples that is found with a power of 80 %, simulated; to 3 %.
-
-    Infinite where a ratio of 100 is not found.
-    """
-    x, y = (np.random.default_rng(i).normal(size=(studies, k)) for i, k in enumerate((n, m)))
-    test = Ordered(NAIVE, (("x", "y"),), spread=True)
-
-    def lacking(log_ratio: float) -> float:
-        found, _ = test.p_values([math.exp(log_ratio) * x, y], [(0, 1)], permutations=199)
-        return POWER - float((2 * found <= ALPHA).mean())
-
-    top = math.log(100)
-    return math.inf if lacking(top) > 0 else math.exp(optimize.bisect(lacking, 0.0, top, xtol=0.03))
 
 
 def versus(first: Sequence[str], second: Sequence[str]) -> tuple[tuple[str, str], ...]:

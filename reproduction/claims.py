@@ -163,7 +163,7 @@ class Outcome:
             return "no data"
         holds, does_not, undecided = (self.counts[name] for name in VERDICTS)
         number, enough = len(self.results), " (one is enough)" if self.claim.one_is_enough else ""
-        told = f"{holds} of {number} clause{'s' * (number > 1)} hold{'s' * (holds == 1)}{enough}"
+        told = f"{holds} of {number} clause{'s' * ((holds, number) != (1, 1))} hold{'s' * (holds == 1)}{enough}"
         rest = [f"{does_not} do{'es' * (does_not == 1)} not"] * bool(does_not) + [f"{undecided} undecided"] * bool(
             undecided
         )

@@ -21,7 +21,10 @@ CURVES = {"quad": "A.1", "quad_arm": "A.2"}
 """Those of trainings."""
 ORIGIN = "Fine-tuned from common base policies, 12 M of the thesis's 295 M transitions."
 """What every caption on robots says."""
-PAIRS = "every line is a base, every dot the policy of a method that branched off it; bars are means."
+PAIRS = (
+    "every line is a base, every dot the policy of a method that branched off it; bars are means over bases, of "
+    "crashes themselves and not of their logarithms, which contrasts compare."
+)
 DIFFERENCES = (
     "differences from Uniform. Every dot is a base; bars are 95 % t intervals of the mean. To the right is more: of "
     "scores better, of rates worse. A log rate is that of crashes per interaction."
@@ -30,8 +33,9 @@ TRAINING = "every line is a base, in grey Uniform's of the same bases; rolling m
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")  # Okabe and Ito's
 _MARKERS = "osD^vP"
 _COLUMNS = 5
+_MOST_TICKS = 6
 RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
-"""Ticks of a logarithmic axis of rates [% of interactions]."""
+"""Ticks of a logarithmic axis of rates [% of interactions, or per 1000 transitions]."""
 LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
@@ -84,7 +88,6 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
         panel.set_title(f"under {title}")
         panel.grid(axis="y", alpha=0.3)
         panel.set_xticks(range(len(methods)), methods, rotation=45, ha="right", rotation_mode="anchor")
-        panel.tick_params(axis="x", labelbottom=panel not in axes[0, :2])
         panel.set_xlim(-0.5, len(methods) - 0.5)
     as_rates(axes[0, 0], "y", "crashes per interaction [%]")
     rates = [x for panel in axes[0] for line in panel.lines for x in line.get_ydata()]
@@ -169,8 +172,11 @@ def training(data: Data, environment: str) -> "Figure | None":
         _share_limits(axes[which::2], label)
     for panel in axes[::2].flat:
         low, high = panel.get_ylim()
-        if np.floor(np.log10(high)) <= np.ceil(np.log10(max(low, LINEAR))):  # powers of ten: one tick or none
+        shown = [x for x in RATES if max(low, LINEAR) <= x <= high]
+        if len(shown) < 2:
             panel.yaxis.set_major_locator(MaxNLocator(4))
+        elif len(shown) <= _MOST_TICKS:  # of more, powers of ten are enough
+            panel.set_yticks(shown)
     _legend(figure, bases(data, environment))
     return figure
 

@@ -281,7 +281,8 @@ DOSE = Measure("delivered dose: mean percentile of fear of the goals in training
 FITTED = Measure("share of rollouts after which fear was fitted", _curve("fear_fitted", _known_mean))
 EXACT_RANK = Measure("percentile of the chosen goals, tried in clones", _curve("exact_percentile", _known_mean))
 AUROC = Measure("AUROC of fear within contexts", _curve("auroc", _known_mean))
-LEVEL = Measure("mean level of the ground in training", _curve("level", _known_mean))
+LEVEL = Measure("mean level of the ground in training", _curve("level", lambda x: _known_mean(x) or math.nan))
+"""Not known on flat ground, which has no levels and whose trainings log 0."""
 VARIANCE = Measure("explained variance of the critic in training", _curve("explained_variance", _known_mean))
 MOTION = Measure("speed of the policy", _curve("speed", lambda x: float(x)))
 RISK = Measure("fear at the dangerous place above that at the safe one",

@@ -105,14 +105,18 @@ def test_detectable_share_has_the_promised_power():
     assert stats.detectable_share(5) == math.inf
 
 
-def test_detectable_spread_has_the_promised_power():
-    """At the ratio that it names, fresh normal samples are told apart in 80 %."""
-    ratio = claim_tests.detectable_spread(10, 10)
-    rng = np.random.default_rng(9)
-    x, y = ratio * rng.normal(size=(600, 10)), rng.normal(size=(600, 10))
-    more, _ = Ordered(NAIVE, (("a", "b"),), spread=True).p_values([x, y], [(0, 1)])
-    # Both shares are binomial, of 400 and 600 studies; four standard errors of them together, and the step of 3 %.
-    assert (2 * more <= 0.05).mean() == pytest.approx(0.8, abs=4 * math.sqrt(0.16 / 400 + 0.16 / 600) + 0.02)
+def test_detectable_margins_have_the_promised_power():
+    """Equal populations are found alike within the margin that is named in 80 %, where one side or both are tested."""
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=(2, 600, 30))
+    values = {"vds": rng.normal(size=30), "uniform": rng.normal(size=30)}
+    for at_most in (False, True):
+        margin = Alike(SCORE, "vds", "uniform", at_most).find(only(values, "score"), HERE).detectable
+        _, lower = permutation.p_values([x, y + margin], [(0, 1)], "superiority", permutations=199)
+        higher, _ = permutation.p_values([x, y - margin], [(0, 1)], "superiority", permutations=199)
+        p = lower if at_most else np.maximum(lower, higher)
+        # The margin comes from the spread of one study of 30 a side, which is known to some 15 %.
+        assert (p <= 0.05).mean() == pytest.approx(0.8, abs=0.08)
 
 
 def test_highest_counts_orders():
@@ -170,6 +174,10 @@ def test_policies_are_compared_within_their_bases():
     assert apart.verdict == "undecided"
     three = Ordered(NAIVE, versus(["vds", "rnd"], ["uniform"])).find(in_blocks(values), HERE)
     assert three.n == {"vds": 5, "uniform": 5, "rnd": 5}  # the bases that all of them have
+    begun = in_blocks(values | {"cl": 0.9 * BASE[:3]})
+    three = Ordered(NAIVE, versus(["vds", "rnd", "cl"], ["uniform"])).find(begun, HERE)
+    assert three.n == {"vds": 5, "uniform": 5, "rnd": 5}  # what has not finished takes no bases from what has
+    assert Ordered(NAIVE, (("cl", "uniform"),)).find(begun, HERE).n == {"cl": 3, "uniform": 3}
 
 
 def test_five_bases_cannot_order_two_methods():
@@ -239,6 +247,9 @@ def test_bases_are_exchanged_as_a_whole():
     test = Matters(ATTACKED, NAIVE, ("coop", "p25", "vds", "rnd"))
     paired = test.find(Evidence(rows), HERE)
     assert paired.interval.estimate > 0.3
-    assert paired.p_for == pytest.approx(2 / 64, abs=0.03)  # of 999 random exchanges
+    assert paired.p_for == 2 / 64  # all 64 of them
+    assert (paired.verdict, math.isfinite(paired.detectable)) == ("holds", True)
     apart = test.find(Evidence([{**row, "block": ""} for row in rows]), HERE)
     assert apart.p_for <= paired.p_for
+    five = test.find(Evidence(rows).only(range(1, 6)), HERE)
+    assert (five.p_for, five.verdict, five.detectable) == (2 / 32, "undecided", math.inf)

@@ -183,6 +183,7 @@ def test_line_of_a_claim_counts_clauses(alike):
     assert len(outcome.without_data) == 1
     assert outcome.within("absolute").line == "no data"
     assert outcome.within("relative").line == outcome.line
+    assert claims.test(claim_of((1, 1)), alike).line == "0 of 1 clauses hold; 1 undecided"
     assert claims.test(claim_of((0.01, 1)), alike).line == "1 of 1 clause holds"
 
 

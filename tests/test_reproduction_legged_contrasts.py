@@ -156,6 +156,8 @@ def test_tables_say_what_is_judged_and_what_is_estimated(tmp_path, monkeypatch):
     claims = {(row["robot"], row["not run"]): row["claims that speak of it"] for row in lacking}
     assert (claims["quad", "T10"], claims["quad_arm", "T10"]) == ("C19", "C22, C23")
     assert not any("C31" in text.split(", ") for text in claims.values())  # speed is not measured by a run
+    assert "C35" in claims["quad", "p25"].split(", ")
+    assert not any("C35" in text.split(", ") for (robot, _), text in claims.items() if robot == "quad_arm")  # no stairs
     assert claims["quad", legged_contrasts.WITH_PARTICLE] == "C18"
     assert "C18" not in claims["quad", "rnd"].split(", ")
 
@@ -169,16 +171,18 @@ def test_studies_without_bases_have_no_such_section():
 def test_bases_are_told_with_their_spread(tmp_path):
     """Every base that was judged has a row for each T, and all of them their mean and deviation."""
     assert legged_contrasts.bases(tmp_path) == []
-    for index, score in enumerate((0.5, 0.7)):
-        home = tmp_path / legged_bases.base_name("quad", index)
-        folder = legged_contrasts.RunFolder.create(home)
-        folder.write_json("evaluation.json", [
-            {"goal_period": period, "score": score, "crash_rate": 0.01, "interaction_crashes": 5, "interactions": 500}
-            for period in (100, 500)
-        ])  # fmt: skip
-        folder.append_csv("progress.csv", {"iteration": 1, "level": 4 + index})
-    title, rows = legged_contrasts.bases(tmp_path)
-    assert title == "### The bases of quad"
+    for robot, level in (("quad", 4), ("quad_arm", 0)):
+        for index, score in enumerate((0.5, 0.7)):
+            home = tmp_path / legged_bases.base_name(robot, index)
+            folder = legged_contrasts.RunFolder.create(home)
+            folder.write_json("evaluation.json", [
+                {"goal_period": period, "score": score, "crash_rate": 0.01, "interaction_crashes": 5,
+                 "interactions": 500} for period in (100, 500)
+            ])  # fmt: skip
+            folder.append_csv("progress.csv", {"iteration": 1, "level": level and level + index})
+    title, rows, arm, on_flat = legged_contrasts.bases(tmp_path)
+    assert (title, arm) == ("### The bases of quad", "### The bases of quad_arm")
+    assert not any("level at the end of training" in row for row in on_flat)  # flat ground has none
     assert [(row["base"], row["T"]) for row in rows] == [
         (name, period) for period in ("100", "500")
         for name in ("quad_base_1", "quad_base_2", "mean ± standard deviation")
@@ -211,6 +215,12 @@ def test_contrasts_without_bases_that_do_not_walk(tmp_path):
 
 def test_trainings_are_told_base_by_base(tables):
     """What goals did to a method's own training stands in a table, with a dash for what the task does not have."""
+    data = Data.read(tables)
+    for row in data.curve_rows:
+        row["level"] = {"p75": (4.0, 4.5), "uniform": (0.0, 0.0)}.get(row["method"], ())
+    p75, _, uniform, _ = legged_contrasts._trainings(Evidence.of(data))[2]
+    assert p75["mean level of the ground in training"] == ", ".join(["4.25"] * BASES)
+    assert uniform["mean level of the ground in training"] == "-"  # flat ground has no levels
     rows = legged_contrasts._trainings(Evidence.of(Data.read(tables)))[2]
     assert [row["method"] for row in rows] == sorted(METHODS)
     for row in rows:
@@ -279,6 +289,9 @@ def test_report_has_pairs_claims_and_pictures(tables, tmp_path):
     report.write(tables, tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "| ppo.hidden | 8 |" in text  # the merge has kept the settings
+    undecided = text.count("| undecided |")  # of three bases everything is an estimate
+    assert f"For {undecided} of {undecided} undecided there is no effect that so few policies show in 80 %." in text
+    assert "inf" not in text.split()
     for words in ("Figure 4.8 in pairs", "Figure A.1 in pairs", legged_figures.ORIGIN, "## Methods in pairs",
                   "### Not run", "score (Naive): uniform > penalty-30"):  # fmt: skip
         assert words in text, words
@@ -319,7 +332,7 @@ def test_pictures_show_every_policy(tables):
     assert own == {BASES, 2 * BASES}  # Uniform's own panels, and those with Uniform in grey behind
 
 
-@pytest.mark.parametrize("crashes", [(2.2, 4.5), (0.3, 0.5), (0.15, 1.6), (0.02, 40.0)])
+@pytest.mark.parametrize("crashes", [(2.2, 4.5), (0.3, 0.5), (0.15, 1.6), (0.25, 6.0), (0.02, 40.0)])
 def test_axes_of_trainings_have_numbers(tables, crashes):
     """However narrow the range of the crashes is, the axis has two numbers or more."""
     data = Data.read(tables)
@@ -327,7 +340,10 @@ def test_axes_of_trainings_have_numbers(tables, crashes):
         row["crashes_per_1000"] = tuple(np.geomspace(*crashes, len(row["env_steps"])))
     for panel in legged_figures.training(data, "quad").axes[: len(METHODS)]:
         low, high = panel.get_ylim()
-        assert sum(low <= tick <= high for tick in panel.get_yticks()) >= 2
+        shown = [tick for tick in panel.get_yticks() if low <= tick <= high]
+        assert len(shown) >= 2
+        middle = math.sqrt(max(low, legged_figures.LINEAR) * high)
+        assert min(shown) < middle  # in the lower half too, which linear steps leave empty
 
 
 def test_pictures_say_where_nobody_attacked(tables):

@@ -9,14 +9,16 @@ References:
     .. [1] Chung and Romano, *Exact and Asymptotically Robust Permutation Tests*, Annals of Statistics 41, 2013.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import optimize, stats
 
-from deimos.study.stats import Array, Statistic
+from deimos.study.stats import POWER, Array, Statistic
 
 Pairs = Sequence[tuple[int, int]]
 """Of the numbers of two samples each: the first is claimed to have more."""
@@ -126,6 +128,26 @@ def p_values_in_blocks(
         for side in ("greater", "less")
     )  # fmt: skip
     return float(more), float(less)
+
+
+@lru_cache
+def detectable_spread(n: int, m: int, alpha: float = 0.05) -> float:
+    """Smallest ratio of standard deviations of normal samples that the two-sided test finds with a power of 80 %.
+
+    Simulated, to some 5 %; with five policies a side to some 12 %. Infinite where a ratio of 100 is not found.
+    """
+    # Of few policies power rises slowly with the ratio: what few permutations lose, and few studies, would move it.
+    cost = (n + m) ** 2
+    studies = min(1000, max(400, 100_000 // cost))
+    permutations = min(PERMUTATIONS, max(199, 200_000 // cost))
+    x, y = (np.random.default_rng(i).normal(size=(studies, k)) for i, k in enumerate((n, m)))
+
+    def lacking(log_ratio: float) -> float:
+        found, _ = p_values([math.exp(log_ratio) * x, y], [(0, 1)], "spread", permutations=permutations)
+        return POWER - float((2 * found <= alpha).mean())
+
+    top = math.log(100)
+    return math.inf if lacking(top) > 0 else math.exp(optimize.bisect(lacking, 0.0, top, xtol=0.03))
 
 
 def _blocks(studies: int, permutations: int, number: int) -> Iterator[tuple[slice, slice]]:
