@@ -94,12 +94,11 @@ def main(arguments: list[str], program: str) -> None:
     options: ViewOptions = console.parse(ViewOptions, arguments, program)
     console.quiet_warp()
     if options.record:
+        require_video(options.record)
         choose_renderer()
         load_renderer()
     run = SavedRun.open(options.run, options.goal_period, options.terrain)
     check_port(options.port)
-    if options.record:
-        require_video(options.record)
     worlds = options.worlds or (1 if run.has_robots else 8)
     session = Session(run, worlds, options.seed, options.world, shield=options.shield)
     if options.goals not in (*session.names, *options.attackers):
