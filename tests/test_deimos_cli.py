@@ -144,7 +144,7 @@ def test_of_an_option_given_twice_the_last_counts(monkeypatch):
     """A single value may be given again, as scripts do to change one; its name alone decides, not that of a list."""
     parsed = []
     monkeypatch.setattr("deimos.app.train._train", parsed.append)
-    assert cli.main("train --seed 3 --env.goal-period 20 --seed 4 --eval.attackers argmax".split()) == 0
+    assert cli.main("train --seed 3 --seed 4 --eval.attackers argmax".split()) == 0
     assert (parsed[0].seed, parsed[0].eval.attackers) == (4, ("argmax",))
 
 

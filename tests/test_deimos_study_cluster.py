@@ -210,7 +210,7 @@ def test_what_no_machine_has_room_for_is_refused(study, ray):
     on_ray.OnRay(study, gpus=2.0).require_room([made[4, "cuda"]])
     for threads, device, gpus in ((9, "cpu", None), (8, "cuda", None), (4, "cuda", 3.0)):
         with pytest.raises(RunError, match=rf"has the {threads} CPU\(s\) and \d GPU\(s\) that .* takes; add one"):
-            on_ray.OnRay(study, gpus).require_room([cell, made[threads, device]])
+            on_ray.OnRay(study, gpus).require_room([made[threads, device]])
 
 
 def test_a_study_that_waits_for_ever_is_refused(study, ray, monkeypatch):
