@@ -138,11 +138,11 @@ def test_a_robot_that_slides_is_odd(page):
     assert robot_check.judge_feet(standing) == ["it slides by 5 cm in 0.5 s; put its feet below its hips"]
 
 
-def run(folder, *arguments):
+def run(folder, *arguments, **more):
     """``deimos robot`` in a process of its own, for MuJoCo decides once how it renders."""
     path = os.pathsep.join([str(HOME), os.environ.get("PYTHONPATH", "")])
     return subprocess.run(
-        [sys.executable, "-m", "deimos", "robot", *arguments], cwd=folder, env=os.environ | {"PYTHONPATH": path},
+        [sys.executable, "-m", "deimos", "robot", *arguments], cwd=folder, env=os.environ | {"PYTHONPATH": path} | more,
         capture_output=True, text=True, check=False,
     )  # fmt: skip
 
@@ -158,6 +158,13 @@ def test_a_check_ends_with_a_picture(page):
     robot._check_picture(page / "scout.png")  # another check may replace it
     red = (picture[:, :, 0] > 150) & (picture[:, :, 1:] < 90).all(axis=2)
     assert red[:, 480:].sum() > 1000 > red[:, :480].sum()  # the base, where it is drawn as what collides
+
+
+def test_a_check_without_a_renderer_is_one_line(page):
+    """Where MuJoCo has nothing to render with, it cannot even be imported; the line says what to install."""
+    done = run(page, "check", "scout.toml", MUJOCO_GL="nonsense")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"deimos: Nothing can be rendered with MUJOCO_GL=nonsense .*install libegl1 .*\n", done.stderr)
 
 
 def test_a_check_ends_with_1_where_there_is_a_fault(page):

@@ -18,7 +18,7 @@ from deimos.sim.drawing import with_caption
 from deimos.sim.legged import mjcf, robot_draft, robot_file, robots
 from deimos.sim.legged.robot_check import LEGS, PARTS, SECONDS, Report, check_robot
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, Robot
-from deimos.sim.rendering import choose_renderer, renderer
+from deimos.sim.rendering import choose_renderer, load_renderer, renderer
 
 if TYPE_CHECKING:
     import mujoco
@@ -92,6 +92,7 @@ def check(arguments: list[str], program: str) -> None:
     path = options.picture or Path(f"{Path(options.robot).stem}.png")
     _check_picture(path)
     choose_renderer()
+    load_renderer()
     console.quiet_warp()
     robot, notes = _load(options)
     report = check_robot(robot, options.engine)
