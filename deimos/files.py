@@ -62,6 +62,22 @@ def read_bytes(path: Path) -> bytes:
         return file.read()
 
 
+def require_place(path: Path) -> None:
+    """Refuse a place where no file can be written: for those who would find out after long work.
+
+    A file that is there already can be replaced.
+
+    Raises:
+        RunError: If its folder is missing or cannot be written to, or it is a folder itself.
+    """
+    if not path.parent.is_dir():
+        raise RunError(f"The folder {path.parent} does not exist; make it first.")
+    if path.is_dir():
+        raise RunError(f"{path} is a folder.")
+    if not os.access(path.parent, os.W_OK):
+        raise RunError(f"The folder {path.parent} cannot be written to.")
+
+
 def save_tensors(path: Path, data: dict) -> None:
     """Write a file of tensors so that at every moment either the old or the new one is complete.
 

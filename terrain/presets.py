@@ -72,6 +72,8 @@ def _grid(table: dict[str, Any], changes: dict[str, Any]) -> Grid:
     values = {name: value for name, value in table.items() if name != "shape"}
     if unknown := sorted(set(values) - set(hints)):
         raise ValueError(f"it has '{unknown[0]}', but may have only preset, shape, {', '.join(hints)}")
+    if not isinstance(table["shape"], list):
+        raise ValueError(f"shape must be a list of tables, [[shape]], got {table['shape']!r:.80}")
     numbers = {name: convert(name, value, hints[name]) for name, value in values.items()}
     return Grid(shapes=tuple(map(_share, table["shape"])), **(numbers | changes))
 

@@ -262,6 +262,17 @@ def test_a_pool_is_made_and_used_by_commands(tmp_path, capsys):
     assert re.search(r"\(Naive\) +argmax +scripted +pooled\n", capsys.readouterr().out)
 
 
+def test_a_place_for_a_pool_is_tried_before_the_work(tmp_path, monkeypatch, capsys):
+    """A folder that is missing, or that cannot be written to, is refused before anything is trained."""
+    monkeypatch.setattr("deimos.app.pool.make_pool", lambda *args: pytest.fail("trained in vain"))
+    make = ["pool", str(OLD), "--out"]
+    assert cli.main([*make, str(tmp_path / "none" / "pool.pt")]) == 2
+    assert capsys.readouterr().err == f"deimos: The folder {tmp_path / 'none'} does not exist; make it first.\n"
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    assert cli.main([*make, str(tmp_path / "pool.pt")]) == 2
+    assert capsys.readouterr().err == f"deimos: The folder {tmp_path} cannot be written to.\n"
+
+
 def test_a_pool_is_refused_in_one_line(tmp_path):
     """None, one of another environment, one that is not there, and policies that never crash."""
     config, pool = particle.Config(), tmp_path / "pool.pt"

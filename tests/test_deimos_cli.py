@@ -81,6 +81,8 @@ TRAIN_ERRORS = {
     "selector:learnability --selector.low 0.95": "low must be below high, got 0.95 and 0.9",
     "--device cuda": "There is no CUDA device here; use --device cpu",
     "--device tpu": "device must be auto, cpu, cuda or cuda:N, got 'tpu'",
+    "--ppo.hidden 8 --seed 2 --ppo.hidden 9": "--ppo.hidden is given twice; give it once, with all its values",
+    "--eval.attackers pooled --eval.pool none.pt": r"none.pt cannot be read \(No such file or directory\)",
     "--bogus 3": "Unrecognized options: --bogus",
     "bogus": "Unrecognized options: bogus",
     "--out there": "there exists and is not overwritten; choose another --out, or continue with --resume",
@@ -100,6 +102,12 @@ OTHER_ERRORS = {
     "evaluate": "Missing from deimos evaluate: .*Folder of the run",
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
     "evaluate there": "there is not a run folder: it holds no config.json",
+    "evaluate there --worlds many": r"deimos: --worlds: invalid literal for int\(\) with base 10: 'many'$",
+    "evaluate there --attackers oracle --attackers search": "--attackers is given twice; give it once",
+    "view there --shield maybe": "There is no 'maybe' for --shield; there are: 'ignore', 'project', 'stop'.$",
+    "terrain grid --difficulty 0.9": "deimos: --difficulty: input length 1 did not match .* 2 of `FLOAT FLOAT`$",
+    "terrain grid --out=a.npz --levels 1 --out=b.npz": "--out is given twice",
+    "doctor --device gpu": "device must be auto, cpu, cuda or cuda:N, got 'gpu'",
     "bench": "There is no command 'bench'",
     "study walk": "There is no command 'study walk'; there are: run, cell, show, attack, pool, pack, unpack, merge, "
     "export, report",
@@ -124,6 +132,20 @@ def test_training_refuses(here, capfd, monkeypatch, arguments):
     before = contents(here)
     assert re.search(TRAIN_ERRORS[arguments], refused(["train", *arguments.split()], capfd))
     assert contents(here) == before
+
+
+def test_a_folder_that_exists_is_refused_before_the_work(here, capfd, monkeypatch):
+    """Nothing is built, which takes minutes where robots are compiled, for a run whose folder is taken."""
+    monkeypatch.setattr(training, "build", lambda *args: pytest.fail("built in vain"))
+    assert "there exists and is not overwritten" in refused(["train", "--out", "there"], capfd)
+
+
+def test_of_an_option_given_twice_the_last_counts(monkeypatch):
+    """A single value may be given again, as scripts do to change one; its name alone decides, not that of a list."""
+    parsed = []
+    monkeypatch.setattr("deimos.app.train._train", parsed.append)
+    assert cli.main("train --seed 3 --seed 4 --eval.attackers argmax".split()) == 0
+    assert (parsed[0].seed, parsed[0].eval.attackers) == (4, ("argmax",))
 
 
 @pytest.mark.parametrize("arguments", OTHER_ERRORS)
@@ -244,11 +266,14 @@ def test_plugins_are_one_line_in_a_list():
 
 
 @pytest.mark.parametrize(
-    "command", ["evaluate", "play", "view", "study", "study run", "study show", "terrain", "terrain grid"]
+    "command",
+    "evaluate,play,view,study,study run,study show,study attack,terrain,terrain grid,terrain list".split(","),
 )
 def test_other_commands_explain_themselves(capsys, command):
-    """The other commands have a help too."""
-    assert "--help" in shown_help(command.split(), capsys)
+    """The other commands have a help too, in plain text."""
+    shown = shown_help(command.split(), capsys)
+    assert "--help" in shown
+    assert "`" not in shown
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,8 @@ def copied(finished, tmp_path):
         ("--worlds 0", "worlds must be at least 1, got 0"),
         ("--worlds many", "--worlds: .*'many'"),
         ("--seed -1", r"seed must be in \[0, .*, got -1"),
+        ("--pool pool.pt", "pool is the file of the attacker pooled; add --attackers pooled"),
+        ("--oracle-worlds 3 --attackers search", "oracle_worlds are those of the attacker oracle; add --attackers"),
         ("--contexts -1", "contexts must be at least 0, got -1"),
         (
             "--contexts 5 --worlds 3",

@@ -40,6 +40,27 @@ def test_says_what_there_is_and_what_works(capfd, monkeypatch):
     assert cli.main(["doctor", "--device", "cpu"]) == 0
 
 
+def test_a_folder_is_no_package(monkeypatch, tmp_path, capsys):
+    """A folder named like a package, as Weights & Biases leaves one with its logs, is not taken for it."""
+    for name in ("wandb", "trimesh"):
+        (tmp_path / name).mkdir()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(doctor, "CHECKS", [])
+    monkeypatch.setattr(doctor, "PURPOSES", {"wandb": ("curves", "wandb"), "trimesh": ("terrain", "legged")})
+    version = doctor.importlib.metadata.version
+
+    def found(name):
+        if name == "wandb":  # whatever is installed here
+            raise doctor.importlib.metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(doctor.importlib.metadata, "version", found)
+    assert cli.main(["doctor", "--device", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"curves +- +pip install 'deimos-rl\[wandb\]'", said)
+    assert re.search(r"terrain +\d\S+ +installed", said)
+
+
 def test_a_cache_that_cannot_be_written_is_found(monkeypatch, tmp_path):
     """The kernel cache is measured, and one that cannot be written to is said with the way out."""
     import warp as wp

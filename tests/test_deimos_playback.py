@@ -149,7 +149,7 @@ def test_pictures_of_a_particle_need_no_mujoco(particle, tmp_path):
     [
         ("x.avi", "video must end in one of .mp4, .mkv, .mov, .webm, .gif, .webp, got x.avi"),
         ("x", "video must end in one of"),
-        ("nowhere/x.gif", "The folder of nowhere/x.gif does not exist"),
+        ("nowhere/x.gif", "The folder nowhere does not exist; make it first"),
     ],
 )
 def test_what_cannot_be_written_is_refused(particle, tmp_path, monkeypatch, capsys, name, message):

@@ -14,7 +14,7 @@ from PIL import Image
 from robot_models import PAGE, write_scout
 
 from deimos import plugins
-from deimos.app import cli
+from deimos.app import cli, robot
 from deimos.sim.legged import engines, robot_check, robot_draft, robots
 from deimos.sim.legged.engines import PhysicsConfig
 
@@ -138,11 +138,11 @@ def test_a_robot_that_slides_is_odd(page):
     assert robot_check.judge_feet(standing) == ["it slides by 5 cm in 0.5 s; put its feet below its hips"]
 
 
-def run(folder, *arguments):
+def run(folder, *arguments, **more):
     """``deimos robot`` in a process of its own, for MuJoCo decides once how it renders."""
     path = os.pathsep.join([str(HOME), os.environ.get("PYTHONPATH", "")])
     return subprocess.run(
-        [sys.executable, "-m", "deimos", "robot", *arguments], cwd=folder, env=os.environ | {"PYTHONPATH": path},
+        [sys.executable, "-m", "deimos", "robot", *arguments], cwd=folder, env=os.environ | {"PYTHONPATH": path} | more,
         capture_output=True, text=True, check=False,
     )  # fmt: skip
 
@@ -155,8 +155,16 @@ def test_a_check_ends_with_a_picture(page):
     assert done.stdout.splitlines()[-2:] == ["It stands, and can be trained.", "scout.png"]
     picture = np.asarray(Image.open(page / "scout.png"))
     assert picture.shape == (480, 960, 3)
+    robot._check_picture(page / "scout.png")  # another check may replace it
     red = (picture[:, :, 0] > 150) & (picture[:, :, 1:] < 90).all(axis=2)
     assert red[:, 480:].sum() > 1000 > red[:, :480].sum()  # the base, where it is drawn as what collides
+
+
+def test_a_check_without_a_renderer_is_one_line(page):
+    """Where MuJoCo has nothing to render with, it cannot even be imported; the line says what to install."""
+    done = run(page, "check", "scout.toml", MUJOCO_GL="nonsense")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"deimos: Nothing can be rendered with MUJOCO_GL=nonsense .*install libegl1 .*\n", done.stderr)
 
 
 def test_a_check_ends_with_1_where_there_is_a_fault(page):
@@ -202,6 +210,7 @@ def test_a_draft_is_not_written_over_a_file(page, monkeypatch, capsys):
         (["check", "none.xml"], "mjcf must be an MJCF file, but there is no none.xml."),
         (["check", "scout.toml", "--held", "a"], "held is for an MJCF; a robot file names the joints that it holds."),
         (["check", "scout.toml", "--picture", "a.jpg"], "picture must end in .png, got a.jpg."),
+        (["check", "scout.toml", "--picture", "no/a.png"], "The folder no does not exist; make it first."),
         (["new", "none.xml"], "mjcf must be an MJCF file, but there is no none.xml."),
         (["new", "scout.xml", "--held", "tail"], "held must name joints of scout.xml, which has no 'tail'."),
         (
@@ -215,4 +224,17 @@ def test_bad_requests_end_in_one_line(page, monkeypatch, capsys, arguments, line
     monkeypatch.chdir(page)
     (page / "scout.toml").rename(page / "kept.toml") if arguments[0] == "new" else None
     assert cli.main(["robot", *arguments]) == 2
+    assert capsys.readouterr() == ("", f"deimos: {line}\n")
+
+
+@pytest.mark.parametrize("is_picture", [True, False])
+def test_a_file_that_no_check_has_drawn_stays(page, monkeypatch, capsys, is_picture):
+    """A texture of the robot's own, say, or what only ends in .png, is not overwritten."""
+    monkeypatch.chdir(page)
+    monkeypatch.setattr(robot, "check_robot", lambda *args: pytest.fail("checked in vain"))
+    Image.new("RGB", (4, 4)).save("scout.png") if is_picture else Path("scout.png").write_text("a note")
+    before = Path("scout.png").read_bytes()
+    assert cli.main(["robot", "check", "scout.toml"]) == 2
+    line = "scout.png exists and is not overwritten, for it is no picture of a check; choose another --picture."
     assert capsys.readouterr().err == f"deimos: {line}\n"
+    assert Path("scout.png").read_bytes() == before

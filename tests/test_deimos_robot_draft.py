@@ -321,3 +321,42 @@ def test_looks_that_weigh_are_named(tmp_path):
         path.read_text().replace("<freejoint/>", '<freejoint/><geom name="lid" size=".1" contype="0" conaffinity="0"/>')
     )
     assert any("geom 'lid' touches nothing and adds to the weight" in note for note in robot_draft.draft(path)[1])
+
+
+LEFT_OUT = {
+    "gravcomp": (
+        '<body name="upper_', '<body gravcomp="0.5" name="upper_',
+        "gravcomp of body 'upper_rr', 'upper_rl', 'upper_fr', 'upper_fl' is left out: gravity acts on all of its mass",
+    ),
+    "delay": (
+        '<motor joint="knee_fl"/>', '<motor joint="knee_fl" delay="0.01" nsample="4"/>',
+        "the delay of the actuator of joint 'knee_fl' is left out: its torque comes at once",
+    ),
+    "timeconst": (
+        '<motor joint="knee_fl"/>', '<general joint="knee_fl" dyntype="filter" dynprm="0.1" ctrlrange="-9 9"/>',
+        "the activation (timeconst, dyntype) of the actuator of joint 'knee_fl' is left out: it acts at once",
+    ),
+    "jet": (
+        "<actuator>", '<actuator><adhesion name="glue" body="lower_fl" ctrlrange="0 1" gain="3"/>',
+        "actuator 'glue' is left out, for it acts on no joint",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LEFT_OUT)
+def test_what_is_left_out_is_said(tmp_path, what):
+    """What moves the robot in the file and is not simulated is a note; the robot itself is as without it."""
+    path = write_scout(tmp_path)
+    plain, notes = robot_draft.draft(path)
+    old, new, note = LEFT_OUT[what]
+    path.write_text(path.read_text().replace(old, new))
+    robot, more = robot_draft.draft(path)
+    assert robot == plain
+    assert more == [note, *notes]
+
+
+def test_what_a_held_joint_loses_is_not_said(tmp_path):
+    """An actuator of a joint that is held moves nothing, whatever it has."""
+    path = write_mule(tmp_path)
+    path.write_text(path.read_text().replace('class="mule" joint="nod"', 'class="mule" joint="nod" timeconst="0.1"'))
+    assert robot_draft.draft(path, ("nod",))[1] == []

@@ -104,6 +104,12 @@ class FakeRay(ModuleType):
         """What the cluster has."""
         return {"CPU": 12.0, "GPU": 2.0}
 
+    def nodes(self):
+        """The machines, of which one was lost."""
+        plain, lost = {"CPU": 8.0, "memory": 1e9}, {"CPU": 64.0, "GPU": 8.0}
+        machines = ((plain, True), (plain | {"CPU": 4.0, "GPU": 2.0}, True), (lost, False))
+        return [{"Alive": lives, "Resources": has} for has, lives in machines]
+
     def get_runtime_context(self):
         """Where this is."""
         return SimpleNamespace(get_node_id=lambda: "here")
@@ -193,6 +199,31 @@ def test_a_cell_asks_ray_for_what_it_uses(study, ray):
     assert on_ray.OnRay(study, gpus=0.25).room([larger] * 50) == 4
 
 
+def test_what_no_machine_has_room_for_is_refused(study, ray):
+    """Ray would wait for ever for more GPUs, or more CPUs beside them, than a machine that lives has."""
+    engine, cell = on_ray.OnRay(study), study.cells()[0]
+    made = {
+        (threads, device): replace(cell, config=replace(cell.config, threads=threads, device=device))
+        for threads in (4, 8, 9) for device in ("cpu", "cuda")
+    }  # fmt: skip
+    engine.require_room([made[8, "cpu"], made[4, "cuda"]])
+    on_ray.OnRay(study, gpus=2.0).require_room([made[4, "cuda"]])
+    for threads, device, gpus in ((9, "cpu", None), (8, "cuda", None), (4, "cuda", 3.0)):
+        with pytest.raises(RunError, match=rf"has the {threads} CPU\(s\) and \d GPU\(s\) that .* takes; add one"):
+            on_ray.OnRay(study, gpus).require_room([made[threads, device]])
+
+
+def test_a_study_that_waits_for_ever_is_refused(study, ray, monkeypatch):
+    """The command asks for room before it begins, and counts no cell that is finished."""
+    monkeypatch.setattr(FakeRay, "nodes", lambda self: [])
+    monkeypatch.setattr(cli, "estimate", lambda *args, **more: Estimate("", {}))
+    with pytest.raises(RunError, match="No machine of the Ray cluster has the 1 CPU"):
+        cli.RunOptions(folder=study.path, engine="ray").run()
+    assert not Answers.begun
+    monkeypatch.setattr(StudyFolder, "finished", lambda self, cells: {cell.digest for cell in cells})
+    cli.RunOptions(folder=study.path, engine="ray").run()
+
+
 def test_what_ray_loses_is_a_line(study, ray, monkeypatch):
     """A cell that is lost more often than Ray tries it has failed in one line; so has one whose folder is not seen."""
     engine, cell = on_ray.OnRay(study), study.cells()[0]
@@ -229,10 +260,43 @@ def test_a_study_runs_on_ray(study, ray, monkeypatch):
     finished = study.cells()[0]
     monkeypatch.setattr(StudyFolder, "finished", lambda self, cells: {finished.digest} & {c.digest for c in cells})
     monkeypatch.setattr(Answers, "answer", "out of luck")
-    monkeypatch.setattr(cli, "estimate", lambda study, cells: Estimate("", {}))
+    monkeypatch.setattr(cli, "estimate", lambda *args, **more: Estimate("", {}))
     with pytest.raises(RunError, match=r"1 of 2 cells failed, .*: out of luck"):
         cli.RunOptions(folder=study.path, engine="ray").run()
     assert Answers.begun == [study.cells()[1].name] * 2
+
+
+@pytest.mark.parametrize("options", [{"engine": "ray"}, {"estimate": True}, {}])
+def test_what_cannot_be_measured_here(study, ray, monkeypatch, capsys, options):
+    """Cells that other machines work on need not be measured here, which has no GPU perhaps; those of this one must."""
+
+    def measure(cell):
+        raise RunError("There is no CUDA device here.")
+
+    monkeypatch.setattr("deimos.study.estimate._measure", measure)
+    command = cli.RunOptions(folder=study.path, **options)
+    if not options:
+        with pytest.raises(RunError, match="no CUDA device"):
+            command.run()
+        return
+    if options.get("engine"):
+        monkeypatch.setattr(Answers, "answer", "out of luck")
+        with pytest.raises(RunError, match="2 of 2 cells failed"):
+            command.run()
+    else:
+        command.run()
+    said = capsys.readouterr().err
+    assert re.match(r"2 run\(s\): .* M transitions \+ .*; how long they take cannot be measured here \(There is", said)
+
+
+def test_an_estimate_can_be_stopped(study, monkeypatch, capsys):
+    """Ctrl-C while kinds of cells are measured ends the command, says how it continues, and begins no cell."""
+    monkeypatch.setattr("deimos.study.estimate._measure", lambda cell: pytest.fail("measured all the same"))
+    with pytest.raises(SystemExit) as stop:
+        cli.RunOptions(folder=study.path).run(stopped=lambda: True)
+    assert stop.value.code == 130
+    assert f"continue with: deimos study run {study.path}" in capsys.readouterr().err
+    assert not any((study.cell_path(cell) / "run").exists() for cell in study.cells())
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from deimos.checks import RunError
 from deimos.files import load_tensors
 from deimos.run.attackers.pooled import SCHEMA
 from deimos.study import cell as worker
-from deimos.study import cli, plan
+from deimos.study import cli, plan, pools
 from deimos.study.folder import StudyFolder
 
 FACTORS = """
@@ -103,3 +103,12 @@ def test_a_study_without_policies_has_no_pools(tmp_path):
     """A folder without cells is refused."""
     with pytest.raises(RunError, match="holds no policies"):
         cli.PoolOptions(folder=tmp_path).run()
+
+
+def test_a_folder_for_pools_is_tried_before_the_work(screening, tmp_path, monkeypatch):
+    """One that cannot be written to is refused before anything is trained."""
+    monkeypatch.setattr(pools, "_is_finished", lambda study, cell: True)
+    monkeypatch.setattr(pools, "load_policy", lambda *args: pytest.fail("worked in vain"))
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(RunError, match=f"The folder {tmp_path} cannot be written to"):
+        cli.PoolOptions(folder=screening.path, out=tmp_path).run()

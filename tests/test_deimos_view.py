@@ -364,6 +364,31 @@ def test_what_cannot_be_shown_is_one_line(scared, tmp_path, monkeypatch, capsys,
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--goals argmx --attackers argmax", "There is no 'argmx' for --goals here"),
+        ("--shield stop --attackers argmax", "has no shield; make one by deimos shield"),
+        ("--record none/x.mp4 --attackers argmax", "The folder none does not exist; make it first"),
+        ("--record x.avi --attackers argmax", "video must end in one of .mp4,"),
+    ],
+)
+def test_what_is_missing_is_said_before_attackers_learn(scared, tmp_path, monkeypatch, capsys, arguments, message):
+    """Attackers learn for minutes: whatever else cannot be had is refused first."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delattr("deimos.app.view.prepare")
+    assert cli.main(["view", str(scared), *arguments.split()]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_mujoco_without_its_viewer_is_one_line(scared, capsys, monkeypatch):
+    """Where MuJoCo is installed and lacks the web viewer, as on Windows, nobody is told to install it."""
+    monkeypatch.setitem(sys.modules, "mujoco.studio", None)
+    assert cli.main(["view", str(scared), "--seconds", "1"]) == 2
+    line = "deimos: This needs mujoco.studio, which the mujoco that is installed has not.\n"
+    assert capsys.readouterr().err == line
+
+
 def test_a_port_in_use_is_one_line(scared, capsys, monkeypatch):
     """A port that another program listens on is refused in one line with the way out, before attackers learn."""
     monkeypatch.delattr("deimos.app.view.prepare")

@@ -286,6 +286,17 @@ def test_mistakes_give_one_line(folder, capsys, arguments, message):
     assert (folder / "here.npz").read_text() == "before"
 
 
+@pytest.mark.parametrize("option", ["--out a.npz", "--preview a.png", "--mjcf new", "--mjcf old"])
+def test_a_place_is_tried_before_the_work(folder, capsys, monkeypatch, option):
+    """A folder that cannot be written to is refused before anything is built."""
+    (folder / "old").mkdir()
+    monkeypatch.setattr("deimos.app.terrain.build_with_mesh", lambda *args, **more: pytest.fail("built in vain"))
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    assert run("grid", *option.split()) == 2
+    where = "old" if option.endswith("old") else "."
+    assert capsys.readouterr().err == f"deimos: The folder {where} cannot be written to.\n"
+
+
 def test_grid_that_does_not_fit_is_refused(folder, capsys, monkeypatch):
     """A grid beyond the free memory says how much it needs, and writes nothing."""
     monkeypatch.setattr("deimos.terrain.world._free_memory", lambda: 2**27)

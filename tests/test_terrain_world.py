@@ -294,7 +294,9 @@ def test_dropped_in_file_is_a_preset(tmp_path, monkeypatch):
         ('[[shape]]\nname = "flat"\nshare = "all"', r"share must be a number, got 'all'"),
         ('[[shape]]\nname = "flat"\ntile = 4.0', r"the tile of 'flat' is that of the grid"),
         ('[[shape]]\nname = "gap"\nwidth = 1', r"gap: width must be 2 numbers, got 1"),
-        ('shape = "flat"', r"every \[\[shape\]\] needs a name"),
+        ('shape = "flat"', r"shape must be a list of tables, \[\[shape\]\], got 'flat'"),
+        ('[shape]\nname = "flat"', r"shape must be a list of tables, \[\[shape\]\], got {'name': 'flat'}"),
+        ("shape = 5", r"shape must be a list of tables, \[\[shape\]\], got 5"),
         ("preset = 3", r"There is no preset '3'"),
     ],
 )

@@ -65,9 +65,11 @@ def main(arguments: list[str] | None = None) -> int:
     except (RunError, SimulationError) as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
+        package, _, part = (error.name or "").partition(".")
         if package not in EXTRAS:
             raise
+        if part and importlib.util.find_spec(package) is not None:
+            return _fail(f"This needs {error.name}, which the {package} that is installed has not.")
         return _fail(f"This needs {package}, which is not installed: pip install 'deimos-rl[{EXTRAS[package]}]'")
     except ImportError as error:
         return _fail(f"{error.name or 'A library'} cannot be loaded ({error}).")

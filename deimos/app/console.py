@@ -12,6 +12,7 @@ import io
 import itertools
 import logging
 import os
+import re
 import shutil
 import signal
 import sys
@@ -21,8 +22,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
-from types import MappingProxyType
-from typing import Annotated, Any
+from types import MappingProxyType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from deimos.checks import RunError
 
@@ -73,27 +74,46 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
     import tyro
 
     arguments = [_at_home(argument) for argument in arguments]
+    is_help = bool({"-h", "--help"} & set(arguments))
+    rule, registry = _Fields(is_help), tyro.constructors.ConstructorRegistry()
+    registry.struct_rule(rule)
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(ImportError):  # then tyro's own, framed words stay, with exit code 2
             from tyro._errors import on_parse_error  # since 1.0.17, and not promised
 
             stack.enter_context(on_parse_error(_refuse))
-        if {"-h", "--help"} & set(arguments):
-            more["registry"] = registry = tyro.constructors.ConstructorRegistry()
-            registry.struct_rule(_Explained())
+        if is_help:
             stack.enter_context(_wrapped_help())
-        return tyro.cli(options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), **more)
+        found = tyro.cli(
+            options, args=arguments, prog=program, config=(tyro.conf.CascadeSubcommandArgs,), registry=registry, **more
+        )
+    _refuse_repeated(arguments, rule.lists)
+    return found
 
 
-class _Explained:
-    """A rule of tyro's: how a dataclass is explained by its help.
+def _refuse_repeated(arguments: list[str], lists: set[str]) -> None:
+    """Refuse an option of several values that is given twice: of such, the last one's values alone would count."""
+    flags = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
+    for flag in dict.fromkeys(flags):
+        if flags.count(flag) > 1 and flag.rpartition(".")[2].lstrip("-").replace("-", "_") in lists:
+            raise RunError(f"{flag} is given twice; give it once, with all its values: {flag} A B.")
 
-    Docstrings below fields are shown without the line breaks that tyro would keep. None is not shown, neither as a
-    value nor as a default: what it stands for is in the docstring.
+
+class _Fields:
+    """A rule of tyro's: how the fields of a dataclass are read and, for help, explained.
+
+    None is no value that can be given, and not shown: what it stands for is in the docstring. Docstrings below fields
+    are shown without the line breaks that tyro would keep.
+
+    Args:
+        explained: Whether help is asked for.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, explained: bool) -> None:
+        self._explained = explained
         self._is_asking = False  # what tyro would say without this rule
+        self.lists: set[str] = set()
+        """Names of the fields that take any number of values."""
 
     def __call__(self, struct: Any) -> Any:
         """What tyro is to show; ``None`` leaves it to the other rules."""
@@ -101,12 +121,8 @@ class _Explained:
 
         if self._is_asking or not (isinstance(struct.type, type) and dataclasses.is_dataclass(struct.type)):
             return None
-        texts: dict[str, str] = {}
-        for kind in reversed(inspect.getmro(struct.type)):
-            texts |= _docstrings(kind.__module__).get(kind.__name__, {})
-        for known in dataclasses.fields(struct.type):
-            if known.name in texts:
-                known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+        if self._explained:
+            _explain(struct.type)
         self._is_asking = True
         try:
             found = tyro.constructors.ConstructorRegistry.get_struct_spec(struct)
@@ -114,16 +130,37 @@ class _Explained:
             self._is_asking = False
         if not isinstance(found, tyro.constructors.StructConstructorSpec):
             return found
+        self.lists |= {field.name for field in found.fields if _is_list(field.type)}
         return dataclasses.replace(found, fields=tuple(map(_without_none, found.fields)))
 
 
+def _is_list(kind: Any) -> bool:
+    """Whether a type is a list or a tuple of any length, or either one or None."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin in (Annotated, Union, UnionType):
+        return any(map(_is_list, parts))
+    return origin is list or (origin is tuple and Ellipsis in parts)
+
+
+def _explain(kind: type) -> None:
+    """Give the fields of a dataclass the docstrings below them as their help."""
+    texts: dict[str, str] = {}
+    for each in reversed(inspect.getmro(kind)):
+        texts |= _docstrings(each.__module__).get(each.__name__, {})
+    for known in dataclasses.fields(kind):
+        if known.name in texts:
+            known.metadata = MappingProxyType({"help": texts[known.name]} | known.metadata)
+
+
 def _without_none(field: Any) -> Any:
-    """A field of tyro's that is a value and None by default, as its help is to show it; other fields as they are."""
+    """A field of tyro's that is a value and None by default, without None as a value; other fields as they are."""
     from tyro import conf, constructors
 
+    if field.default is not None:
+        return field
     info = constructors.PrimitiveTypeInfo.make(field.type, set())
     spec = constructors.ConstructorRegistry.get_primitive_spec(info)
-    if field.default is not None or not isinstance(spec, constructors.PrimitiveConstructorSpec):
+    if not isinstance(spec, constructors.PrimitiveConstructorSpec):
         return field
     return dataclasses.replace(field, type=Annotated[field.type, conf.DisallowNone, conf.arg(help_behavior_hint="")])
 
@@ -154,7 +191,7 @@ def _wrapped_help() -> Iterator[None]:
         with contextlib.redirect_stdout(said):
             yield
     finally:
-        for line in said.getvalue().splitlines():
+        for line in said.getvalue().replace("``", "").splitlines():
             print(line.rstrip() if "\x1b" in line else textwrap.fill(line.rstrip(), width))
 
 
@@ -166,15 +203,26 @@ def _at_home(argument: str) -> str:
     return os.path.expanduser(argument)
 
 
+def _plainly(message: str) -> str:
+    """What tyro says of a value, without its markup and, where it could be of one type alone, without naming that."""
+    message = re.sub(r"\[/?bold\]", "", message)
+    tried = re.findall(r"^- .*?: (.*)$", message, re.MULTILINE)
+    return tried[0] if len(tried) == 1 else message
+
+
 def _refuse(event: Any) -> None:
     """Raise ``RunError`` in place of tyro's framed words; what is not known here stays with tyro."""
     argument = getattr(event, "argument", None)
     name = argument and argument.display_name()
     match type(event).__name__:
         case "InstantiationFailure":
-            raise RunError(f"{name}: {event.message}" if name else event.message)
+            message = _plainly(event.message)
+            raise RunError(f"{name}: {message}" if name else message)
         case "InvalidChoice":
-            raise RunError(f"There is no '{event.value}' for {name}; there are: {', '.join(map(repr, event.choices))}.")
+            choices = event.choices
+            if "None" in choices:  # tyro has made a set of them
+                choices = sorted(set(choices) - {"None"})
+            raise RunError(f"There is no '{event.value}' for {name}; there are: {', '.join(map(repr, choices))}.")
         case "SubcommandConflict":
             chosen, flag = event.already_selected, event.trigger_flag
             raise RunError(f"{event.attempted} must stand before {flag}, which is an option of {chosen}.")

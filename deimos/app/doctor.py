@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib.metadata
-import importlib.util
 import os
 import signal
 import subprocess
@@ -17,7 +16,7 @@ from typing import Any
 import torch
 
 from deimos.app import console, gpu_stages
-from deimos.checks import RunError, one_line
+from deimos.checks import RunError, check_device, one_line
 from deimos.run import training
 from deimos.run.cores import cores
 from deimos.run.folder import RunFolder
@@ -59,6 +58,7 @@ class DoctorOptions:
     """Folder of the report of --gpu, and of what --science makes."""
 
     def __post_init__(self) -> None:
+        check_device("device", self.device)
         if unknown := [name for name in self.stages if name not in gpu_stages.STAGES]:
             raise ValueError(f"stages must be some of {', '.join(gpu_stages.STAGES)}, got '{unknown[0]}'.")
         if (self.science or self.stages) and not self.gpu:
@@ -118,9 +118,10 @@ def _table(title: str, rows: Sequence[Sequence[str]]) -> str:
 
 def _package(name: str, extra: str) -> tuple[str, str]:
     """The version of a package and what to say of it."""
-    if importlib.util.find_spec(name) is None:
+    try:
+        return importlib.metadata.version(name.replace("_", "-")), "installed"
+    except importlib.metadata.PackageNotFoundError:  # a folder of that name, such as wandb's logs, is no package
         return "-", f"pip install 'deimos-rl[{extra}]'"
-    return importlib.metadata.version(name.replace("_", "-")), "installed"
 
 
 def _cuda() -> str:

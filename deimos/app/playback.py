@@ -30,7 +30,7 @@ class PlayOptions:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     video: Path | None = None
-    """Video to write: .mp4, .mkv, .mov, .webm, .gif or .webp."""
+    """Video to write: .mp4, .mkv, .mov, .webm, .gif or .webp; one that is there is replaced."""
     frames: Path | None = None
     """Folder for single pictures (.png) instead; must not exist."""
     seconds: float = 10.0

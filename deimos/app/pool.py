@@ -8,6 +8,7 @@ import tyro
 from deimos.app import console
 from deimos.app.findings import known
 from deimos.checks import RunError
+from deimos.files import require_place
 from deimos.learn.policy import load_policy
 from deimos.nn.threads import torch_on_one
 from deimos.run import training
@@ -43,6 +44,7 @@ def main(arguments: list[str], program: str) -> None:
     options: PoolOptions = console.parse(PoolOptions, arguments, program)
     if options.out.exists():
         raise RunError(f"{options.out} exists and is not overwritten; choose another --out.")
+    require_place(options.out)
     folders = [RunFolder.open(path) for path in options.runs]
     console.quiet_warp()
     device = training.resolve_device(options.device)

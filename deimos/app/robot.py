@@ -1,5 +1,6 @@
 """``deimos robot``: draft a robot's file from an MJCF, and check a robot: what is missing or odd, with a picture."""
 
+import contextlib
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +13,19 @@ from deimos import plugins
 from deimos.app import console
 from deimos.app.console import number, table
 from deimos.checks import RunError
-from deimos.files import write_whole
+from deimos.files import require_place, write_whole
 from deimos.sim.drawing import with_caption
 from deimos.sim.legged import mjcf, robot_draft, robot_file, robots
 from deimos.sim.legged.robot_check import LEGS, PARTS, SECONDS, Report, check_robot
 from deimos.sim.legged.robots import COLLISION_GROUP, VISUAL_GROUP, Robot
-from deimos.sim.rendering import choose_renderer, renderer
+from deimos.sim.rendering import choose_renderer, load_renderer, renderer
 
 if TYPE_CHECKING:
     import mujoco
 
 SIZE = 480  # [pixels] of either side of each of the two views
 SEEN = 3.2  # distance of the camera, in heights of the base
+DRAWN_BY = "deimos robot check"  # what a picture says of itself
 COLOURS = {"base": (0.85, 0.2, 0.15, 1.0), "feet": (0.1, 0.6, 0.25, 1.0), "limbs": (0.2, 0.4, 0.8, 1.0)}
 
 
@@ -41,7 +43,8 @@ class CheckOptions:
     engine: Literal["native", "warp"] = "native"
     """What simulates it; warp, mujoco-warp, compiles for a minute or two first."""
     picture: Path | None = None
-    """PNG file for the picture: what the robot looks like, and what of it collides. By default NAME.png here."""
+    """PNG file for the picture: what the robot looks like, and what of it collides. By default NAME.png here. One of an
+    earlier check is replaced, another file is not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,12 +89,14 @@ def write_draft(arguments: list[str], program: str) -> None:
 def check(arguments: list[str], program: str) -> None:
     """Check a robot; ends the process with 1 if it has faults."""
     options: CheckOptions = console.parse(CheckOptions, arguments, program)
+    path = options.picture or Path(f"{Path(options.robot).stem}.png")
+    _check_picture(path)
     choose_renderer()
+    load_renderer()
     console.quiet_warp()
     robot, notes = _load(options)
     report = check_robot(robot, options.engine)
     _say(robot, report, notes)
-    path = options.picture or Path(f"{Path(options.robot).stem}.png")
     _draw(path, robot, report)
     print(path)
     if report.faults:
@@ -140,13 +145,26 @@ def _say(robot: Robot, report: Report, notes: list[str]) -> None:
     print("It cannot be trained like this." if report.faults else "It stands, and can be trained.")
 
 
-def _draw(path: Path, robot: Robot, report: Report) -> None:
-    """Write a picture of the robot as it stands: its looks to the left, what collides to the right."""
-    import mujoco
+def _check_picture(path: Path) -> None:
+    """Raise ``RunError`` unless a picture can be written there: where nothing is, or one of an earlier check."""
     from PIL import Image
 
     if path.suffix.lower() != ".png":
         raise RunError(f"picture must end in .png, got {path}.")
+    require_place(path)
+    if not path.exists():
+        return
+    with contextlib.suppress(Exception), Image.open(path) as found:  # a foreign file may raise anything
+        if found.info.get("Software") == DRAWN_BY:
+            return
+    raise RunError(f"{path} exists and is not overwritten, for it is no picture of a check; choose another --picture.")
+
+
+def _draw(path: Path, robot: Robot, report: Report) -> None:
+    """Write a picture of the robot as it stands: its looks to the left, what collides to the right."""
+    import mujoco
+    from PIL import Image, PngImagePlugin
+
     model, data = report.physics.model, report.physics.to_mujoco(0)
     _colour(model, robot)
     camera = mujoco.MjvCamera()
@@ -160,7 +178,9 @@ def _draw(path: Path, robot: Robot, report: Report) -> None:
             shown.geomgroup[group] = 1
             drawn.update_scene(data, camera, shown)
             views.append(with_caption(drawn.render(), text))
-    write_whole(path, lambda file: Image.fromarray(np.hstack(views)).save(file, "PNG"))
+    notes = PngImagePlugin.PngInfo()
+    notes.add_text("Software", DRAWN_BY)
+    write_whole(path, lambda file: Image.fromarray(np.hstack(views)).save(file, "PNG", pnginfo=notes))
 
 
 def _colour(model: "mujoco.MjModel", robot: Robot) -> None:

@@ -12,6 +12,7 @@ import tyro
 
 from deimos.app import console
 from deimos.checks import RunError, check_range
+from deimos.files import require_place
 from deimos.terrain import catalog, export, presets
 from deimos.terrain.grid import Terrain
 from deimos.terrain.importing import import_file
@@ -270,14 +271,12 @@ def _check_outputs(outputs: Outputs) -> None:
     if mjcf and mjcf.exists() and not mjcf.is_dir():
         raise RunError(f"mjcf must be a folder, but {mjcf} is a file.")
     files = [*outputs.out, *filter(None, [preview])]
-    for path in [*files, *filter(None, [mjcf])]:
-        if not path.parent.is_dir():
-            raise RunError(f"The folder {path.parent} does not exist; make it first.")
-    files += [mjcf / name for name in export.MJCF_FILES] if mjcf else []
+    inside = [mjcf / name for name in export.MJCF_FILES] if mjcf else []
+    for path in [*files, *(inside if mjcf is None or mjcf.exists() else [mjcf])]:
+        require_place(path)
+    files += inside
     for number, path in enumerate(files):
         if path in files[:number]:
             raise RunError(f"{path} is named twice.")
-        if path.is_dir():
-            raise RunError(f"{path} is a folder.")
         if path.exists() and not outputs.force:
             raise RunError(f"{path} exists and is not overwritten; choose another name, or add --force.")

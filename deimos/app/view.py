@@ -23,7 +23,7 @@ from deimos.checks import RunError, check_at_least, check_positive, check_range
 from deimos.goals.shield import Mode
 from deimos.run.attack import names as attacker_names
 from deimos.run.saved import SavedRun
-from deimos.run.video import video
+from deimos.run.video import require_video, video
 from deimos.sim.drawing import with_caption
 from deimos.sim.rendering import choose_renderer, load_renderer, renderer
 
@@ -64,7 +64,8 @@ class ViewOptions:
     seed: int = 1_000_003
     """Seed of the worlds and their goals, in [0, 2^32)."""
     record: Path | None = None
-    """Video to write meanwhile: .mp4, .mkv, .mov, .webm, .gif or .webp. What is paused is left out."""
+    """Video to write meanwhile: .mp4, .mkv, .mov, .webm, .gif or .webp; one that is there is replaced. What is paused
+    is left out."""
     seconds: float | None = None
     """End after so many simulated seconds, or 50 steps each where the world has none; by default when stopped."""
     fps: float = 25.0
@@ -93,20 +94,22 @@ def main(arguments: list[str], program: str) -> None:
     options: ViewOptions = console.parse(ViewOptions, arguments, program)
     console.quiet_warp()
     if options.record:
+        require_video(options.record)
         choose_renderer()
         load_renderer()
     run = SavedRun.open(options.run, options.goal_period, options.terrain)
-    check_port(options.port)  # attackers learn for minutes
-    with console.progress("attackers learn") as report:
-        attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report)
+    check_port(options.port)
     worlds = options.worlds or (1 if run.has_robots else 8)
-    session = Session(run, worlds, options.seed, options.world, attacks, afraid, options.shield)
-    if options.goals not in session.names:
+    session = Session(run, worlds, options.seed, options.world, shield=options.shield)
+    if options.goals not in (*session.names, *options.attackers):
         possible = sorted({*session.names[:-1], *attacker_names()})
         raise RunError(
             f"There is no '{options.goals}' for --goals here; there are: {', '.join(session.names[:-1])}, and with "
             f"--attackers: {', '.join(possible)}."
         )
+    with console.progress("attackers learn") as report:  # for minutes: all that can be refused has been
+        attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report)
+    session.add_attackers(attacks, afraid)
     session.choose(options.goals)
     watch(session, options)
 

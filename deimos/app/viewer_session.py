@@ -142,6 +142,13 @@ class Session:
         self.goals.current, self.goals.own = current if current in (*choices, BY_HAND) else UNIFORM, own
         self._loop = GoalLoop(self.env, self.goals, guard=self._guard)
 
+    def add_attackers(
+        self, attacks: Mapping[str, Attack], afraid: Callable[[Env], FearSelector] | None = None
+    ) -> None:  # fmt: skip
+        """Let attackers choose too; for the arguments see ``Session``, which may be without them until then."""
+        self._attacks, self._fallback = dict(attacks), afraid
+        self._join()
+
     def _stamps(self) -> list[tuple[int, int]]:
         """What tells whether the files of a run are those that were loaded."""
         try:

@@ -171,6 +171,13 @@ def check_memory(env_config: EnvConfig, config: EvalConfig, device: torch.device
         )  # fmt: skip
 
 
+def require_pool(config: EvalConfig) -> None:
+    """Raise ``RunError`` unless the file of an attacker that needs one can be read."""
+    for name in config.attackers:
+        if attacker(name).needs_pool and config.pool is not None:
+            _read(config.pool)
+
+
 def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
     """Rows of the folder that differ from these of an evaluation in nothing but the engine: how it did elsewhere."""
 

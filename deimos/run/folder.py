@@ -30,14 +30,18 @@ class RunFolder:
         self.path = path
         self._columns: dict[str, list[str]] = {}  # of the files that were added to
 
+    @staticmethod
+    def require_new(path: Path) -> None:
+        """Refuse a folder of a new run that exists."""
+        if path.exists():
+            raise RunError(f"{path} exists and is not overwritten; choose another --out, or continue with --resume.")
+
     @classmethod
     def create(cls, path: Path) -> "RunFolder":
         """Make the folder, which must not exist."""
+        cls.require_new(path)
         try:
             path.mkdir(parents=True)
-        except FileExistsError as error:
-            reason = f"{path} exists and is not overwritten; choose another --out, or continue with --resume."
-            raise RunError(reason) from error
         except OSError as error:
             raise RunError(f"The run folder {path} cannot be made ({error.strerror}).") from error
         return cls(path)

@@ -23,7 +23,7 @@ from deimos.run.branch import check_branch
 from deimos.run.clips import Camera, cut_clips
 from deimos.run.config import from_dict, kind, require_readable, to_dict, with_plain_numbers
 from deimos.run.cores import cores
-from deimos.run.evaluation import check_memory
+from deimos.run.evaluation import check_memory, require_pool
 from deimos.run.failure import check_finite, dumped
 from deimos.run.folder import RunFolder
 from deimos.run.logs import Logs, open_logs
@@ -110,6 +110,10 @@ def start(
     )  # fmt: skip
     torch.set_num_threads(config.threads)
     with ranks.together():
+        if path is not None and ranks.place().first:
+            RunFolder.require_new(path)  # before robots are compiled
+        if config.evaluation:
+            require_pool(config.eval)  # before hours of training
         trainer = build(config, device)
         if init_from is not None:
             _load_weights(trainer, RunFolder.open(init_from))

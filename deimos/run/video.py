@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from deimos.checks import RunError
-from deimos.files import first_line
+from deimos.files import first_line, require_place
 
 CODECS = {".mp4": "libx264", ".mkv": "libx264", ".mov": "libx264", ".webm": "libvpx-vp9", ".gif": "gif"}
 """What ffmpeg encodes a video with, by the ending of its file."""
@@ -47,6 +47,13 @@ def pictures(folder: Path) -> Iterator[Write]:
     yield write
 
 
+def require_video(path: Path) -> None:
+    """Raise ``RunError`` unless ``path`` ends in one of ``ENDINGS`` and a file can be written there."""
+    if path.suffix.lower() not in ENDINGS:
+        raise RunError(f"video must end in one of {', '.join(ENDINGS)}, got {path}.")
+    require_place(path)
+
+
 @contextmanager
 def video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
     """Writes a video, whose ending is one of ``ENDINGS``; one that is cut off does not stay.
@@ -59,11 +66,8 @@ def video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
     Raises:
         RunError: If the ending is another, it cannot be written, or no picture was.
     """
+    require_video(path)
     ending = path.suffix.lower()
-    if ending not in ENDINGS:
-        raise RunError(f"video must end in one of {', '.join(ENDINGS)}, got {path}.")
-    if not path.parent.is_dir():
-        raise RunError(f"The folder of {path} does not exist.")
     unfinished = path.with_name(f".unfinished-{path.name}")
     try:
         known = CODECS.get(ending)

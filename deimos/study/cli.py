@@ -67,7 +67,9 @@ class _WorkOptions(_FolderOptions):
             from deimos.study.on_ray import OnRay
 
             engine = cluster = OnRay(study, self.gpus)
-            workers = self.workers or cluster.room(study.cells())
+            finished = study.finished(cells := study.cells())
+            cluster.require_room([cell for cell in cells if cell.digest not in finished])
+            workers = self.workers or cluster.room(cells)
         runner = Runner(study, engine, workers, seconds or {})
         end = runner.run(lambda progress: report(_summary(progress), progress.share), stopped)
         if end.finished + len(end.failed) < end.total:
@@ -147,7 +149,10 @@ class RunOptions(_WorkOptions):
             study.forget_failures()
         seconds = None
         if open_ := _open(study):
-            takes = estimate(study, open_)
+            takes = estimate(study, open_, elsewhere=self.engine == "ray" or self.estimate, stopped=stopped)
+            if stopped():
+                print(f"Stopped before any cell; continue with: deimos study run {study.path}", file=sys.stderr)
+                raise SystemExit(130)
             print(takes.text, file=sys.stderr, flush=True)
             seconds = takes.seconds
         elif self.estimate:

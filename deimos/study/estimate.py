@@ -3,12 +3,13 @@
 import random
 import time
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from statistics import harmonic_mean, median
 
 import torch
 
+from deimos.checks import RunError, one_line
 from deimos.nn.threads import on_threads
 from deimos.run import training
 from deimos.run.attack import attacker, uniform_goals
@@ -25,6 +26,8 @@ SECONDS = 10.0  # of training that a kind of cells is measured for, at most; a p
 PLAYED = 50  # steps of a policy that evaluations are measured by
 MOST_KINDS = 16  # that are measured; others are as fast as these in the mean
 OF_ORACLE = 100  # candidates that an attacker tries in clones
+Kind = tuple[str, str]
+"""Cells that are as fast: their setting, and who chooses the goals."""
 
 
 @dataclass(frozen=True)
@@ -47,42 +50,70 @@ class Estimate:
     """Of every cell, by its name: seconds of a core for its training, and for all else."""
 
 
-def estimate(study: StudyFolder, cells: Iterable[Cell]) -> Estimate:
+def estimate(
+    study: StudyFolder, cells: Iterable[Cell], *, elsewhere: bool = False, stopped: Callable[[], bool] = lambda: False
+) -> Estimate:  # fmt: skip
     """What the cells of a study that are not finished take; it measures kinds of cells for some seconds each.
 
     Of more than ``MOST_KINDS``, as a design over many settings has, a random sample is measured. Training is as fast as
     the finished cells of a kind were where there are any, and acting as measured.
+
+    Args:
+        study: The study.
+        cells: At least one cell.
+        elsewhere: Whether other machines work on them: then what this one cannot run, for want of a GPU, is left out.
+        stopped: Asked before a kind is measured; true leaves out those that are left.
+
+    Raises:
+        RunError: If a kind of cells cannot be run here, and not ``elsewhere``.
     """
     cells = list(cells)
-    kinds: dict[tuple[str, str], list[Cell]] = defaultdict(list)
+    kinds: dict[Kind, list[Cell]] = defaultdict(list)
     for cell in cells:
         kinds[cell.setting, kind(cell.config.goals)].append(cell)
-    ran: dict[tuple[str, str], list[float]] = defaultdict(list)
+    ran: dict[Kind, list[float]] = defaultdict(list)
     results = study.results()
     for row in results.rows:
         ran[row["setting"], row["method"]].append(row["fps"])
     sample = random.Random(0).sample([*kinds], min(MOST_KINDS, len(kinds)))
-    measures = {name: _measure(kinds[name][0]) for name in sample}
+    measures, reason = _measure_all({name: kinds[name][0] for name in sample}, elsewhere, stopped)
+    costs = {cell.name: cost(study, cell, results) for cell in cells}
+    trained, acted = (sum(steps) for steps in zip(*costs.values(), strict=True))
+    learning = f"{len(cells)} run(s): {trained / 1e6:,.1f} M transitions"
+    others = f"{acted / 1e6:,.1f} M world-steps of attacks, evaluations and audits"
+    if not measures:
+        return Estimate(f"{learning} + {others}; how long they take cannot be measured here ({reason})", {})
     mean = Speed(*(harmonic_mean([getattr(x, rate) for x in measures.values()]) for rate in ("training", "acting")))
-    trained = acted = 0.0
     measured, seconds = False, {}
     for name, own in kinds.items():
         speed = measures.get(name, mean)
         for cell in own:
             known = [fps for fps in ran[cell.setting, cell.config.label] if fps > 0]
             measured |= not known
-            transitions, steps = cost(study, cell, results)
-            trained, acted = trained + transitions, acted + steps
+            transitions, steps = costs[cell.name]
             rate = median(known) if known else speed.training
             seconds[cell.name] = transitions / rate, steps / speed.acting
-    each = "each kind" if len(sample) == len(kinds) else f"{len(sample)} of {len(kinds)} kinds"
+    each = "each kind" if len(measures) == len(kinds) else f"{len(measures)} of {len(kinds)} kinds"
     source = f"measured on a short run of {each}" if measured else "of the finished cells"
     hours = sum(map(sum, seconds.values())) / 3600
-    return Estimate(
-        f"{len(cells)} run(s): {trained / 1e6:,.1f} M transitions (FPS {source}) + {acted / 1e6:,.1f} M world-steps of "
-        f"attacks, evaluations and audits = {hours:.2f} core-hours.",
-        seconds,
-    )
+    return Estimate(f"{learning} (FPS {source}) + {others} = {hours:.2f} core-hours.", seconds)
+
+
+def _measure_all(
+    cells: Mapping[Kind, Cell], elsewhere: bool, stopped: Callable[[], bool]
+) -> tuple[dict[Kind, Speed], str]:  # fmt: skip
+    """The speeds of kinds of cells, and why the last one that cannot be run here cannot; see ``estimate``."""
+    measures, reason = {}, ""
+    for name, cell in cells.items():
+        if stopped():
+            break
+        try:
+            measures[name] = _measure(cell)
+        except RunError as error:
+            if not elsewhere:
+                raise
+            reason = one_line(error)
+    return measures, reason
 
 
 def cost(study: StudyFolder, cell: Cell, results: Results | None = None) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from deimos.checks import RunError, check_at_least, one_line
-from deimos.files import read_bytes
+from deimos.files import first_line, read_bytes
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets, training
@@ -202,7 +202,7 @@ def _read(path: Path, readers: tuple[Path, ...]) -> dict:
     except RecursionError as error:
         raise RunError(f"{path} is not a study's TOML file (it is nested too deep).") from error
     except (OSError, ValueError) as error:
-        raise RunError(f"{path} is not a study's TOML file ({one_line(error)}).") from error
+        raise RunError(f"{path} is not a study's TOML file ({first_line(error)}).") from error
     if "base" not in data:
         return data
     base = path.parent / check_kind(f"{path}: base", data["base"], str)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from deimos.checks import RunError
+from deimos.files import require_place
 from deimos.learn.policy import load_policy
 from deimos.nn.threads import torch_on_one
 from deimos.run.attackers.pooled import make_pool
@@ -64,6 +65,7 @@ def _is_finished(study: StudyFolder, cell: Cell) -> bool:
 
 
 def _write(study: StudyFolder, cells: Sequence[Cell], path: Path, device: torch.device) -> dict[str, Any]:
+    require_place(path)
     with one_stream(device), torch_on_one():
         targets = []
         for cell in cells:

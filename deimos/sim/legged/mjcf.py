@@ -53,7 +53,7 @@ class Source:
     has_keyframe: bool
     """Whether the pose is that of a keyframe."""
     notes: tuple[str, ...]
-    """What is odd about the file, each with a way out."""
+    """What is odd about the file, each with a way out, and what of it is left out."""
 
     def name(self, joint: int) -> str:
         """Name of a joint."""
@@ -92,7 +92,7 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
         raise ValueError(f"mjcf must be a file that MuJoCo loads, but of {path} it says: {one_line(error)}") from error
     base = _find_base(path, whole)
     _refuse_couplings(path, whole)
-    visual = _weighing_visuals(spec, whole)
+    notes = [*_weighing_visuals(spec, whole), *_left_out(whole, held)]
     for name in held:
         if spec.joint(name) is None:
             raise ValueError(f"held must name joints of {path}, which has no '{name}'.")
@@ -109,7 +109,7 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
     return Source(
         model=model, base=model.body(base).id, servos=_servos(whole),
         pose={whole.joint(j).name: float(angles[whole.jnt_qposadr[j]]) for j in range(whole.njnt)},
-        has_keyframe=key is not None, notes=tuple(visual),
+        has_keyframe=key is not None, notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -204,6 +204,27 @@ def _weighing_visuals(spec: "mujoco.MjSpec", model: "mujoco.MjModel") -> list[st
         f"geom '{name}' touches nothing and adds to the weight of its body, which has no <inertial>; give it mass=\"0\""
         for name in weighing
     ]
+
+
+def _left_out(model: "mujoco.MjModel", held: Sequence[str]) -> list[str]:
+    """What to say of what moves the robot in the file and is not simulated; actuators of held joints do not."""
+    import mujoco
+
+    on_joints = [int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)]
+    joints = {i: model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu)
+              if model.actuator_trntype[i] in on_joints}  # fmt: skip
+    moving = [i for i, joint in joints.items() if joint not in held]
+    late = [joints[i] for i in moving if model.actuator_delay[i] > 0]
+    filtered = [joints[i] for i in moving if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE]
+    light = [model.body(i).name for i in range(1, model.nbody) if model.body_gravcomp[i]]
+    others = [model.actuator(i).name or f"number {i}" for i in range(model.nu) if i not in joints]
+    found = (
+        (light, "gravcomp of body {} is left out: gravity acts on all of its mass"),
+        (late, "the delay of the actuator of joint {} is left out: its torque comes at once"),
+        (filtered, "the activation (timeconst, dyntype) of the actuator of joint {} is left out: it acts at once"),
+        (others, "actuator {} is left out, for it acts on no joint"),
+    )
+    return [text.format(", ".join(f"'{name}'" for name in dict.fromkeys(names))) for names, text in found if names]
 
 
 def _standing_keyframe(model: "mujoco.MjModel") -> int | None:
