@@ -199,29 +199,31 @@ def test_a_cell_asks_ray_for_what_it_uses(study, ray):
     assert on_ray.OnRay(study, gpus=0.25).room([larger] * 50) == 4
 
 
-def test_what_no_machine_has_room_for_is_refused(study, ray):
-    """Ray would wait for ever for more GPUs, or more CPUs beside them, than a machine that lives has."""
+def test_what_no_machine_has_room_for_is_named(study, ray):
+    """Ray would wait without a word for more GPUs, or more CPUs beside them, than a machine that lives has."""
     engine, cell = on_ray.OnRay(study), study.cells()[0]
     made = {
         (threads, device): replace(cell, config=replace(cell.config, threads=threads, device=device))
         for threads in (4, 8, 9) for device in ("cpu", "cuda")
     }  # fmt: skip
-    engine.require_room([made[8, "cpu"], made[4, "cuda"]])
-    on_ray.OnRay(study, gpus=2.0).require_room([made[4, "cuda"]])
+    assert not engine.lacking([made[8, "cpu"], made[4, "cuda"]])
+    assert not on_ray.OnRay(study, gpus=2.0).lacking([made[4, "cuda"]])
     for threads, device, gpus in ((9, "cpu", None), (8, "cuda", None), (4, "cuda", 3.0)):
-        with pytest.raises(RunError, match=rf"has the {threads} CPU\(s\) and \d GPU\(s\) that .* takes; add one"):
-            on_ray.OnRay(study, gpus).require_room([made[threads, device]])
+        said = on_ray.OnRay(study, gpus).lacking([made[threads, device]])
+        assert re.fullmatch(rf"No machine .* has the {threads} CPU\(s\) and \d GPU\(s\) that .* takes", said)
 
 
-def test_a_study_that_waits_for_ever_is_refused(study, ray, monkeypatch):
-    """The command asks for room before it begins, and counts no cell that is finished."""
+def test_a_study_says_what_it_waits_for(study, ray, monkeypatch, capsys):
+    """A cluster may grow, so the command begins, and says what is lacking; it counts no cell that is finished."""
     monkeypatch.setattr(FakeRay, "nodes", lambda self: [])
     monkeypatch.setattr(cli, "estimate", lambda *args, **more: Estimate("", {}))
-    with pytest.raises(RunError, match="No machine of the Ray cluster has the 1 CPU"):
+    monkeypatch.setattr(Answers, "answer", "out of luck")
+    with pytest.raises(RunError, match="2 of 2 cells failed"):
         cli.RunOptions(folder=study.path, engine="ray").run()
-    assert not Answers.begun
+    assert "takes: it waits until one joins (see --device" in capsys.readouterr().err
     monkeypatch.setattr(StudyFolder, "finished", lambda self, cells: {cell.digest for cell in cells})
     cli.RunOptions(folder=study.path, engine="ray").run()
+    assert "waits" not in capsys.readouterr().err
 
 
 def test_what_ray_loses_is_a_line(study, ray, monkeypatch):

@@ -68,7 +68,8 @@ class _WorkOptions(_FolderOptions):
 
             engine = cluster = OnRay(study, self.gpus)
             finished = study.finished(cells := study.cells())
-            cluster.require_room([cell for cell in cells if cell.digest not in finished])
+            if lacking := cluster.lacking([cell for cell in cells if cell.digest not in finished]):
+                print(f"{lacking}: it waits until one joins (see --device, --gpus, --threads).", file=sys.stderr)
             workers = self.workers or cluster.room(cells)
         runner = Runner(study, engine, workers, seconds or {})
         end = runner.run(lambda progress: report(_summary(progress), progress.share), stopped)

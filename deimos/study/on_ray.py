@@ -59,20 +59,17 @@ class OnRay:
         ]
         return max(1, min([len(cells), *fits]))
 
-    def require_room(self, cells: list[Cell]) -> None:
-        """Refuse cells that no machine of the cluster, as it is now, has room for: Ray would wait for one for ever.
+    def lacking(self, cells: list[Cell]) -> str:
+        """Which of these cells no machine of the cluster, as it is now, has room for; empty where each has one.
 
-        Raises:
-            RunError: If there is one; the message says what it takes.
+        Ray waits for such a machine, without a word and for ever unless the cluster grows.
         """
         machines = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         for cell in cells:
             cpus, gpus = (self._resources(cell)[name] for name in ("num_cpus", "num_gpus"))
             if not any(has.get("CPU", 0) >= cpus and has.get("GPU", 0) >= gpus for has in machines):
-                raise RunError(
-                    f"No machine of the Ray cluster has the {cpus} CPU(s) and {gpus:g} GPU(s) that {cell.name} takes; "
-                    "add one, or change --device, --gpus or --threads."
-                )
+                return f"No machine of the Ray cluster has the {cpus} CPU(s) and {gpus:g} GPU(s) that {cell.name} takes"
+        return ""
 
     def _resources(self, cell: Cell) -> dict[str, float]:
         gpus = float(cell.config.device.startswith("cuda")) if self._gpus is None else self._gpus
