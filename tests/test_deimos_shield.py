@@ -274,13 +274,17 @@ def test_splits_of_uniform_scores_keep_the_promise():
 SMALL = "--worlds 1000 --eval.worlds 64 --eval.steps 100 --eval.adversary-steps 40 --alphas 0.3 --device cpu".split()
 
 
-def test_the_shield_of_a_run(run, capsys):
+def test_the_shield_of_a_run(run, tmp_path, capsys):
     """The command keeps a shield that can be loaded, refuses as often at random, and lets fewer crash."""
-    assert cli.main(["shield", str(run), "--alpha", "0.2", "--attackers", "argmax", *SMALL]) == 0
+    pool = str(tmp_path / "pool.pt")
+    make = "--worlds 64 --adversary-steps 100 --device cpu".split()
+    assert cli.main(["pool", str(run), str(run), "--out", pool, *make]) == 0
+    attackers = ["--attackers", "argmax", "pooled", "--eval.pool", pool]
+    assert cli.main(["shield", str(run), "--alpha", "0.2", *attackers, *SMALL]) == 0
     assert "at most 20 % get through, with a confidence of 95 %" in capsys.readouterr().out
     found = json.loads((run / "shield.json").read_text())
     rows = {(row["shield"], row["goals"]): row for row in found["trials"]}
-    assert {goals for _, goals in rows} == {"naive", "argmax"}
+    assert {goals for _, goals in rows} == {"naive", "argmax", "pooled"}
     shielded, random = rows["shield", "naive"], rows["random refusal", "naive"]
     assert 0.0 < shielded["refused"] < 1.0
     assert random["refused"] == pytest.approx(shielded["refused"], abs=0.1)
@@ -303,6 +307,8 @@ def test_what_cannot_be_shielded_is_refused_in_a_line(run, tmp_path, capsys):
     assert "--worlds" in said
     assert cli.main(["shield", str(run), "--alpha", "1.5"]) == 2
     assert "alpha must be in (0, 1), got 1.5" in capsys.readouterr().err
+    assert cli.main(["shield", str(run), "--eval.oracle-worlds", "3", "--attackers", "argmax"]) == 2
+    assert "oracle_worlds are those of the attacker oracle; add --attackers oracle" in capsys.readouterr().err
     assert cli.main(["shield", str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
     budget = "--method uniform --no-evaluation --num-envs 16 --env-steps 24 --threads 1 --device cpu --ppo.hidden 8"

@@ -226,6 +226,20 @@ def test_an_attacker_can_choose_and_lends_its_fear(scared, tmp_path):
     assert chosen >= np.mean([session.risk((goal / session._scale).tolist()) for goal in uniform])
 
 
+def test_a_pool_may_choose_the_goals(scared, tmp_path):
+    """The attacker whose file is named chooses goals, and has learnt nothing meanwhile."""
+    path, run = tmp_path / "pool.pt", str(scared)
+    make = ["pool", run, run, "--out", str(path), "--worlds", "64", "--adversary-steps", "100", "--device", "cpu"]
+    assert cli.main(make) == 0
+    saved = SavedRun.open(scared)
+    attacks, afraid = prepare(saved, ["pooled"], 32, lambda stage, share: None, path)
+    assert afraid is None
+    session = Session(saved, 1, 5, attacks=attacks)
+    session.choose("pooled")
+    assert session.goals.current == "pooled"
+    session.step()
+
+
 def test_goals_may_last_longer_than_an_evaluation(scared):
     """T may be whatever one wants to watch: that the run was evaluated for fewer steps is no matter."""
     steps = SavedRun.open(scared).config.eval.steps
@@ -347,8 +361,9 @@ def test_a_video_is_recorded_meanwhile(scared, tmp_path):
     ("arguments", "message"),
     [
         (["--goals", "argmax"], "There is no 'argmax' for --goals here; there are: uniform, p75, and with --attackers"),
-        (["--attackers", "oracle"], "oracle tries every goal in clones of the world, which is too slow to be watched"),
         (["--attackers", "nobody"], "There is no attacker 'nobody'"),
+        (["--pool", "a.pt"], "pool is the file of the attacker pooled; add --attackers pooled"),
+        (["--attackers", "argmax", "pooled", "--pool", "a.pt"], "a.pt cannot be read (No such file or directory)"),
         (["--attackers", "pooled"], "pool must be a file of deimos pool for the attacker pooled, got none"),
         (["--attackers", "argmax", "argmax"], "attackers must be different, got argmax, argmax"),
         (["--terrain", "rough"], "terrain is for legged robots"),

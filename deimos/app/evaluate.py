@@ -10,10 +10,10 @@ import tyro
 from deimos.app import console, figures
 from deimos.app.console import table
 from deimos.app.findings import describe, known
-from deimos.checks import RunError, check_at_least
+from deimos.checks import check_at_least
 from deimos.nn.threads import torch_on_one
 from deimos.run import api, audit, training
-from deimos.run.attack import attacker
+from deimos.run.attack import require_heard
 from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig, elsewhere, evaluate_run
 from deimos.run.folder import RunFolder
@@ -105,19 +105,10 @@ def main(arguments: list[str], program: str) -> None:
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
     changes["attackers"] = tuple(dict.fromkeys((*config.eval.attackers, *changes.get("attackers", ()))))
     env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes, options.env.engine)
-    _refuse_unused(options, eval_config)
+    require_heard(eval_config.attackers, options.pool, options.oracle_worlds)
     with one_stream(device):
         show_evaluation(folder, config, env_config, eval_config, device)
     print(folder.path)
-
-
-def _refuse_unused(options: EvaluateOptions, config: EvalConfig) -> None:
-    """Refuse what is said to attackers that are not among those of the evaluation: nobody would listen."""
-    who = [attacker(name) for name in config.attackers]
-    if options.pool is not None and not any(each.needs_pool for each in who):
-        raise RunError("pool is the file of the attacker pooled; add --attackers pooled.")
-    if options.oracle_worlds is not None and not any(each.few_worlds for each in who):
-        raise RunError("oracle_worlds are those of the attacker oracle; add --attackers oracle.")
 
 
 def title(config: TrainConfig) -> str:

@@ -10,11 +10,13 @@ from deimos.app.console import table
 from deimos.app.findings import known, percent
 from deimos.checks import RunError
 from deimos.run import training
+from deimos.run.attack import require_heard
+from deimos.run.evaluation import require_pool
 from deimos.run.folder import RunFolder
 from deimos.run.shield import ShieldConfig, shield_run, without_pool
 from deimos.sim.shared import one_stream
 
-_CHANGES = ("worlds", "steps", "seed", "adversary_steps", "oracle_worlds")
+_CHANGES = ("worlds", "steps", "seed", "adversary_steps", "pool", "oracle_worlds")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +31,8 @@ class Evaluation:
     """Seed of the worlds and their goals."""
     adversary_steps: int | None = None
     """Unit of the attackers' budgets: steps that ``argmax`` learns from."""
+    pool: Path | None = None
+    """File of the attacker pooled, made by ``deimos pool``."""
     oracle_worlds: int | None = None
     """Worlds that meet the attacker ``oracle``."""
 
@@ -64,12 +68,14 @@ def main(arguments: list[str], program: str) -> None:
     changes = {name: getattr(options.eval, name) for name in _CHANGES if getattr(options.eval, name) is not None}
     attackers = without_pool() if options.attackers is None else options.attackers
     try:
+        require_heard(attackers, options.eval.pool, options.eval.oracle_worlds)
         eval_config = replace(config.eval, attackers=attackers, **changes)
         if eval_config.steps < 2 * config.env.goal_period:
             least = 2 * config.env.goal_period
             raise ValueError(f"eval.steps must be at least 2 T = {least}, got {eval_config.steps}.")
     except ValueError as error:
         raise RunError(str(error)) from error
+    require_pool(eval_config)
     with one_stream(device), console.progress("shield") as report:
         found = shield_run(folder, config, options.shield, eval_config, device, report)
     figures.draw_tradeoff(folder, found)

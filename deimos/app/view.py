@@ -48,6 +48,8 @@ class ViewOptions:
     attackers: tuple[str, ...] = ()
     """Attackers that may choose the goals: argmax, scripted, ... One that learns does so before the page is there, and
     where the run has no fear network, the map shows what it has learnt."""
+    pool: Path | None = None
+    """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
     shield: Mode | None = None
     """Have the run's shield, which deimos shield makes, look at every goal before the policy gets it, those by hand
     too: what becomes of one that it refuses."""
@@ -108,7 +110,7 @@ def main(arguments: list[str], program: str) -> None:
             f"--attackers: {', '.join(possible)}."
         )
     with console.progress("attackers learn") as report:  # for minutes: all that can be refused has been
-        attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report)
+        attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report, options.pool)
     session.add_attackers(attacks, afraid)
     session.choose(options.goals)
     watch(session, options)

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,8 +14,8 @@ from deimos.goals.fear_selector import FearSelector
 from deimos.goals.selector import GoalSelector, Proposal
 from deimos.goals.shield import Mode
 from deimos.nn.layout import goal_components
-from deimos.run.attack import Attack, argmax_director, attacker, uniform_goals
-from deimos.run.evaluation import make_target
+from deimos.run.attack import Attack, argmax_director, attacker, require_heard, uniform_goals
+from deimos.run.evaluation import make_target, require_pool
 from deimos.run.fear import learnt_fear
 from deimos.run.film import seconds_per_step
 from deimos.run.loop import GoalLoop
@@ -308,7 +309,7 @@ class Session:
 
 
 def prepare(
-    run: SavedRun, names: Sequence[str], worlds: int, report: Callable[[str, float], None]
+    run: SavedRun, names: Sequence[str], worlds: int, report: Callable[[str, float], None], pool: Path | None = None
 ) -> tuple[dict[str, Attack], Callable[[Env], FearSelector] | None]:
     """Let attackers learn about the policy of a run.
 
@@ -317,6 +318,7 @@ def prepare(
         names: The attackers.
         worlds: Worlds that they learn in.
         report: Told the attacker and the share of its steps that are done.
+        pool: The file of the attacker ``pooled``; ``None`` for the run's own.
 
     Returns:
         The attackers, and what makes a selector with the fear network that the first of them has learnt, with the
@@ -326,9 +328,11 @@ def prepare(
         RunError: If an attacker is unknown, lacks what it needs, or is too slow to be watched.
     """
     try:
-        setting = replace(run.config.eval, attackers=tuple(names), worlds=worlds)
+        setting = replace(run.config.eval, attackers=tuple(names), worlds=worlds, pool=pool or run.config.eval.pool)
+        require_heard(names, pool)
     except ValueError as error:
         raise RunError(str(error)) from error
+    require_pool(setting)
     slow = [name for name in names if attacker(name).few_worlds]
     if slow:
         raise RunError(f"{slow[0]} tries every goal in clones of the world, which is too slow to be watched.")

@@ -139,6 +139,19 @@ def attacker(name: str) -> AttackerConfig:
     return plugins.load(attackers, _plugins()[name]).Config()
 
 
+def require_heard(among: Iterable[str], pool: Path | None, oracle_worlds: int | None = None) -> None:
+    """Refuse what is said to an attacker that is not among some: nobody would listen.
+
+    Raises:
+        RunError: If a pool, or a number of worlds, is given, and none of the attackers takes it.
+    """
+    who = [attacker(name) for name in among]
+    if pool is not None and not any(each.needs_pool for each in who):
+        raise RunError("pool is the file of the attacker pooled; add --attackers pooled.")
+    if oracle_worlds is not None and not any(each.few_worlds for each in who):
+        raise RunError("oracle_worlds are those of the attacker oracle; add --attackers oracle.")
+
+
 def uniform_goals(env: Env) -> GoalSelector:
     """Naive: uniform goals."""
     return uniform.Config().build(spaces(env), 0)
