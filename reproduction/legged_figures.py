@@ -7,7 +7,7 @@ import numpy as np
 
 from deimos.study import outcomes
 from deimos.study.data import Data, Where
-from deimos.study.figures import CAVEAT, WIDTH, WINDOW, Figures, as_rates, instead, rolling, subplots
+from deimos.study.figures import CAVEAT, RATES, WIDTH, WINDOW, Figures, as_rates, instead, rolling, subplots
 from reproduction.legged_contrasts import NAIVE, OUTCOMES, REFERENCE, WORST, contrasts
 from reproduction.measures import SCORE, Evidence, Place
 
@@ -34,8 +34,6 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")  #
 _MARKERS = "osD^vP"
 _COLUMNS = 5
 _MOST_TICKS = 6
-RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
-"""Ticks of a logarithmic axis of rates [% of interactions, or per 1000 transitions]."""
 LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
@@ -89,12 +87,8 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
         panel.grid(axis="y", alpha=0.3)
         panel.set_xticks(range(len(methods)), methods, rotation=45, ha="right", rotation_mode="anchor")
         panel.set_xlim(-0.5, len(methods) - 0.5)
-    as_rates(axes[0, 0], "y", "crashes per interaction [%]")
     rates = [x for panel in axes[0] for line in panel.lines for x in line.get_ydata()]
-    if rates and min(rates) >= RATES[0]:  # decades that nothing is in would hide what is between bases
-        low, high = max(x for x in RATES if x <= min(rates)), min(x for x in RATES if x > max(rates))
-        axes[0, 0].set_yticks(RATES, [f"{x:g}" for x in RATES])
-        axes[0, 0].set_ylim(low, high)
+    as_rates(axes[0, 0], "y", "crashes per interaction [%]", rates)
     axes[1, 0].set_ylabel("score")
     axes[1, 2].set_axis_off()
     _legend(figure, numbers)

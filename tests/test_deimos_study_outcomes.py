@@ -138,6 +138,7 @@ def test_dose_is_what_training_delivered():
     left, right = outcomes.dose(data, "directional", 100).axes
     assert {x for x, _ in dots(left).round(6).tolist()} == {50.0, 70.0, 90.0}
     assert {y for _, y in dots(right).round(6).tolist()} == {1.0, 2.0, 3.0}
+    assert right.get_ylim() == (1.0, 5.0)  # no decades that nothing is in
     assert outcomes.dose(study(curve=False), "directional", 100) is None
 
 

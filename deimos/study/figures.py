@@ -4,7 +4,8 @@ Every method has one colour and one marker throughout: those of the data's ``Sty
 do not say is named in the place of its panel.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -28,6 +29,10 @@ TRAINING = (
 DPI = 200
 WIDTH = 7.2  # [inch]: the text of an A4 page, at which every figure can be read
 ROW = 0.16  # [inch]: of a name in a legend
+RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
+"""Ticks of a logarithmic axis of rates [% of interactions, or per 1000 transitions]."""
+DECADES = (0, 0.01, 0.1, 1, 10, 100)
+FEW_DECADES = 200  # the largest ratio of an axis's ends at which all of these fit
 WINDOW = 0.05  # of the training, for the rolling mean
 PRINT: dict[Any, Any] = {
     "font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5,
@@ -80,12 +85,21 @@ def instead(axes: "Axes", text: str) -> None:
     axes.tick_params(axis="y", left=False, labelleft=False)  # of these axes alone, where others share their ticks
 
 
-def as_rates(axes: "Axes", which: Literal["x", "y"], label: str) -> None:
-    """An axis of shares in percent, from none to all: linear up to 0.01 %, logarithmic above."""
+def as_rates(axes: "Axes", which: Literal["x", "y"], label: str, rates: Iterable[float] = ()) -> None:
+    """An axis of shares in percent, from none to all: linear up to 0.01 %, logarithmic above.
+
+    Where the rates that it shows are given [%] and none is in the linear part, it ends with them: decades that nothing
+    is in would hide what is between policies.
+    """
     axis = axes.xaxis if which == "x" else axes.yaxis
     getattr(axes, f"set_{which}scale")("symlog", linthresh=0.01, linscale=0.5)
-    getattr(axes, f"set_{which}lim")(-0.002, 150)
-    axis.set_ticks([0, 0.01, 0.1, 1, 10, 100], ["0", "0.01", "0.1", "1", "10", "100"])
+    low, high, ticks = -0.002, 150.0, DECADES
+    shown = [rate for rate in rates if not math.isnan(rate)]
+    if shown and min(shown) >= RATES[0]:
+        low, high = max(x for x in RATES if x <= min(shown)), min(x for x in RATES if x > max(shown))
+        ticks = RATES if high <= FEW_DECADES * low else ticks
+    axis.set_ticks(ticks, [f"{x:g}" for x in ticks])
+    getattr(axes, f"set_{which}lim")(low, high)
     axis.set_ticks([], minor=True)
     axis.set_label_text(label)
 

@@ -186,7 +186,8 @@ def pareto(data: Data, environment: str, period: int) -> "Figure | None":
             color=data.style.colours[name], markeredgecolor="black", markeredgewidth=0.7,
         )  # fmt: skip
     panel.axvline(SAFE, color="black", linewidth=0.8, linestyle=":")
-    as_rates(panel, "x", f"crashes per interaction under {attacked(data, environment, period).by} [%]")
+    rates = [SAFE, *np.concatenate([rate for rate, _ in points.values()])]
+    as_rates(panel, "x", f"crashes per interaction under {attacked(data, environment, period).by} [%]", rates)
     panel.set_ylabel("score under uniform goals")
     panel.grid(alpha=0.3)
     legend(figure, data.style, points, "beside")
@@ -303,7 +304,8 @@ def dose(data: Data, environment: str, period: int) -> "Figure | None":
         panel.set_xlabel("delivered dose: mean percentile of fear")
         panel.grid(alpha=0.3)
     axes[0, 0].set_ylabel("score under uniform goals")
-    as_rates(axes[0, 1], "y", f"crashes per interaction\nunder {hard.by} [%]")
+    rates = [x for drawn in axes[0, 1].lines for x in drawn.get_ydata()]
+    as_rates(axes[0, 1], "y", f"crashes per interaction\nunder {hard.by} [%]", rates)
     legend(figure, data.style, names, "beside")
     return figure
 
