@@ -1,5 +1,6 @@
-"""The numbers that the README, the page of the populations and their lab's tables have are those of the rows."""
+"""The numbers that the README, the pages of the populations and their lab's tables have are those of the rows."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -8,25 +9,38 @@ import pytest
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, read_table
 from reproduction import beside, hypotheses, mechanism
 from reproduction.hypotheses import CHOOSING, TESTING, VARIANTS, samples
-from reproduction.measures import ATTACKED, SCORE, Evidence, under
+from reproduction.legged_contrasts import NAIVE, PRIMARY, WORST, contrast
+from reproduction.measures import ATTACKED, LEVEL, RISK, SCORE, Evidence, Place, under
 from reproduction.particle_picture import points
 
 HOME = Path(__file__).parent.parent
-TABLES = sorted((HOME / "docs" / "results").glob("particle_[a-z]"))
-README, PAGE = (
-    " ".join((HOME / name).read_text(encoding="utf-8").split()) for name in ("README.md", "docs/particle.md")
+RESULTS = HOME / "docs" / "results"
+README, PAGE, LEGGED = (
+    " ".join((HOME / name).read_text(encoding="utf-8").split())
+    for name in ("README.md", "docs/particle.md", "docs/legged.md")
 )
 LAB = (HOME / "docs" / "lab" / "results.md").read_text(encoding="utf-8").splitlines()
 
 
-@pytest.fixture(scope="module")
-def evidence():
-    """All policies of the populations."""
+def read(pattern):
+    """All policies of the tables in some folders of docs/results."""
     results, curves = (
-        [row for folder in TABLES for row in read_table(folder / name, columns)]
+        [row for folder in sorted(RESULTS.glob(pattern)) for row in read_table(folder / name, columns)]
         for name, columns in (("results.csv", RESULT_COLUMNS), ("curves.csv", CURVE_COLUMNS))
     )
     return Evidence(results, curves, renamed=False)
+
+
+@pytest.fixture(scope="module")
+def evidence():
+    """All policies of the populations of Particle Gym."""
+    return read("particle_[a-z]")
+
+
+@pytest.fixture(scope="module")
+def robots():
+    """All policies of Quad and Quad+arm that branched off base policies."""
+    return read("legged_*")
 
 
 def rate(evidence, measure, method):
@@ -91,3 +105,73 @@ def test_the_lab_has_the_tables_of_the_rows(evidence):
         mechanism.table(early, "relative"), *[beside.table(each) for each in (early, late)],
     ]  # fmt: skip
     assert not missing([line for table in tables for line in table], LAB)
+
+
+def change(logs):
+    """A mean difference of log rates with its interval, as a change of the rate in percent."""
+    mean, low, high = (100 * math.expm1(x) for x in (logs.estimate, logs.low, logs.high))
+    return f"{mean:+.0f} % [{low:.0f}, {high:.0f}]"
+
+
+def test_the_page_of_robots_has_the_primary_contrasts(robots):
+    """Each method beside Uniform at T2: score, both rates, and of the worst attacker's p and what would be found."""
+    place = Place("quad", 100)
+    for name in PRIMARY:
+        score, naive, worst = (contrast(robots, place, name, "uniform", each) for each in (SCORE, NAIVE, WORST))
+        assert all(each.bases == (1, 2, 3, 4, 5) for each in (score, naive, worst))
+        mean = score.mean
+        found = 100 * math.expm1(-worst.detectable)
+        line = (
+            f"| {name} | {mean.estimate:+.3f} [{mean.low:.3f}, {mean.high:.3f}] | {change(naive.mean)} | "
+            f"{change(worst.mean)} | {worst.p:.2f} | {found:.0f} % |"
+        )
+        assert line in LEGGED
+
+
+def test_the_readme_quotes_the_robots(robots):
+    """Changes of the worst attacker's rate."""
+    p75, both, penalty = (contrast(robots, Place("quad", 100), name, "uniform", WORST).mean for name in PRIMARY)
+    ends = [change(each).partition("% ")[2] for each in (p75, both)]
+    assert not missing([f"worst attacker ({' and '.join(ends)} %)", f"({change(penalty)})"], README)
+
+
+def test_the_page_of_robots_has_what_is_exploratory(robots):
+    """How often Uniform's policies fall, what ground p75 trained on, and what a penalty does at T10."""
+    near, far = Place("quad", 100), Place("quad", 500)
+    falls, attacked = (100 * mean(measure, robots, near, "uniform") for measure in (under("naive"), ATTACKED))
+    p75, uniform = (mean(LEVEL, robots, near, name) for name in ("p75", "uniform"))
+    score, rate = (contrast(robots, far, "penalty-30", "uniform", each).mean for each in (SCORE, NAIVE))
+    lower, *ends = (-100 * math.expm1(x) for x in (rate.estimate, rate.high, rate.low))
+    assert not missing([
+        f"fall in {falls:.1f} % of uniform goals and {attacked:.1f} % of the worst attacker's",
+        f"train at a mean level of {p75:.1f}, under Uniform at {uniform:.1f}",
+        f"{lower:.0f} % [{ends[0]:.0f}, {ends[1]:.0f}] fewer falls under uniform goals",
+        f"a score {score.estimate:.3f} [{score.low:.3f}, {score.high:.3f}] higher",
+    ], LEGGED)  # fmt: skip
+    assert min(contrast(robots, far, "vds", "uniform", WORST).differences) > 0
+    risks = RISK(robots, near, "p75").values()
+    assert len(risks) == 5
+    assert min(risks) > 0
+
+
+def test_the_page_of_robots_says_where_they_fall(robots):
+    """Uniform's policies under uniform goals: the share of their falls on stairs, and rates on easy and hard ground."""
+    counts = [
+        (*place.split(), *both)
+        for row in robots.evaluations(Place("quad", 100), "naive", "uniform").values()
+        for place, both in row["crashes_by_kind"].items()
+    ]
+    stairs = sum(falls for kind, _, falls, _ in counts if "stairs" in kind) / sum(falls for *_, falls, _ in counts)
+    low, high = (
+        100 * np.divide(*np.sum([both for _, level, *both in counts if level in levels], axis=0))
+        for levels in ("01", "89")
+    )
+    assert not missing([
+        f"{100 * stairs:.0f} % are on stairs",
+        f"from the two lowest levels of ground to the two highest they rise from {low:.1f} to {high:.1f} %",
+    ], LEGGED)  # fmt: skip
+
+
+def mean(measure, evidence, place, method):
+    """The mean of a method's policies in a place."""
+    return np.mean([*measure(evidence, place, method).values()])
