@@ -68,9 +68,7 @@ def test_what_no_environment_can_be_built_of_is_refused(num_envs, seed, message)
 def test_a_goal_has_a_scale_for_each_of_its_components():
     """A tuple of another length is refused by the environment's constructor, before anything is allocated."""
     with pytest.raises(ValueError, match="scale of the goal must have 2 components, got 1"):
-        WarpEnv(
-            Config(), 4, CPU, 0, 0, layout=(ObsField("goal", 2, "m", (1.0,)),), goal_range=(1.0, 1.0), action_dim=1
-        )
+        WarpEnv(Config(), 4, CPU, 0, 0, layout=(ObsField("goal", 2, "m", (1.0,)),), goal_range=(1.0, 1.0), action_dim=1)
 
 
 def test_sound_worlds_pass_the_check(torch_device):
