@@ -13,9 +13,11 @@ from deimos.app import cli
 from deimos.checks import RunError
 from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
+from deimos.run.api import configure_evaluation
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
-from deimos.sim.envs import particle
+from deimos.sim.envs import particle, quad
+from deimos.study.plan import Cell
 
 OLD = Path(__file__).parent / "data" / "run_0_1_0"  # python train.py of 0.1.0 with 32 worlds, 48 steps, hidden 8
 
@@ -39,6 +41,14 @@ def run(tmp_path_factory):
     finally:
         torch.set_num_threads(before)
     return path
+
+
+def test_goals_of_an_evaluation_may_outlast_the_episodes_of_the_training():
+    """Evaluations of robots have no time limit, so any T that their steps have room for will do."""
+    config = deimos.TrainConfig(env=quad.Config(goal_period=20, episode_steps=40), eval=EvalConfig(steps=100))
+    env, evaluation = configure_evaluation(config, 50, {})
+    assert (env.goal_period, env.episode_steps, evaluation.steps) == (50, 0, 100)
+    assert Cell(environment="quad", config=config, goal_periods=(20, 50)).goal_periods == (20, 50)
 
 
 def test_a_program_trains_evaluates_and_acts(run):

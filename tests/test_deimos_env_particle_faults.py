@@ -9,6 +9,12 @@ from particle_worlds import build, constant_actions
 from states import assert_same
 
 from deimos.checks import SimulationError
+from deimos.sim.env import ObsField
+from deimos.sim.envs.particle import Config
+from deimos.sim.warp_env import WarpEnv
+
+CPU = torch.device("cpu")
+ALL, ROWS = torch.ones(8, dtype=torch.bool), torch.tensor([2, 5])
 
 
 @pytest.mark.parametrize("shape", [(8,), (8, 2), (7, 3), (1, 3)])
@@ -19,6 +25,50 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
     with pytest.raises(ValueError, match=rf"action must have the shape \(8, 3\), got {re.escape(str(shape))}"):
         env.step(torch.zeros(shape, device=torch_device))
     assert_same(env.state_dict(), before)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda env: env.reset(torch.tensor([2])), r"mask must have the shape \(8,\), got \(1,\)"),
+        (lambda env: env.reset(torch.ones(8)), "mask must be bool, got torch.float32"),
+        (lambda env: env.reset(ALL, torch.ones(1)), r"goal range must have the shape \(3,\), got \(1,\)"),
+        (lambda env: env.sample_goals(ALL, 2), "rows must be whole numbers of worlds, got torch.bool"),
+        (lambda env: env.sample_goals(ROWS, 0), "count must be at least 1, got 0"),
+        (lambda env: env.sample_goals(ROWS, 2, torch.ones(1, 3)), r"must have the shape \(3,\), got \(1, 3\)"),
+        (lambda env: env.draw(torch.ones(8)), "rows must be whole numbers of worlds, got torch.float32"),
+        (lambda env: env.set_goals(ALL, torch.zeros(8, 3)), "rows must be whole numbers of worlds, got torch.bool"),
+        (lambda env: env.set_goals(ROWS, torch.zeros(3)), r"goal must have the shape \(2, 3\), got \(3,\)"),
+        (lambda env: env.set_goals(ROWS, torch.zeros(2, 3), ROWS), "where must be bool, got torch.int64"),
+    ],
+)
+def test_masks_rows_and_goals_are_never_guessed(wrong, message):
+    """A list of worlds is no mask and a mask no list, no shape is broadcast; what is refused changes nothing."""
+    env = build(CPU)
+    env.step(constant_actions(8, CPU))
+    before = env.state_dict()
+    with pytest.raises(ValueError, match=message):
+        wrong(env)
+    assert_same(env.state_dict(), before)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "seed", "message"),
+    [
+        (0, 0, "num_envs must be at least 1, got 0"), (4, -1, r"seed must be in \[0, 2\^32\), got -1"),
+        (4, 2**32, r"seed must be in \[0, 2\^32\), got 4294967296"), (4, 1.5, "seed must be a whole number, got 1.5"),
+    ],
+)  # fmt: skip
+def test_what_no_environment_can_be_built_of_is_refused(num_envs, seed, message):
+    """A seed out of its range would be another one's, and no worlds have no numbers."""
+    with pytest.raises(ValueError, match=message):
+        Config().build(num_envs, CPU, seed)
+
+
+def test_a_goal_has_a_scale_for_each_of_its_components():
+    """A tuple of another length is refused by the environment's constructor, before anything is allocated."""
+    with pytest.raises(ValueError, match="scale of the goal must have 2 components, got 1"):
+        WarpEnv(Config(), 4, CPU, 0, 0, layout=(ObsField("goal", 2, "m", (1.0,)),), goal_range=(1.0, 1.0), action_dim=1)
 
 
 def test_sound_worlds_pass_the_check(torch_device):

@@ -57,6 +57,15 @@ def test_the_hosts_default_dtype_changes_no_number(name):
     assert found[0] == found[1]
 
 
+@pytest.mark.parametrize(("limit", "said"), [(0, 0), (20, 0), (19, 1), (10, 1)])
+def test_episodes_that_are_too_short_for_a_chosen_goal_are_said(limit, said, caplog):
+    """The first goal of an episode is nobody's choice, so one that is chosen lasts T steps only if two fit."""
+    config = replace(CONFIG, env=particle.Config(goal_period=10, time_limit=limit))
+    training.Trainer(config, torch.device("cpu"))
+    words = f"Episodes of {limit} steps have no room for two goals of T = 10"
+    assert [words in record.getMessage() for record in caplog.records] == [True] * said
+
+
 def test_seed_reaches_everything():
     """The seed decides the weights of every network, their noise and order of learning, and the worlds and goals."""
     one, other = (training.Trainer(replace(CONFIG, seed=seed), torch.device("cpu")) for seed in (3, 4))

@@ -196,15 +196,16 @@ def test_commanded_displacement_is_that_of_the_path(device):
         assert displacement == pytest.approx(end * t, rel=1e-5, abs=1e-6)
 
 
-def test_levels_of_first_episodes_and_frozen_ones(device, uniform_reference):
-    """First levels are drawn from the lowest ones; frozen levels are a function of the world's number alone."""
+@pytest.mark.parametrize("start_levels", [2, LEVELS + 2])
+def test_levels_of_first_episodes_and_frozen_ones(device, uniform_reference, start_levels):
+    """First levels are drawn from the lowest ones, or evenly from all; frozen ones follow from the world's number."""
     for rule in (LevelRule.REWARD, LevelRule.FROZEN):
-        world = World(device, level_rule=int(rule))
+        world = World(device, level_rule=int(rule), start_levels=start_levels)
         world.worlds.episode_count.zero_()
         world.set(mask=True, terminated=False, truncated=False, invalid=False)
         update_levels(world.legged)
         number = 100 + np.arange(N)
-        drawn = (uniform_reference(9, Purpose.LEVEL, number, 0)[:, 0] * 2).astype(int)
+        drawn = (uniform_reference(9, Purpose.LEVEL, number, 0)[:, 0] * min(start_levels, LEVELS)).astype(int)
         expected = drawn if rule == LevelRule.REWARD else number // COLUMNS % LEVELS
         np.testing.assert_array_equal(world.state.level.numpy(), expected)
 

@@ -102,6 +102,14 @@ def test_everything_is_written_at_once(folder, small, capsys):
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 100
 
 
+def test_shapes_that_get_no_column_are_said(folder, capsys):
+    """A preset on few columns has none for its smaller shares, and the report counts them."""
+    assert run("grid", "--levels", "1", "--columns", "4", "--cell", "0.5", "--border", "1", "--out", "few.npz") == 0
+    columns = "1 slope-up, 0 slope-down, 0 rough-slope-down, 2 stairs-up, 1 stairs-down, 0 discrete"
+    assert f"columns            {columns}\n" in capsys.readouterr().out
+    assert terrain.load("few.npz").shapes == ("slope-up", "stairs-up", "stairs-up", "stairs-down")
+
+
 @pytest.mark.parametrize("ending", [".stl", ".obj", ".ply", ".glb", ".npz", ".png"])
 def test_what_was_written_is_imported(folder, small, capsys, ending):
     """``import`` gives back the terrain that ``grid`` has written; by default as NAME.npz in the current folder."""

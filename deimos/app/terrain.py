@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -207,11 +208,18 @@ def _make(grid: Grid, outputs: Outputs, title: str) -> None:
         files = _write(terrain, mesh, outputs, title, progress)
     levels = f"{grid.easiest:g} to {grid.hardest:g} in {grid.levels} levels"
     report = _measure(terrain, mesh) | {
+        "columns": _columns(grid),
         "difficulty": f"{grid.easiest:g}" if grid.levels == 1 else levels,
         "highest riser [m]": f"{highest_riser(mesh):.3f}",
         "time [s]": f"{seconds:.2f}",
     }
     print(title, *[f"{name:18} {value}" for name, value in report.items()], *files, sep="\n")
+
+
+def _columns(grid: Grid) -> str:
+    """How many columns every shape has got: with few of them, a small share is none."""
+    counts = Counter(map(catalog.name_of, grid.column_shapes))
+    return ", ".join(f"{counts[name]} {name}" for name in dict.fromkeys(catalog.name_of(p.shape) for p in grid.shapes))
 
 
 def import_terrain(arguments: list[str], program: str) -> None:

@@ -101,7 +101,7 @@ def configure_evaluation(
     """
     try:
         period = config.env.goal_period if goal_period is None else goal_period
-        env_config = config.env.with_goal_period(period)
+        env_config = config.env.for_evaluation().with_goal_period(period)  # no episode is too short for it
         eval_config = with_plain_numbers(replace(config.eval, **changes))
         require_readable(eval_config)
         if engine is not None:

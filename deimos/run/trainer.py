@@ -146,6 +146,11 @@ class Trainer:
         num_envs = ranks.share("num_envs", config.num_envs)
         self._first_world = ranks.place().rank * num_envs
         self.env = config.env.build(num_envs, device, config.seed, self._first_world)
+        if 0 < self.env.time_limit < 2 * self.env.goal_period:
+            _log.warning(
+                "Episodes of %d steps have no room for two goals of T = %d: the first one is uniform, and none that is "
+                "chosen is survived to its end.", self.env.time_limit, self.env.goal_period,
+            )  # fmt: skip
         total_steps = config.iterations * config.ppo.num_steps
         window = window_between(self.env.goal_period, config.ppo.num_steps)
         self.loop = GoalLoop(self.env, config.goals.build(spaces(self.env, total_steps), config.seed), window)

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from deimos.checks import SimulationError
+from deimos.checks import SimulationError, check_at_least, check_whole
 from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_worlds, record, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
@@ -27,7 +27,8 @@ class WarpEnv(Env):
 
     A subclass calls this constructor, allocates its own state by ``allocate``, and at last calls ``begin`` with a
     kernel for the step (physics, reward, crash, observation) and one for the reset; see ``deimos.kernels.episodes`` for
-    what these share, and docs/add_an_environment.md for a whole one.
+    what these share, and docs/add_an_environment.md for a whole one. Masks, worlds, goals and shares of another shape
+    or kind than ``Env`` says are refused by a ``ValueError``: nothing is broadcast.
 
     Args:
         config: The task.
@@ -39,6 +40,9 @@ class WarpEnv(Env):
         dt: Duration of a step [s]; 1 where the world has no seconds.
         time_limit: Steps after which an episode is truncated; 0 for never.
         stagger: Whether the goal clock of every world's first episode starts at a random step.
+
+    Raises:
+        ValueError: If ``num_envs`` or ``seed`` is out of its range, or goals have other components than their field.
     """
 
     quantities: tuple[str, ...] = ("action",)
@@ -60,6 +64,10 @@ class WarpEnv(Env):
         dt: float = 1.0, time_limit: int = 0, stagger: bool = False,
     ) -> None:  # fmt: skip
         check_stream(device)
+        check_at_least("num_envs", num_envs, 1)
+        check_whole("seed", seed)
+        if not 0 <= seed < 2**32:
+            raise ValueError(f"seed must be in [0, 2^32), got {seed}.")
         self.config = config
         self.num_envs, self.device = num_envs, device
         self._seed, self._offset = seed, env_offset
@@ -69,8 +77,9 @@ class WarpEnv(Env):
         goal = self.goal_slice
         scale = goal_field(self.layout).scale
         scales = scale if isinstance(scale, tuple) else (scale,) * self.goal_dim
-        if len(goal_range) != self.goal_dim:
-            raise ValueError(f"goal_range must have {self.goal_dim} components, got {len(goal_range)}.")
+        for name, numbers in (("goal_range", goal_range), ("scale of the goal", scales)):
+            if len(numbers) != self.goal_dim:
+                raise ValueError(f"{name} must have {self.goal_dim} components, got {len(numbers)}.")
         groups = len(self.goal_groups)
         self.worlds = make_worlds(
             num_envs, warp_device(device), obs_dim=self.obs_dim, action_dim=action_dim, goal_start=goal.start,
@@ -162,9 +171,7 @@ class WarpEnv(Env):
     @final
     def step(self, action: Tensor) -> Step:
         """See ``Env.step``."""
-        if action.shape != self.action.tensor.shape:
-            expected = tuple(self.action.tensor.shape)
-            raise ValueError(f"action must have the shape {expected}, got {tuple(action.shape)}.")
+        _require_shape("action", action, self.action.tensor.shape)
         check_stream(self.device)
         self.action.tensor.copy_(action.detach())
         self.launch_step()
@@ -175,6 +182,7 @@ class WarpEnv(Env):
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""
         check_stream(self.device)
+        _require_mask("mask", mask, self._views["mask"].shape)
         self._views["mask"].copy_(mask)
         self._first_range.set(goal_scale)
         self._launch_reset()
@@ -221,7 +229,11 @@ class WarpEnv(Env):
     @final
     def set_goals(self, rows: Tensor, goal: Tensor, where: Tensor | None = None) -> None:
         """See ``Env.set_goals``."""
-        self._set_rows(rows if where is None else torch.where(where, rows, self._nobody[: len(rows)]))
+        _require_shape("goal", goal, (len(rows), self.goal_dim))
+        if where is not None:
+            _require_mask("where", where, rows.shape)
+            rows = torch.where(where, rows, self._nobody[: len(rows)])
+        self._set_rows(rows)
         self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
@@ -272,6 +284,7 @@ class WarpEnv(Env):
         self._window_began, self._faults_known = self.steps, 0
 
     def _record_candidates(self, count: int) -> tuple[Shared, list[wp.Launch]]:
+        check_at_least("count", count, 1)
         candidates = Shared.zeros((self.num_envs, count, self.goal_dim), wp.float32, self.device)
         scale = self._candidate_scale.array
         launches = [draw_candidates(self._row.array, scale, candidates.array, self.worlds)]
@@ -280,6 +293,8 @@ class WarpEnv(Env):
         return candidates, launches
 
     def _set_rows(self, rows: Tensor) -> None:
+        if rows.dtype not in (torch.int32, torch.int64):  # a mask would be taken for worlds 0 and 1
+            raise ValueError(f"rows must be whole numbers of worlds, got {rows.dtype}.")
         self._row.tensor[: len(rows)] = rows
 
 
@@ -293,7 +308,21 @@ class _Share:
     def set(self, share: Tensor | None) -> None:
         """Write ``share`` of the range, of the shape of the range, in (0, 1]; ``None`` for the whole."""
         if share is not None:
+            _require_shape("share of the goal range", share, self._whole.shape)
             torch.mul(self._whole, share.detach(), out=self._out)
         elif not self._is_whole:
             self._out.copy_(self._whole)
         self._is_whole = share is None
+
+
+def _require_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    """Raise ``ValueError`` for another shape: nothing is broadcast, which would hide a mistake."""
+    if tensor.shape != shape:
+        raise ValueError(f"{name} must have the shape {tuple(shape)}, got {tuple(tensor.shape)}.")
+
+
+def _require_mask(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    """Raise ``ValueError`` unless a tensor is a mask of this shape: numbers of worlds would be taken for one."""
+    _require_shape(name, tensor, shape)
+    if tensor.dtype != torch.bool:
+        raise ValueError(f"{name} must be bool, got {tensor.dtype}.")

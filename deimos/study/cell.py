@@ -99,7 +99,7 @@ def _finish(study: StudyFolder, cell: Cell, device: torch.device, watch: Callabl
     """Evaluate what was trained, and write ``result.json``."""
     home, config = RunFolder(study.cell_path(cell)), cell.config
     folder, once = RunFolder(home.path / "run"), _scales(study)
-    tasks = [config.env.with_goal_period(period) for period in cell.goal_periods]
+    tasks = [config.env.for_evaluation().with_goal_period(period) for period in cell.goal_periods]
     parts = [evaluate_run(folder, task, config.eval, device, watch, again=False, once=once) for task in tasks]
     audited: dict[str, Any] = Audits(home, config, cell.audit_worlds).row()
     if audited:
@@ -123,7 +123,7 @@ def _attack(study: StudyFolder, cell: Cell, device: torch.device, watch: Callabl
         check_sources(f"Cell {cell.name}", wanted | {"code": made_by}, (), files)
         folder = RunFolder.open(home.path / "run")
         config = replace(cell.config.eval, attackers=attackers)
-        task, once = cell.config.env.with_goal_period(period), _scales(study)
+        task, once = cell.config.env.for_evaluation().with_goal_period(period), _scales(study)
         rows = evaluate_run(folder, task, config, device, watch, again=False, once=once)
         found = home.read_json("result.json")
         fresh = evaluated(cell, folder, [row for row in rows if row["goals"] in attackers], made_by)

@@ -76,7 +76,8 @@ class Cell:
         if not self.goal_periods or len(set(self.goal_periods)) < len(self.goal_periods):
             raise ValueError(f"goal_periods must be one or more different numbers, got {self.goal_periods}.")
         for period in self.goal_periods:
-            replace(self.config, env=self.config.env.with_goal_period(period))  # is the evaluation long enough for it?
+            quiet = self.config.env.for_evaluation()
+            replace(self.config, env=quiet.with_goal_period(period))  # is the evaluation long enough for it?
 
     @cached_property
     def digest(self) -> str:

@@ -87,7 +87,7 @@ def next_level(
         return (world // num_columns) % num_levels
     u = uniform4(worlds.seed, wp.static(int(Purpose.LEVEL)), world, episode, 0, 0)
     if episode == 0:
-        return wp.min(int(u[0] * float(params.start_levels)), num_levels - 1)
+        return int(u[0] * float(wp.min(params.start_levels, num_levels)))
     level = state.level[env]
     crashed = worlds.terminated[env]
     if worlds.invalid[env] or not (crashed or worlds.truncated[env]):

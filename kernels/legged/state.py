@@ -77,7 +77,7 @@ class LocomotionParams:
     spawn_speed: float  # bound of every component of the base's first velocity [m/s] and [rad/s]
     spawn_reach: float  # half side of the square below the base whose highest ground counts [m]
     level_rule: int  # one of LevelRule
-    start_levels: int  # levels that first episodes are drawn from
+    start_levels: int  # levels that first episodes are drawn from, all where there are fewer
     cell: float  # of the height grid [m]
     corner: wp.vec2  # its first sample [m]
     low: wp.vec2  # least and largest x and y of the terrain; beyond them an episode is truncated [m]

@@ -38,7 +38,7 @@ class LocomotionConfig(EnvConfig):
     """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far its goals led it
     beside how far they should have (an arc where they ask for yaw; less than 0.3 m does not count), or nothing."""
     start_levels: int = 6
-    """Levels that first episodes are drawn from, at least 1."""
+    """Levels that first episodes are drawn from, the easiest ones, at least 1; all where the terrain has fewer."""
     rewards: RewardWeights = field(default_factory=RewardWeights)
     """Weights of the reward's terms."""
     air_time_target: float = 0.3

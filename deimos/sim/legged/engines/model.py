@@ -39,12 +39,6 @@ def _add_ground(spec: "mujoco.MjSpec", terrain: Terrain | None) -> None:
     """Add a ground without friction of its own: the feet's counts."""
     import mujoco
 
-    if terrain is not None and terrain.cell < (1 - 1e-6) * FINEST_CELL:
-        raise ValueError(
-            f"terrain must have cells of at least {FINEST_CELL} m under a robot, got {terrain.cell:g} m; on "
-            f"finer ones the simulator loses contacts. Build it with --cell {FINEST_CELL}, or import it with "
-            f"--resolution {FINEST_CELL}."
-        )
     if terrain is None:
         ground = spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 0.05))
     else:
