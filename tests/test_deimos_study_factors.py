@@ -107,6 +107,16 @@ def test_sobol_sample_fills_the_ranges():
     assert (rewards == "linear").sum() == 8
 
 
+def test_whole_ranges_have_both_ends():
+    """A whole range is as often at either end as its numbers are wide, on its own scale, and never beyond them."""
+    ranges = {"ppo.epochs": {"low": 1, "high": 3}, "ppo.minibatches": {"low": 1, "high": 3, "log": True}}
+    points = factors.expand(ranges, {"kind": "sobol", "points": 1024})
+    linear, rising = ([[point.levels[name] for point in points].count(value) for value in (1, 2, 3)] for name in ranges)
+    assert sum(linear) == sum(rising) == 1024
+    np.testing.assert_allclose(linear, 1024 / 3, atol=8)
+    np.testing.assert_allclose(rising, 1024 * np.diff(np.log([1, 2, 3, 4])) / np.log(4), atol=8)
+
+
 def test_small_sobol_sample_may_hide_a_factor_behind_another():
     """Of 16 points of 7 factors some split alike, and the line on the design says which; 32 points of 8 tell all."""
     eight = {f"env.f{i}": [0, 1] for i in range(8)}
