@@ -258,9 +258,14 @@ def _decide(trainer: Trainer, rows: Tensor) -> _Decision:
     env, selector = trainer.env, trainer.loop.selector
     obs = env.obs[rows]
     state, goal = env.state(obs), obs[:, env.goal_slice]
-    candidates = env.sample_goals(rows, CANDIDATES).clone()
+    scale = selector.goal_range()
+    candidates = env.sample_goals(rows, CANDIDATES, scale).clone()
     worlds = {name: tensor[rows] for name, tensor in env.tensors.items()}
     chosen = selector.propose(rows, state, goal, candidates, env.draw(rows)).goal
+    if scale is not None:  # it chose from a part of the range, as a curriculum does, and is judged among goals of all
+        candidates = torch.where(
+            (candidates == chosen.unsqueeze(1)).all(2, keepdim=True), candidates, env.sample_goals(rows, CANDIDATES)
+        )
     afraid = fear_selector(selector)
     score = afraid.score(state, goal, candidates) if afraid is not None and afraid.fear.fitted else None
     bounds = env.goal_bounds(rows)
