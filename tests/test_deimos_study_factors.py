@@ -186,6 +186,7 @@ MISTAKES = {
     "[factors]\nseed = [1, 2]": "seed cannot stand in 'train' or be a factor",
     "[factors]\nnum_envs = [0]": "num_envs must be at least 1, got 0",
     "[factors]\nhorizon = [{ env = { goal_period = 5 } }]": "levels must be values, or tables of fields each",
+    "[factors]\nenv = [2]": r"\[factors\] env must be a table, got 2",
     "[factors]\ntimes = [2]": r"\[factors\] times must be a table, got 2",
     "[factors]\ntimes.env = [2]": r"\[factors\] times\.env must be a table, got 2",
     "[factors]\ntimes.seed = [2]": "seed cannot stand in 'train' or be a factor",

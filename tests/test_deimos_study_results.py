@@ -84,6 +84,8 @@ def test_other_schema_is_refused(path):
         read_table(path, COLUMNS)
     path.write_text("count,name\n3,a\n")
     assert read_table(path, {"name": str, "count": int}) == [{"name": "a", "count": 3}]
+    path.write_text("\ufeffcount,name\n3,a\n", encoding="utf-8")  # as spreadsheets mark it
+    assert read_table(path, {"name": str, "count": int}) == [{"name": "a", "count": 3}]
 
 
 def test_broken_value_is_refused(path):

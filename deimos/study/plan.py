@@ -218,7 +218,7 @@ def _read(path: Path, readers: tuple[Path, ...]) -> dict:
     if path.resolve() in readers:
         raise RunError(f"{path} is a base of itself.")
     try:
-        data = tomllib.loads(read_bytes(path).decode())
+        data = tomllib.loads(read_bytes(path).decode("utf-8-sig"))  # some editors mark a file as UTF-8
     except RecursionError as error:
         raise RunError(f"{path} is not a study's TOML file (it is nested too deep).") from error
     except (OSError, ValueError) as error:
@@ -349,7 +349,8 @@ def _environment(
     stored = None if origin is None else training.read_config(RunFolder.open(Path(origin)))
     try:
         ready = _training_preset(table) if stored is None else _branch(table, stored)
-        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried.get("env", {}))))
+        varied = check_kind("[factors] env", tried.get("env", {}), dict)
+        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), varied)))
         env = multiplied(env, check_kind("[factors] times.env", times.get("env", {}), dict))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error

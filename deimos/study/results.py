@@ -375,7 +375,7 @@ def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     Raises ``RunError`` if it has other columns, or holds what is no value of its column.
     """
     try:
-        text = read_bytes(path).decode()
+        text = read_bytes(path).decode("utf-8-sig")
     except FileNotFoundError:
         return []
     except (OSError, ValueError) as error:
