@@ -115,6 +115,20 @@ def test_a_policy_is_of_one_cell(tmp_path):
     assert len(study.cells()) == 5
 
 
+def test_what_was_edited_is_named(tmp_path):
+    """Another setting of an environment that has cells is refused by the fields that differ."""
+    study = StudyFolder(tmp_path / "study")
+    study.add(plan.expand(plan.read(SMALL), seeds="1"))
+    text = SMALL.read_text().replace("2000", "3000").replace("worlds = 200", "worlds = 9")
+    (tmp_path / "edited.toml").write_text(text)
+    differ = "eval.worlds was 200 and is 9, env_steps was 2000 and is 3000"
+    with pytest.raises(RunError, match=f"'directional' were made with other settings .*: {differ}. Put them back"):
+        cli.RunOptions(folder=study.path, file=tmp_path / "edited.toml").run()
+    with pytest.raises(RunError, match="num_envs was 200 and is 100"):
+        cli.RunOptions(folder=study.path, file=SMALL, num_envs=100).run()
+    assert len(study.cells()) == 5
+
+
 def test_attackers_that_cannot_be_made_stop_the_run(tmp_path):
     """Who needs a file that the cells do not have is refused before a cell is made, and before finished ones fail."""
     file = tmp_path / "study.toml"

@@ -171,10 +171,11 @@ class RunOptions(_WorkOptions):
             train={name: x for name, x in train.items() if x is not None},
         )  # fmt: skip
         attacks = rounds(description)
-        found, there = study.results(), [*study.cells(), *cells]
+        found, there = study.results(), study.cells()
+        plan.check_settings(there, cells)
         for check in (check_comparable, check_cells):
-            check([*found.rows, *found.curves, *map(identity, there)])
-        check_rounds([*study.rounds(), *attacks], there)
+            check([*found.rows, *found.curves, *map(identity, [*there, *cells])])
+        check_rounds([*study.rounds(), *attacks], [*there, *cells])
         _check_committed(self.allow_uncommitted)
         if description.get("factors"):
             print(factors.describe(description["factors"], description.get("design", {})), file=sys.stderr)
@@ -251,8 +252,7 @@ class AttackOptions(_WorkOptions):
                 f"{len(left)} of {len(cells)} cells are not finished; finish them first: deimos study run {study.path}"
             )
         check_rounds([self._round()], cells)
-        lost = {row["hash"] for row in study.results().rows} - {cell.digest for cell in cells}
-        if lost:
+        if lost := {row["hash"] for row in study.results().rows} - {cell.digest for cell in cells}:
             print(f"{len(lost)} policies of the tables are lost and stay as they are.", file=sys.stderr)
         _check_committed(self.allow_uncommitted)
         study.add_rounds([self._round()])

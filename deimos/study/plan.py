@@ -7,7 +7,7 @@ import re
 import tomllib
 import typing
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, reduce
 from pathlib import Path
@@ -19,7 +19,7 @@ from deimos.files import first_line, read_bytes
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets, training
-from deimos.run.branch import branch_config, check_branch
+from deimos.run.branch import branch_config, check_branch, flat
 from deimos.run.config import from_dict, multiplied, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -93,11 +93,15 @@ class Cell:
         Plug-ins count where the environment is from one; files that are another one for each seed do not, see
         ``block``.
         """
-        shared = {name: value for name, value in self._config().items() if name not in ("method", "selector", "seed")}
+        return _digest(**self._shared())
+
+    def _shared(self) -> dict[str, Any]:
+        """What ``setting`` is the hash of."""
+        config = {name: value for name, value in self._config().items() if name not in ("method", "selector", "seed")}
         own = (*self.plugins, *self.by_seed)
         common = {name: value for name, value in self.sources.items() if name not in own}
         common |= self._made_by(self.config.env)
-        return _digest(config=shared, goal_periods=list(self.goal_periods), sources=common)
+        return {"config": config, "goal_periods": list(self.goal_periods), "sources": common}
 
     @cached_property
     def block(self) -> str:
@@ -173,6 +177,23 @@ def _is_own(config: EnvConfig | SelectorConfig, known: tuple[str, ...] = ()) -> 
 def _digest(**data: Any) -> str:
     text = json.dumps({"schema": SCHEMA} | data, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def check_settings(there: Iterable[Cell], cells: Iterable[Cell]) -> None:
+    """Raise ``RunError`` with what differs if a cell has not the setting of one of its environment and code."""
+    known = {cell.environment: cell for cell in there}
+    for cell in cells:
+        other = known.get(cell.environment, cell)
+        if other.setting != cell.setting and other.sources.get("code") == cell.sources.get("code"):
+            ours, theirs = ({**flat(x["config"]), **x["sources"], "goal_periods": x["goal_periods"]}
+                            for x in (cell._shared(), other._shared()))  # fmt: skip
+            differ = [f"{name} was {theirs.get(name)} and is {ours.get(name)}"
+                      for name in {**theirs, **ours} if ours.get(name) != theirs.get(name)]  # fmt: skip
+            if differ:  # an older version may have hashed something else
+                raise RunError(
+                    f"The cells of environment '{cell.environment}' were made with other settings and cannot be "
+                    f"compared: {', '.join(differ[:5] + ['...'] * (len(differ) > 5))}. Put them back, or begin anew."
+                )
 
 
 def read_cell(path: Path) -> Cell:
