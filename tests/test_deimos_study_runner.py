@@ -277,10 +277,10 @@ def test_any_engine_is_retried_once(whole, tmp_path):
     assert (engine.stopped, end.finished, end.failed, study.failures(cell)) == (1, 0, {}, [])
 
 
-def test_a_signal_to_all_processes_is_no_failure(whole, tmp_path):
+def test_a_signal_to_all_processes_is_no_failure(file, tmp_path):
     """A worker that ends by the signal that ends the study, be it a moment earlier, has not failed."""
     study = StudyFolder(tmp_path / "study")
-    study.add(whole.cells()[:1])
+    study.add(plan.expand(plan.read(file))[:1])
     (cell,) = study.cells()
     end = runner.Runner(study, Answers(None), 1).run(lambda progress: None, lambda: True)
     assert (end.finished, end.failed, study.failures(cell)) == (0, {}, [])

@@ -97,7 +97,7 @@ def hashes(plugins: Sequence[str], files: Files) -> dict[str, str]:
     Raises:
         RunError: If a file cannot be read.
     """
-    modules = {name: partial(_source, name) for name in plugins}
+    modules: Files = {name: partial(_source, name) for name in plugins}
     try:
         return {name: hashlib.sha256(read()).hexdigest()[:DIGITS] for name, read in {**modules, **files}.items()}
     except OSError as error:
