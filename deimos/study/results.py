@@ -424,7 +424,7 @@ def _value(kind: type, given: Any) -> Any:
         return tuple(math.nan if part is None else float(part) for part in parts)
     if kind in (dict, list):
         found: Any = json.loads(given) if given and isinstance(given, str) else given or kind()
-        if not isinstance(found, kind):
+        if not issubclass(type(found), kind):
             raise ValueError(f"{str(given)!r:.80} is no {'table' if kind is dict else 'list'}")
         return found if kind is list else {name: math.nan if value is None else value for name, value in found.items()}
     if given is None or given == "":
