@@ -1,5 +1,7 @@
 """What the oracle says would happen is what happens."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -143,6 +145,16 @@ def test_audit_agrees_with_itself(afraid):
     found = audit_fear(afraid, 5)
     assert found["contexts"] >= 5
     assert 0 <= found["low"] <= found["auroc"] <= found["high"] <= 1
+
+
+def test_an_audit_of_a_policy_that_always_crashes_ends(afraid, monkeypatch):
+    """Where no world lives until its goal changes there is no context, which is said and not waited for."""
+    step = afraid.env.step
+    monkeypatch.setattr(
+        afraid.env, "step", lambda action: replace(step(action), goal_due=torch.zeros(128, dtype=torch.bool))
+    )
+    with pytest.raises(RunError, match=f"In {50 * CONFIG.goal_period} steps no world lived until its goal changed"):
+        audit_fear(afraid, 5)
 
 
 def test_a_run_without_fear_cannot_be_judged():

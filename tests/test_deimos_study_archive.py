@@ -24,6 +24,7 @@ from deimos.study import cell as worker
 from deimos.study import cli, plan
 from deimos.study.folder import StudyFolder
 from deimos.study.results import evaluated, identity
+from deimos.study.rounds import rounds
 
 WORST = ("worst", "worst_attacker", "worst_interactions")  # they depend on who attacked
 LONG = {"attackers": ("argmax-long",), "allow_uncommitted": True}
@@ -197,7 +198,7 @@ def test_study_file_may_name_further_attackers(file, tmp_path):
     description = plan.read(file) | {"attack": [{"attackers": ["search"], "seeds": [0]}, {"attackers": ["search"]}]}
     study = StudyFolder(tmp_path)
     for _ in range(2):
-        study.add_rounds(plan.rounds(description))
+        study.add_rounds(rounds(description))
     assert [(each.attackers, each.seeds) for each in study.rounds()] == [(("search",), (0,)), (("search",), ())]
     for table, message in (
         ({"attackers": ["nobody"]}, "There is no attacker 'nobody'"),
@@ -206,7 +207,7 @@ def test_study_file_may_name_further_attackers(file, tmp_path):
         ({"who": ["search"]}, r"An \[\[attack\]\] has no who; it has: attackers, seeds"),
     ):
         with pytest.raises(RunError, match=message):
-            plan.rounds({"attack": [table]})
+            rounds({"attack": [table]})
     (tmp_path / "attack.json").write_text('[{"attackers": 3}]')
     with pytest.raises(RunError, match=r"attack\.json does not list attackers"):
         study.rounds()
@@ -313,6 +314,7 @@ def test_study_imports_its_plugins(tmp_path, monkeypatch, new_plugins, short_stu
     (tmp_path / "my_selector.py").write_text(PLUGIN + "# changed\n")
     (other,) = plan.expand(plan.read(file))
     assert (other.digest != cell.digest, other.setting == cell.setting) == (True, True)
+    assert other.selector != cell.selector  # two versions of a method are no population
     (study.cell_path(cell) / "result.json").unlink()
     with pytest.raises(RunError, match="the file of 'my_selector' is not the one that it was made with"):
         worker.run(study, cell)

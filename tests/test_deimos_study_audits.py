@@ -57,6 +57,22 @@ def test_audited_choices_of_the_oracle_are_the_worst():
         assert found.auroc == []
 
 
+def test_a_curriculum_chooses_from_its_range():
+    """What is audited of ``cl`` are goals of the range that it has got to, judged among goals of the whole range."""
+    trainer = trained(method="cl")
+    tried = []
+    clones = audit_clones(trainer)
+    try_out = clones.try_out
+    clones.try_out = lambda env, rows, goals: tried.append(goals) or try_out(env, rows, goals)
+    found = audit_choices(trainer, 64, clones)
+    share = trainer.loop.selector.share[0]
+    assert share < 1.0
+    assert 0.5 * share < found.chosen.abs().max() <= share + 1e-6
+    assert tried[0].abs().max() > 0.9
+    picked = (tried[0] == found.chosen.unsqueeze(1)).all(2)
+    assert bool((picked.sum(1) == 1).all())
+
+
 def test_audited_worlds_count_once():
     """As many worlds as are asked for give one decision each, wherever their goals stand, inside their boxes."""
     trainer = trained()

@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 
 from deimos.checks import RunError
+from deimos.run.folder import RunFolder
 from deimos.study import cli, plan
-from deimos.study.results import RESULT_COLUMNS, Results, identity
+from deimos.study.folder import StudyFolder
+from deimos.study.results import RESULT_COLUMNS, SCHEMA, Results, identity
 from deimos.study.runner import Progress
 
 SMALL = Path(__file__).parent.parent / "examples" / "study.toml"
@@ -92,6 +94,73 @@ def test_cells_that_do_not_compare_with_the_results_stop_the_run(tmp_path, chang
     with pytest.raises(RunError, match=message):
         cli.RunOptions(folder=tmp_path, file=SMALL, methods=["p25"]).run()
     assert not (tmp_path / "cells").exists()
+
+
+def test_a_policy_is_of_one_cell(tmp_path):
+    """What names one cell twice, or a second cell of a policy, is refused before its cells are made."""
+    text = SMALL.read_text()
+    copy, edited, coarse = (tmp_path / f"{name}.toml" for name in ("copy", "edited", "coarse"))
+    copy.write_text(text + text[text.index("[[environment]]") :].replace('"directional"', '"other"', 1))
+    with pytest.raises(RunError, match="Environments directional, other have the same settings"):
+        cli.RunOptions(folder=tmp_path / "a", file=copy).run()
+    coarse.write_text(text + '[factors]\nenv.max_force = [1.0, 2.0]\n[design]\nkind = "sobol"\npoints = 4\n')
+    with pytest.raises(RunError, match=r"Environments directional\.\d, directional\.\d have the same settings"):
+        cli.RunOptions(folder=tmp_path / "a", file=coarse).run()
+    assert not (tmp_path / "a").exists()
+    study = StudyFolder(tmp_path / "b")
+    study.add(plan.expand(plan.read(SMALL), seeds="1"))
+    edited.write_text("audit_worlds = 50\n" + text)
+    with pytest.raises(RunError, match="2 different cells of environment 'directional', method 'antagonist', seed 0"):
+        cli.RunOptions(folder=study.path, file=edited).run()
+    assert len(study.cells()) == 5
+
+
+def test_what_was_edited_is_named(tmp_path):
+    """Another setting of an environment that has cells is refused by the fields that differ."""
+    study = StudyFolder(tmp_path / "study")
+    study.add(plan.expand(plan.read(SMALL), seeds="1"))
+    text = SMALL.read_text().replace("2000", "3000").replace("worlds = 200", "worlds = 9")
+    (tmp_path / "edited.toml").write_text(text)
+    differ = "eval.worlds was 200 and is 9, env_steps was 2000 and is 3000"
+    with pytest.raises(RunError, match=f"'directional' were made with other settings .*: {differ}. Put them back"):
+        cli.RunOptions(folder=study.path, file=tmp_path / "edited.toml").run()
+    with pytest.raises(RunError, match="num_envs was 200 and is 100"):
+        cli.RunOptions(folder=study.path, file=SMALL, num_envs=100).run()
+    assert len(study.cells()) == 5
+
+
+def test_attackers_that_cannot_be_made_stop_the_run(tmp_path):
+    """Who needs a file that the cells do not have is refused before a cell is made, and before finished ones fail."""
+    file = tmp_path / "study.toml"
+    file.write_text(SMALL.read_text() + '[[attack]]\nattackers = ["pooled"]\n')
+    message = "'directional' cannot be attacked: pool must be a file of deimos pool for the attacker pooled, got none"
+    with pytest.raises(RunError, match=message):
+        cli.RunOptions(folder=tmp_path / "a", file=file).run()
+    assert not (tmp_path / "a").exists()
+    study = StudyFolder(tmp_path / "b")
+    study.add(plan.expand(plan.read(SMALL), seeds="1"))
+    for cell in study.cells():
+        (study.cell_path(cell) / "result.json").write_text("{}")
+    with pytest.raises(RunError, match=message):
+        cli.AttackOptions(folder=study.path, attackers=("pooled",), allow_uncommitted=True).run()
+    assert not (study.path / "attack.json").exists()
+
+
+def test_what_was_given_up_keeps_nobody_from_attacking(tmp_path, monkeypatch):
+    """A cell that failed once is open; one that was given up has no policy, and those of the others are attacked."""
+    study = StudyFolder(tmp_path)
+    study.add(plan.expand(plan.read(SMALL), seeds="1", methods=["p25", "uniform"]))
+    lost, kept = study.cells()
+    RunFolder(study.cell_path(kept)).write_json("result.json", {"schema": SCHEMA, "rows": [], "curve": {}})
+    begun = []
+    monkeypatch.setattr(cli.AttackOptions, "_work", lambda self, study, *rest: begun.append(study.path))
+    study.record_failure(lost, "it broke")
+    attack = cli.AttackOptions(folder=study.path, attackers=("search",), allow_uncommitted=True)
+    with pytest.raises(RunError, match="1 of 2 cells are not finished"):
+        attack.run()
+    study.record_failure(lost, "it broke again")
+    attack.run()
+    assert begun == [study.path]
 
 
 @pytest.mark.parametrize("name", ["show", "export", "report"])

@@ -257,6 +257,22 @@ def test_a_stop_reaches_the_machines(study, ray, monkeypatch):
     assert Answers.begun == [first.name]
 
 
+def test_machines_work_where_the_runner_does(study, ray, monkeypatch, tmp_path):
+    """Files and plug-ins of a study are seen from its runner's working directory, wherever Ray was started."""
+    monkeypatch.chdir(tmp_path)
+    get, seen = ray.get, []
+
+    def elsewhere(what):
+        if callable(what):  # a task
+            os.chdir("/")
+        return get(what)
+
+    monkeypatch.setattr(ray, "get", elsewhere)
+    monkeypatch.setattr(Answers, "run", lambda self, cell: seen.append(Path.cwd()))
+    assert on_ray.OnRay(study).run(study.cells()[0]) is None
+    assert seen == [tmp_path]
+
+
 def test_a_study_runs_on_ray(study, ray, monkeypatch):
     """The option gives every open cell to Ray, as many at a time as there is room for, and no finished one."""
     finished = study.cells()[0]

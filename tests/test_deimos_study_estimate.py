@@ -10,6 +10,7 @@ from deimos.sim.envs import particle
 from deimos.study import estimate, plan
 from deimos.study.folder import StudyFolder
 from deimos.study.results import RESULT_COLUMNS, Results, identity
+from deimos.study.rounds import AttackRound
 
 CONFIG = TrainConfig(
     env=particle.Config(goal_period=100), method="p25", num_envs=2000, env_steps=2000, threads=1, device="cpu"
@@ -26,7 +27,7 @@ def test_cost_counts_every_world_step(tmp_path):
     assert steps == evaluated + 5 * 100 * (2000 + 100 * 50)
     bare = dataclasses.replace(CELL, audit_worlds=0, goal_periods=(50, 100))
     assert estimate.cost(study, bare) == (transitions, 2 * evaluated)
-    study.add_rounds([plan.AttackRound(attackers=("argmax-long",), seeds=(0, 1))])
+    study.add_rounds([AttackRound(attackers=("argmax-long",), seeds=(0, 1))])
     added = 2000 * 2000 + 2000 * 6000
     assert estimate.cost(study, CELL) == (transitions, steps + added)
     other = dataclasses.replace(CELL, config=dataclasses.replace(CONFIG, seed=2))

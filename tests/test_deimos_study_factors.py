@@ -107,6 +107,16 @@ def test_sobol_sample_fills_the_ranges():
     assert (rewards == "linear").sum() == 8
 
 
+def test_whole_ranges_have_both_ends():
+    """A whole range is as often at either end as its numbers are wide, on its own scale, and never beyond them."""
+    ranges = {"ppo.epochs": {"low": 1, "high": 3}, "ppo.minibatches": {"low": 1, "high": 3, "log": True}}
+    points = factors.expand(ranges, {"kind": "sobol", "points": 1024})
+    linear, rising = ([[point.levels[name] for point in points].count(value) for value in (1, 2, 3)] for name in ranges)
+    assert sum(linear) == sum(rising) == 1024
+    np.testing.assert_allclose(linear, 1024 / 3, atol=8)
+    np.testing.assert_allclose(rising, 1024 * np.diff(np.log([1, 2, 3, 4])) / np.log(4), atol=8)
+
+
 def test_small_sobol_sample_may_hide_a_factor_behind_another():
     """Of 16 points of 7 factors some split alike, and the line on the design says which; 32 points of 8 tell all."""
     eight = {f"env.f{i}": [0, 1] for i in range(8)}
@@ -176,6 +186,7 @@ MISTAKES = {
     "[factors]\nseed = [1, 2]": "seed cannot stand in 'train' or be a factor",
     "[factors]\nnum_envs = [0]": "num_envs must be at least 1, got 0",
     "[factors]\nhorizon = [{ env = { goal_period = 5 } }]": "levels must be values, or tables of fields each",
+    "[factors]\nenv = [2]": r"\[factors\] env must be a table, got 2",
     "[factors]\ntimes = [2]": r"\[factors\] times must be a table, got 2",
     "[factors]\ntimes.env = [2]": r"\[factors\] times\.env must be a table, got 2",
     "[factors]\ntimes.seed = [2]": "seed cannot stand in 'train' or be a factor",

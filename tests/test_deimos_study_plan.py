@@ -53,6 +53,12 @@ def test_file_becomes_a_grid(tmp_path):
     assert all(cell.config.threads == 1 for cell in cells)
 
 
+def test_an_editors_mark_is_no_mistake(tmp_path):
+    """A file that an editor has marked as UTF-8 says the same."""
+    (tmp_path / "marked.toml").write_text("\ufeff" + TOML, encoding="utf-8")
+    assert plan.read(tmp_path / "marked.toml") == described(tmp_path, TOML)
+
+
 def test_choices_come_before_the_file(tmp_path):
     """Seeds, methods, environments and budgets of the command line replace those of the file."""
     cells = plan.expand(

@@ -84,13 +84,16 @@ def test_other_schema_is_refused(path):
         read_table(path, COLUMNS)
     path.write_text("count,name\n3,a\n")
     assert read_table(path, {"name": str, "count": int}) == [{"name": "a", "count": 3}]
+    path.write_text("\ufeffcount,name\n3,a\n", encoding="utf-8")  # as spreadsheets mark it
+    assert read_table(path, {"name": str, "count": int}) == [{"name": "a", "count": 3}]
 
 
 def test_broken_value_is_refused(path):
     """A value that does not fit its column is refused with its line, and so is a line with too few."""
     write_table(path, COLUMNS, [row("a")])
     text = path.read_text()
-    for broken in (text.replace(",3,", ",three,"), text.replace("False", "no"), text + "b,1\n"):
+    whole = text[: text.rindex('"{')]  # but for the last column, a table of errors
+    for broken in (text.replace(",3,", ",three,"), text.replace("False", "no"), text + "b,1\n", whole + "[1]\n"):
         path.write_text(broken)
         with pytest.raises(RunError, match=r"table\.csv, line [23], does not fit its columns"):
             read_table(path, COLUMNS)

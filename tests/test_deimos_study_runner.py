@@ -277,6 +277,21 @@ def test_any_engine_is_retried_once(whole, tmp_path):
     assert (engine.stopped, end.finished, end.failed, study.failures(cell)) == (1, 0, {}, [])
 
 
+def test_a_signal_to_all_processes_is_no_failure(file, tmp_path):
+    """A worker that ends by the signal that ends the study, be it a moment earlier, has not failed."""
+    study = StudyFolder(tmp_path / "study")
+    study.add(plan.expand(plan.read(file))[:1])
+    (cell,) = study.cells()
+    end = runner.Runner(study, Answers(None), 1).run(lambda progress: None, lambda: True)
+    assert (end.finished, end.failed, study.failures(cell)) == (0, {}, [])
+    command = [sys.executable, "-m", "deimos.study.cell", str(study.path), cell.name]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        wait_until(lambda: (study.cell_path(cell) / "run" / "progress.csv").exists(), seconds=300)
+        process.terminate()
+        assert process.wait() == 130 or study.finished([cell])  # it may have been quicker
+    assert (study.cell_path(cell) / "run" / "checkpoint.pt").exists()
+
+
 def test_what_is_left_counts_evaluations(whole, tmp_path, monkeypatch):
     """Training and evaluations count by what they are expected to take, and what was done before as no progress."""
     study = StudyFolder(tmp_path / "study")

@@ -101,3 +101,19 @@ def test_pool_is_part_of_what_a_cell_is_made_from(tmp_path):
     pool.write_bytes(b"two")
     with pytest.raises(RunError, match="Cell x: the file of 'pool' is not the one that it was made with"):
         source.check_sources("Cell x", made, (), {"pool": pool.read_bytes})
+
+
+def test_package_counts_with_all_its_modules(tmp_path, monkeypatch):
+    """A plug-in that is a package is another one where a module inside it has changed."""
+    (tmp_path / "my_plugins").mkdir()
+    for name in ("__init__", "inner"):
+        (tmp_path / "my_plugins" / f"{name}.py").write_text('"""A module."""\n')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    source.import_plugins(["my_plugins", "my_plugins.inner"])
+    before = source.hashes(["my_plugins", "my_plugins.inner"], {})
+    (tmp_path / "my_plugins" / "__init__.py").write_text('"""A package."""\n')
+    package = source.hashes(["my_plugins", "my_plugins.inner"], {})
+    (tmp_path / "my_plugins" / "inner.py").write_text('"""Another one."""\n')
+    both = source.hashes(["my_plugins", "my_plugins.inner"], {})
+    assert len({each["my_plugins"] for each in (before, package, both)}) == 3
+    assert before["my_plugins.inner"] == package["my_plugins.inner"] != both["my_plugins.inner"]

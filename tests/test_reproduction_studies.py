@@ -16,7 +16,8 @@ from deimos.run import training
 from deimos.run.config import kind, to_dict
 from deimos.run.folder import RunFolder
 from deimos.study import plan
-from deimos.study.results import check_comparable, identity
+from deimos.study.results import check_cells, check_comparable, identity
+from deimos.study.rounds import rounds
 from reproduction import legged_bases
 from reproduction.thesis import DIRECTOR_METHODS, LEGGED_METHODS, PARTICLE_METHODS
 
@@ -81,10 +82,11 @@ def test_blocks_make_one_table(pools):
     """The cells of all blocks can be compared: an environment is one setting, and all meet the same attackers."""
     cells = [cell for name in BLOCKS for cell in plan.expand(plan.read(FILES[name]))]
     check_comparable(map(identity, cells))
+    check_cells(map(identity, cells))
     assert {cell.config.eval.attackers for cell in cells} == {("argmax", "pooled", "scripted")}
     assert {cell.config.eval.pool.stem == cell.environment for cell in cells} == {True}
     for name in BLOCKS:
-        (more,) = plan.rounds(plan.read(FILES[name]))
+        (more,) = rounds(plan.read(FILES[name]))
         assert (more.attackers, more.seeds) == (("argmax-long", "search", "q-fear"), (0, 3, 6, 9))
 
 

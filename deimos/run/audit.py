@@ -69,7 +69,7 @@ def audit_fear(trainer: Trainer, contexts: int) -> dict:
         with both outcomes among those ``tried``; ``crash_rate`` of all rollouts; ``iteration``.
 
     Raises:
-        RunError: If there is no fear network, or no context with both outcomes.
+        RunError: If there is no fear network, or no context with both outcomes, or none at all.
     """
     afraid = _learnt_fear(trainer)
     act, clones = _explorers(trainer)
@@ -160,14 +160,22 @@ def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Te
     Returns:
         Worlds (n,), states (n, state_dim), active goals (n, goal_dim), candidates (n, CANDIDATES, goal_dim) and the
         steps survived under each (n, CANDIDATES).
+
+    Raises:
+        RunError: If no goal falls due for ``PATIENCE`` periods: every world crashes before.
     """
     env = trainer.env
-    while True:
+    for _ in range(PATIENCE * env.goal_period):
         step = env.step(act(env.obs))
         rows = (step.goal_due & ~step.terminated & ~step.truncated).nonzero().squeeze(1)
         if len(rows):
             break
         trainer.loop.advance(step)
+    else:
+        raise RunError(
+            f"In {PATIENCE * env.goal_period} steps no world lived until its goal changed; the policy is too bad to "
+            f"rank its goals."
+        )
     draw = uniforms(trainer.config.seed, Purpose.AUDIT_CONTEXT, rows, rows.new_tensor(act.steps))[:, 0]
     rows = rows[draw.argsort()[:BATCH]]
     obs = env.obs[rows]
@@ -250,9 +258,14 @@ def _decide(trainer: Trainer, rows: Tensor) -> _Decision:
     env, selector = trainer.env, trainer.loop.selector
     obs = env.obs[rows]
     state, goal = env.state(obs), obs[:, env.goal_slice]
-    candidates = env.sample_goals(rows, CANDIDATES).clone()
+    scale = selector.goal_range()
+    candidates = env.sample_goals(rows, CANDIDATES, scale).clone()
     worlds = {name: tensor[rows] for name, tensor in env.tensors.items()}
     chosen = selector.propose(rows, state, goal, candidates, env.draw(rows)).goal
+    if scale is not None:  # it chose from a part of the range, as a curriculum does, and is judged among goals of all
+        candidates = torch.where(
+            (candidates == chosen.unsqueeze(1)).all(2, keepdim=True), candidates, env.sample_goals(rows, CANDIDATES)
+        )
     afraid = fear_selector(selector)
     score = afraid.score(state, goal, candidates) if afraid is not None and afraid.fear.fitted else None
     bounds = env.goal_bounds(rows)

@@ -39,14 +39,14 @@ def check_branch(config: TrainConfig, origin: TrainConfig) -> None:
 
 def _fields(config: TrainConfig) -> dict[str, Any]:
     """All that must be the same, by the names of the command line; of files, a hash of what is in them."""
-    fields = _flat(to_dict(config) | {"env": to_dict(config.env) | config.env.file_hashes()})
+    fields = flat(to_dict(config) | {"env": to_dict(config.env) | config.env.file_hashes()})
     free = tuple(f"{name}." for name in MAY_DIFFER)
     return {name: value for name, value in fields.items() if not f"{name}.".startswith(free)}
 
 
-def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """A nested dictionary with dots between the names."""
-    flat: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for name, value in data.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return flat
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found

@@ -1,11 +1,12 @@
 """One cell of a study: ``run`` trains and evaluates it, in whatever process an engine calls it.
 
 ``python -m deimos.study.cell STUDY NAME`` is the worker of ``deimos.study.engine.LocalProcesses``: a byte on its
-standard input asks it to stop, and when that input ends, its runner is gone and it ends at once.
+standard input, or SIGTERM, asks it to stop, and when that input ends, its runner is gone and it ends at once.
 """
 
 import os
 import shutil
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -149,5 +150,6 @@ def _listen(stop: threading.Event) -> None:
 
 if __name__ == "__main__":
     asked = threading.Event()
+    signal.signal(signal.SIGTERM, lambda number, frame: asked.set())  # clusters send it to all processes of a job
     threading.Thread(target=_listen, args=(asked,), daemon=True).start()
     sys.exit(main(sys.argv[1:], asked.is_set))

@@ -22,7 +22,9 @@ from deimos.study import cell as worker
 from deimos.study.engine import Engine, LocalProcesses
 from deimos.study.estimate import estimate
 from deimos.study.folder import StudyFolder
-from deimos.study.results import check_comparable, identity, merge
+from deimos.study.pools import POOLS, given_up, write_pools
+from deimos.study.results import check_cells, check_comparable, identity, merge
+from deimos.study.rounds import AttackRound, check_rounds, rounds
 from deimos.study.runner import Progress, Runner
 from deimos.study.source import check_sources, code
 
@@ -168,14 +170,17 @@ class RunOptions(_WorkOptions):
             description, seeds=self.seeds, methods=self.methods, environments=self.environments,
             train={name: x for name, x in train.items() if x is not None},
         )  # fmt: skip
-        rounds = plan.rounds(description)
-        found = study.results()
-        check_comparable([*found.rows, *found.curves, *map(identity, [*study.cells(), *cells])])
+        attacks = rounds(description)
+        found, there = study.results(), study.cells()
+        plan.check_settings(there, cells)
+        for check in (check_comparable, check_cells):
+            check([*found.rows, *found.curves, *map(identity, [*there, *cells])])
+        check_rounds([*study.rounds(), *attacks], [*there, *cells])
         _check_committed(self.allow_uncommitted)
         if description.get("factors"):
             print(factors.describe(description["factors"], description.get("design", {})), file=sys.stderr)
         study.add(cells)
-        study.add_rounds(rounds)
+        study.add_rounds(attacks)
 
 
 def _check_committed(allowed: bool) -> None:
@@ -226,9 +231,9 @@ class AttackOptions(_WorkOptions):
         super().__post_init__()
         self._round()
 
-    def _round(self) -> plan.AttackRound:
+    def _round(self) -> AttackRound:
         seeds = tuple(plan.parse_seeds(self.seeds)) if self.seeds else ()
-        return plan.AttackRound(attackers=self.attackers, seeds=seeds)
+        return AttackRound(attackers=self.attackers, seeds=seeds)
 
     def run(
         self,
@@ -242,13 +247,12 @@ class AttackOptions(_WorkOptions):
         if not cells:
             raise RunError(f"{study.path} holds no policies: neither cells nor {archive.FILE}.")
         trained = [cell for cell in cells if (study.cell_path(cell) / "result.json").exists()]
-        if len(trained) < len(cells):
+        if left := {cell.name for cell in cells} - {cell.name for cell in [*trained, *given_up(study)]}:
             raise RunError(
-                f"{len(cells) - len(trained)} of {len(cells)} cells are not finished; finish them first: deimos study "
-                f"run {study.path}"
+                f"{len(left)} of {len(cells)} cells are not finished; finish them first: deimos study run {study.path}"
             )
-        lost = {row["hash"] for row in study.results().rows} - {cell.digest for cell in cells}
-        if lost:
+        check_rounds([self._round()], cells)
+        if lost := {row["hash"] for row in study.results().rows} - {cell.digest for cell in cells}:
             print(f"{len(lost)} policies of the tables are lost and stay as they are.", file=sys.stderr)
         _check_committed(self.allow_uncommitted)
         study.add_rounds([self._round()])
@@ -306,8 +310,6 @@ class PoolOptions(_FolderOptions):
 
     def run(self) -> None:
         """Write them, and a line for each; for the errors see ``deimos.study.pools.write_pools``."""
-        from deimos.study.pools import POOLS, given_up, write_pools
-
         study, device = StudyFolder(self.folder), training.resolve_device(self.device)
         for path, facts in write_pools(study, self.out or self.folder / POOLS, device):
             if facts is None:
@@ -433,8 +435,7 @@ COMMANDS: dict[str, Any] = {
     "pack": PackOptions, "unpack": UnpackOptions, "merge": MergeOptions, "export": ExportOptions,
     "report": ReportOptions,
 }  # fmt: skip
-"""The options of every command, whose ``run`` does it; those of ``LONG`` take what says when to stop and what shows
-progress."""
+"""The options of every command, whose ``run`` does it; those of ``LONG`` can be stopped and show progress."""
 LONG = (RunOptions, CellOptions, AttackOptions)
 
 

@@ -184,10 +184,8 @@ def _at(levels: Any, share: float) -> Any:
         return levels[int(share * len(levels))]
     low, high = levels["low"], levels["high"]
     whole = isinstance(low, int) and isinstance(high, int)
-    if levels.get("log"):
-        value = low * (high / low) ** share
-    else:
-        value = low + (high + whole - low) * share
+    end = high + whole  # of what is rounded down
+    value = low * (end / low) ** share if levels.get("log") else low + (end - low) * share
     return min(high, math.floor(value)) if whole else value
 
 

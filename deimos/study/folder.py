@@ -22,8 +22,9 @@ from deimos.lock import hold
 from deimos.run.config import from_dict, to_dict
 from deimos.run.evaluation import Scale
 from deimos.run.folder import RunFolder
-from deimos.study.plan import AttackRound, Cell, read_cell
+from deimos.study.plan import Cell, read_cell
 from deimos.study.results import Results, Row
+from deimos.study.rounds import AttackRound
 
 ATTACK, FEAR, SCALES = "attack.json", "fear.pt", "scales.json"
 
@@ -76,7 +77,7 @@ class StudyFolder:
 
     def added(self, cell: Cell) -> tuple[str, ...]:
         """The added attackers that a cell is to meet."""
-        wanted = [each for each in self.rounds() if not each.seeds or cell.config.seed in each.seeds]
+        wanted = [each for each in self.rounds() if each.meets(cell)]
         return tuple(dict.fromkeys(name for each in wanted for name in each.attackers))
 
     def missing(self, cell: Cell, results: Results | None = None) -> dict[int, tuple[str, ...]]:

@@ -5,6 +5,7 @@ given a cell works on it as this one would, in a process of its own (``deimos.st
 the machine, and starts a cell anew elsewhere, from its last checkpoint, where a worker or a machine is lost.
 """
 
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,7 @@ class OnRay:
             if self._stopping:
                 return None
             options = self._task.options(name=cell.name, **self._resources(cell))
-            task = options.remote(str(self._study.path.resolve()), cell.name, self._stop)
+            task = options.remote(str(self._study.path.resolve()), cell.name, self._stop, os.getcwd())
             self._running.add(task)
         try:
             return self._ray.get(task)
@@ -120,10 +121,16 @@ class _Stop:
         await self._asked.wait()
 
 
-def _work(study: str, name: str, stop: Any) -> str | None:
-    """Work on a cell on the machine that Ray has chosen; see ``deimos.study.engine.Engine.run``."""
+def _work(study: str, name: str, stop: Any, working: str) -> str | None:
+    """Work on a cell on the machine that Ray has chosen; see ``deimos.study.engine.Engine.run``.
+
+    ``working`` is the runner's working directory, from which a study's files and plug-ins are seen; without it, as
+    where machines do not share it, the study must name them by whole paths.
+    """
     import ray
 
+    if os.path.isdir(working):
+        os.chdir(working)  # Ray's is where `ray start` was called; this process works on this cell alone
     folder = StudyFolder(Path(study))
     engine = LocalProcesses(folder)
     asked = stop.wait.remote()

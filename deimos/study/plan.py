@@ -7,19 +7,19 @@ import re
 import tomllib
 import typing
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import Any
 
+import deimos
 from deimos.checks import RunError, check_at_least, one_line
 from deimos.files import first_line, read_bytes
 from deimos.goals.methods import method
 from deimos.goals.selector import SelectorConfig
 from deimos.run import presets, training
-from deimos.run.attack import attacker
-from deimos.run.branch import branch_config, check_branch
+from deimos.run.branch import branch_config, check_branch, flat
 from deimos.run.config import from_dict, multiplied, to_dict
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -27,7 +27,7 @@ from deimos.sim.env import EnvConfig
 from deimos.study import factors
 from deimos.study.factors import merged
 from deimos.study.source import Files, code, hashes, import_plugins
-from deimos.study.tables import check_keys, check_kind, shown
+from deimos.study.tables import check_kind, check_table, shown
 
 SCHEMA = 2  # of cell.json
 MOST_SEEDS = 100_000
@@ -89,14 +89,20 @@ class Cell:
 
     @cached_property
     def setting(self) -> str:
-        """The same of what the cells of one environment must share to be compared: all but selector, seed, plugins.
+        """The same of what the cells of one environment must share to be compared: all but selector and seed.
 
-        Nor the files that are another one for each seed; see ``block``.
+        Plug-ins count where the environment is from one; files that are another one for each seed do not, see
+        ``block``.
         """
-        shared = {name: value for name, value in self._config().items() if name not in ("method", "selector", "seed")}
+        return _digest(**self._shared())
+
+    def _shared(self) -> dict[str, Any]:
+        """What ``setting`` is the hash of."""
+        config = {name: value for name, value in self._config().items() if name not in ("method", "selector", "seed")}
         own = (*self.plugins, *self.by_seed)
         common = {name: value for name, value in self.sources.items() if name not in own}
-        return _digest(config=shared, goal_periods=list(self.goal_periods), sources=common)
+        common |= self._made_by(self.config.env)
+        return {"config": config, "goal_periods": list(self.goal_periods), "sources": common}
 
     @cached_property
     def block(self) -> str:
@@ -109,8 +115,14 @@ class Cell:
 
     @cached_property
     def selector(self) -> str:
-        """The same of what the cells of one method must share: what the method's name stands for."""
-        return _digest(selector=_spelled_out(self.config.goals))
+        """The same of what the cells of one method must share: what its name stands for, and whose code that is."""
+        made_by = self._made_by(self.config.goals)
+        return _digest(selector=_spelled_out(self.config.goals), **({"plugins": made_by} if made_by else {}))
+
+    def _made_by(self, config: EnvConfig | SelectorConfig) -> dict[str, str]:
+        """The hashes of the plug-ins, if a configuration is that of one."""
+        found = {name: self.sources[name] for name in self.plugins if name in self.sources}
+        return {} if _is_own(config) else found
 
     @property
     def files(self) -> Files:
@@ -141,19 +153,48 @@ class Cell:
         return {"schema": SCHEMA} | to_dict(self)
 
 
-def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
-    """A selector's configuration with those of the methods that it names, as Schedule and Mix do."""
-    fields, named = to_dict(config), {}
-    hints = typing.get_type_hints(type(config))
-    for value in [value for name, value in fields.items() if hints.get(name) is str and value not in known]:
+def _named(config: SelectorConfig, known: tuple[str, ...]) -> dict[str, SelectorConfig]:
+    """The methods that a selector names, as Schedule and Mix do, but for those that are ``known``."""
+    found, hints = {}, typing.get_type_hints(type(config))
+    for value in [value for name, value in to_dict(config).items() if hints.get(name) is str and value not in known]:
         with contextlib.suppress(ValueError):  # it names no method
-            named[value] = _spelled_out(method(value), (*known, value))
-    return fields | ({"methods": named} if named else {})
+            found[value] = method(value)
+    return found
+
+
+def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
+    """A selector's configuration with those of the methods that it names."""
+    named = {name: _spelled_out(own, (*known, name)) for name, own in _named(config, known).items()}
+    return to_dict(config) | ({"methods": named} if named else {})
+
+
+def _is_own(config: EnvConfig | SelectorConfig, known: tuple[str, ...] = ()) -> bool:
+    """Whether a configuration, and those of the methods that it names, are of Deimos' own code, no plug-in's."""
+    named = _named(config, known) if isinstance(config, SelectorConfig) else {}
+    own = type(config).__module__.partition(".")[0] == deimos.__name__
+    return own and all(_is_own(each, (*known, name)) for name, each in named.items())
 
 
 def _digest(**data: Any) -> str:
     text = json.dumps({"schema": SCHEMA} | data, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def check_settings(there: Iterable[Cell], cells: Iterable[Cell]) -> None:
+    """Raise ``RunError`` with what differs if a cell has not the setting of one of its environment and code."""
+    known = {cell.environment: cell for cell in there}
+    for cell in cells:
+        other = known.get(cell.environment, cell)
+        if other.setting != cell.setting and other.sources.get("code") == cell.sources.get("code"):
+            ours, theirs = ({**flat(x["config"]), **x["sources"], "goal_periods": x["goal_periods"]}
+                            for x in (cell._shared(), other._shared()))  # fmt: skip
+            differ = [f"{name} was {theirs.get(name)} and is {ours.get(name)}"
+                      for name in {**theirs, **ours} if ours.get(name) != theirs.get(name)]  # fmt: skip
+            if differ:  # an older version may have hashed something else
+                raise RunError(
+                    f"The cells of environment '{cell.environment}' were made with other settings and cannot be "
+                    f"compared: {', '.join(differ[:5] + ['...'] * (len(differ) > 5))}. Put them back, or begin anew."
+                )
 
 
 def read_cell(path: Path) -> Cell:
@@ -187,7 +228,7 @@ def read(path: Path) -> dict:
     * ``factors`` and ``design``: see ``deimos.study.factors``;
     * ``audit_worlds``: see ``Cell``;
     * ``plugins``: names of modules that register selectors, attackers or environments;
-    * ``attack``: further attackers for some seeds, see ``rounds``;
+    * ``attack``: further attackers for some seeds, see ``deimos.study.rounds``;
     * ``base``: another such file, as seen from this one, where everything comes from that is not said.
 
     Raises ``RunError`` if it or its base cannot be read or is not TOML.
@@ -199,7 +240,7 @@ def _read(path: Path, readers: tuple[Path, ...]) -> dict:
     if path.resolve() in readers:
         raise RunError(f"{path} is a base of itself.")
     try:
-        data = tomllib.loads(read_bytes(path).decode())
+        data = tomllib.loads(read_bytes(path).decode("utf-8-sig"))  # some editors mark a file as UTF-8
     except RecursionError as error:
         raise RunError(f"{path} is not a study's TOML file (it is nested too deep).") from error
     except (OSError, ValueError) as error:
@@ -227,12 +268,12 @@ def expand(
     Raises:
         RunError: If something is unknown, missing, doubled or out of range.
     """
-    _check_table("A study", description, _KEYS, {"seeds"})
+    check_table("A study", description, _KEYS, {"seeds"})
     tables = description.get("environment", [])
     if not tables:
         raise RunError("A study must have an [[environment]].")
     for table in tables:
-        _check_table("An [[environment]]", table, _ENVIRONMENT_KEYS)
+        check_table("An [[environment]]", table, _ENVIRONMENT_KEYS)
     names = [table.get("name", "") for table in tables]
     _check_unique("environment", names)
     numbers = parse_seeds(description.get("seeds", 10) if seeds is None else seeds)
@@ -330,7 +371,8 @@ def _environment(
     stored = None if origin is None else training.read_config(RunFolder.open(Path(origin)))
     try:
         ready = _training_preset(table) if stored is None else _branch(table, stored)
-        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), tried.get("env", {}))))
+        varied = check_kind("[factors] env", tried.get("env", {}), dict)
+        env = from_dict(EnvConfig, reduce(merged, (ready.pop("env", {}), table.get("env", {}), varied)))
         env = multiplied(env, check_kind("[factors] times.env", times.get("env", {}), dict))
     except ValueError as error:
         raise RunError(f"Environment '{name}': {error}") from error
@@ -355,35 +397,6 @@ def _environment(
         )
         for config in configs
     ]  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttackRound:
-    """Attackers that some policies of a study meet beside those of its cells."""
-
-    attackers: tuple[str, ...]
-    """Their names, at least 1."""
-    seeds: tuple[int, ...] = ()
-    """Seeds of the policies; none for all."""
-
-    def __post_init__(self) -> None:
-        if not self.attackers:
-            raise ValueError("attackers must be one or more names, got none.")
-        for name in self.attackers:
-            attacker(name)
-
-
-def rounds(description: dict) -> list[AttackRound]:
-    """The ``[[attack]]`` of a study: ``attackers``, names, and the ``seeds`` (see ``parse_seeds``) that meet them."""
-    found = []
-    for table in description.get("attack", []):
-        _check_table("An [[attack]]", table, {"attackers": (list, str)}, {"seeds"})
-        seeds = tuple(parse_seeds(table["seeds"])) if "seeds" in table else ()
-        try:
-            found.append(AttackRound(attackers=tuple(table.get("attackers", ())), seeds=seeds))
-        except ValueError as error:
-            raise RunError(f"An [[attack]]: {error}") from error
-    return found
 
 
 def _training_preset(table: dict) -> dict:
@@ -436,12 +449,3 @@ def parse_seeds(given: Any) -> list[int]:
 def _check_unique(what: str, values: Sequence[Any]) -> None:
     if doubled := sorted(value for value, count in Counter(values).items() if count > 1):
         raise RunError(f"Every {what} must be given once; doubled: {', '.join(map(str, doubled))}.")
-
-
-def _check_table(
-    what: str, table: dict, kinds: Mapping[str, tuple[type, type | None]], others: Collection[str] = ()
-) -> None:
-    """Raise ``RunError`` for a key that a table does not have, or a value of another kind."""
-    check_keys(what, table, {*kinds, *others})
-    for key in kinds.keys() & table.keys():
-        check_kind(key, table[key], *kinds[key])

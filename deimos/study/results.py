@@ -344,13 +344,38 @@ def check_comparable(rows: Iterable[Row]) -> None:
             )
 
 
+def check_cells(rows: Iterable[Row]) -> None:
+    """Raise ``RunError`` unless every policy is of one cell, and every cell in one environment.
+
+    Of two cells of a policy one would be trained in vain, as ``Results.check`` refuses their rows; two names of one
+    cell would share its one result. ``rows`` as in ``check_comparable``.
+    """
+    policies, homes = defaultdict(set), defaultdict(set)
+    for row in rows:
+        policies[row["environment"], row["method"], row["seed"]].add(row["hash"])
+        homes[row["hash"]].add(row["environment"])
+    for (environment, method, seed), found in policies.items():
+        if len(found) > 1:
+            raise RunError(
+                f"There are {len(found)} different cells of environment '{environment}', method '{method}', seed "
+                f"{seed} ({', '.join(sorted(found))}): the plug-ins or audit_worlds have changed. Put them back, or "
+                f"begin a new study."
+            )
+    for found in homes.values():
+        if len(found) > 1:
+            raise RunError(
+                f"Environments {', '.join(sorted(found))} have the same settings, so their cells are the same; keep "
+                f"one of them (of a design, take fewer points or more levels)."
+            )
+
+
 def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     """All whole rows of a table, in which empty cells are NaN in columns of numbers, else None; none if it is missing.
 
     Raises ``RunError`` if it has other columns, or holds what is no value of its column.
     """
     try:
-        text = read_bytes(path).decode()
+        text = read_bytes(path).decode("utf-8-sig")
     except FileNotFoundError:
         return []
     except (OSError, ValueError) as error:
@@ -399,6 +424,8 @@ def _value(kind: type, given: Any) -> Any:
         return tuple(math.nan if part is None else float(part) for part in parts)
     if kind in (dict, list):
         found: Any = json.loads(given) if given and isinstance(given, str) else given or kind()
+        if not issubclass(type(found), kind):
+            raise ValueError(f"{str(given)!r:.80} is no {'table' if kind is dict else 'list'}")
         return found if kind is list else {name: math.nan if value is None else value for name, value in found.items()}
     if given is None or given == "":
         return math.nan if kind in (int, float) else None

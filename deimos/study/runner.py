@@ -102,6 +102,8 @@ class Runner:
             if error is None and self.study.finished([cell]):
                 self._finished.add(cell.digest)
                 return
+            if error is None and not self._stopping:
+                time.sleep(2 * POLL_SECONDS)  # a signal to all processes may reach a worker before this one
             if self._killed or (error is None and self._stopping):
                 return
             errors.append(error or "it ended without results")

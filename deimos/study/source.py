@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import deimos
@@ -90,17 +91,24 @@ def hashes(plugins: Sequence[str], files: Files) -> dict[str, str]:
     """What a cell's numbers depend on beside its configuration and the code: plugins and files by their SHA-256.
 
     Args:
-        plugins: Modules, which must be imported.
+        plugins: Modules, which must be imported; a package counts with all its modules.
         files: See ``Cell.files``.
 
     Raises:
         RunError: If a file cannot be read.
     """
-    modules = {name: Path(str(sys.modules[name].__file__)).read_bytes for name in plugins}
+    modules: Files = {name: partial(_source, name) for name in plugins}
     try:
         return {name: hashlib.sha256(read()).hexdigest()[:DIGITS] for name, read in {**modules, **files}.items()}
     except OSError as error:
         raise RunError(f"{error.filename} cannot be read ({error.strerror}).") from error
+
+
+def _source(module: str) -> bytes:
+    """The source of an imported module, of a package that of all its modules."""
+    path = Path(str(sys.modules[module].__file__))
+    inner = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
+    return b"".join(each.read_bytes() for each in inner)
 
 
 def check_sources(what: str, wanted: dict[str, str], plugins: Sequence[str], files: Files) -> None:

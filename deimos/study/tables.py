@@ -31,3 +31,12 @@ def shown(value: Any) -> str:
     """A value for a message, not longer than fits a line."""
     text = repr(value)
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
+def check_table(
+    what: str, table: dict, kinds: Mapping[str, tuple[type, type | None]], others: Collection[str] = ()
+) -> None:
+    """Raise ``RunError`` for a key that a table does not have, or a value of another kind."""
+    check_keys(what, table, {*kinds, *others})
+    for key in kinds.keys() & table.keys():
+        check_kind(key, table[key], *kinds[key])
