@@ -76,8 +76,7 @@ class Cell:
         if not self.goal_periods or len(set(self.goal_periods)) < len(self.goal_periods):
             raise ValueError(f"goal_periods must be one or more different numbers, got {self.goal_periods}.")
         for period in self.goal_periods:
-            quiet = self.config.env.for_evaluation()
-            replace(self.config, env=quiet.with_goal_period(period))  # is the evaluation long enough for it?
+            replace(self.config, env=self.config.env.for_evaluation().with_goal_period(period))  # long enough for it?
 
     @cached_property
     def digest(self) -> str:
