@@ -1,6 +1,7 @@
 """The numbers that the README, the pages of the populations and their lab's tables have are those of the rows."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,15 @@ import pytest
 from deimos.study.results import CURVE_COLUMNS, RESULT_COLUMNS, read_table
 from reproduction import beside, hypotheses, mechanism
 from reproduction.hypotheses import CHOOSING, TESTING, VARIANTS, samples
-from reproduction.legged_contrasts import NAIVE, PRIMARY, WORST, contrast
-from reproduction.measures import ATTACKED, LEVEL, RISK, SCORE, Evidence, Place, under
+from reproduction.legged_contrasts import NAIVE, PRIMARY, WORST, bases, contrast
+from reproduction.measures import ATTACKED, DOSE, LEVEL, SCORE, Evidence, Place, under
 from reproduction.particle_picture import points
 
 HOME = Path(__file__).parent.parent
 RESULTS = HOME / "docs" / "results"
-README, PAGE, LEGGED = (
+README, PAGE, LEGGED, LEGGED_LAB = (
     " ".join((HOME / name).read_text(encoding="utf-8").split())
-    for name in ("README.md", "docs/particle.md", "docs/legged.md")
+    for name in ("README.md", "docs/particle.md", "docs/legged.md", "docs/lab/robots.md")
 )
 LAB = (HOME / "docs" / "lab" / "results.md").read_text(encoding="utf-8").splitlines()
 
@@ -110,7 +111,7 @@ def test_the_lab_has_the_tables_of_the_rows(evidence):
 def change(logs):
     """A mean difference of log rates with its interval, as a change of the rate in percent."""
     mean, low, high = (100 * math.expm1(x) for x in (logs.estimate, logs.low, logs.high))
-    return f"{mean:+.0f} % [{low:.0f}, {high:.0f}]"
+    return f"{mean:+.0f} % [{low:.0f}, {high:.{0 if abs(high) >= 0.5 else 1}f}]"  # 0 would hide its sign
 
 
 def test_the_page_of_robots_has_the_primary_contrasts(robots):
@@ -126,50 +127,105 @@ def test_the_page_of_robots_has_the_primary_contrasts(robots):
             f"{change(worst.mean)} | {worst.p:.2f} | {found:.0f} % |"
         )
         assert line in LEGGED
+        for each in (score, naive, worst):
+            assert f"| {' | '.join(each.row(judged=True).values())} |" in LEGGED_LAB
 
 
 def test_the_readme_quotes_the_robots(robots):
     """Changes of the worst attacker's rate."""
     p75, both, penalty = (contrast(robots, Place("quad", 100), name, "uniform", WORST).mean for name in PRIMARY)
     ends = [change(each).partition("% ")[2] for each in (p75, both)]
-    assert not missing([f"worst attacker ({' and '.join(ends)} %)", f"({change(penalty)})"], README)
+    assert not missing([f"(falls {' and '.join(ends)} %)", f"({change(penalty)})"], README)
 
 
 def test_the_page_of_robots_has_what_is_exploratory(robots):
-    """How often Uniform's policies fall, what ground p75 trained on, and what a penalty does at T10."""
+    """Uniform's falls before and after, the dose, the ground of the trainings, and what a penalty does at T10."""
     near, far = Place("quad", 100), Place("quad", 500)
-    falls, attacked = (100 * mean(measure, robots, near, "uniform") for measure in (under("naive"), ATTACKED))
+    score, falls, attacked = (mean(measure, robots, near, "uniform") for measure in (SCORE, under("naive"), ATTACKED))
+    before = next(row for row in bases()[1] if "mean" in row["base"])["crashes per interaction [%]"].split()[0]
     p75, uniform = (mean(LEVEL, robots, near, name) for name in ("p75", "uniform"))
-    score, rate = (contrast(robots, far, "penalty-30", "uniform", each).mean for each in (SCORE, NAIVE))
+    rate = contrast(robots, far, "penalty-30", "uniform", NAIVE).mean
     lower, *ends = (-100 * math.expm1(x) for x in (rate.estimate, rate.high, rate.low))
     assert not missing([
-        f"fall in {falls:.1f} % of uniform goals and {attacked:.1f} % of the worst attacker's",
+        f"| Uniform | {score:.3f} | {100 * falls:.1f} % | {100 * attacked:.1f} % |",
+        f"from {before} to {100 * falls:.1f} %",
+        f"the {mean(DOSE, robots, near, 'p75'):.0f}st percentile of fear",
         f"train at a mean level of {p75:.1f}, under Uniform at {uniform:.1f}",
-        f"{lower:.0f} % [{ends[0]:.0f}, {ends[1]:.0f}] fewer falls under uniform goals",
-        f"a score {score.estimate:.3f} [{score.low:.3f}, {score.high:.3f}] higher",
+        f"penalty-30 falls {lower:.0f} % [{ends[0]:.0f}, {ends[1]:.0f}] less under uniform goals",
     ], LEGGED)  # fmt: skip
-    assert min(contrast(robots, far, "vds", "uniform", WORST).differences) > 0
-    risks = RISK(robots, near, "p75").values()
-    assert len(risks) == 5
-    assert min(risks) > 0
+
+
+def test_the_lab_has_trainings_at_t10(robots):
+    """p75 beside Uniform at T2 on two bases, and what became of the same bases when trained at T2."""
+    long, short = (
+        [contrast(robots.only([1, 2]), Place(name, 100), "p75", "uniform", each).differences for each in (SCORE, WORST)]
+        for name in ("quad_long", "quad")
+    )
+    far = contrast(robots, Place("quad_long", 500), "p75", "uniform", WORST)
+    less, more = 100 * np.expm1(np.array([long[1], short[1]]))
+    assert not missing([
+        "scores {:.3f} and {:.3f} less".format(*-long[0]),
+        "falls {:.0f} and {:.0f} % less".format(*-less),
+        "falls {:.0f} and {:.0f} % more".format(*more),
+        "judged at T10: {:.0f} and {:.0f} %".format(*-100 * np.expm1(far.differences)),
+        f"the {mean(DOSE, robots, Place('quad_long', 100), 'p75'):.0f}rd percentile of fear",
+    ], LEGGED_LAB)  # fmt: skip
+
+
+def test_the_lab_has_the_bases():
+    """Score, falls and level of every base, and the spread between them."""
+    lines = []
+    for table in (each for each in bases() if isinstance(each, list)):
+        for row in table:
+            name, period, score, falls, _, *level = row.values()
+            if period == "100" or "mean" in name:
+                lines.append(f"| {' | '.join([name.rpartition('base_')[2], period, score, falls, *level])} |")
+    assert len(lines) == 5 + 2 + 3 + 1
+    assert not missing(lines, LEGGED_LAB)
+
+
+def test_the_page_of_robots_counts_clauses():
+    """What the report says of all clauses, and which one holds."""
+    report = (RESULTS / "robots" / "report.md").read_text(encoding="utf-8")
+    (counts,) = re.findall(r"^Clauses: (\d+) holds, 0 does not hold, (\d+) undecided over", report, re.MULTILINE)
+    (beyond,) = re.findall(r"For (\d+) of \d+ undecided there is no effect", report)
+    held, undecided = map(int, counts)
+    assert f"of {held + undecided} clauses one holds" in LEGGED
+    assert f"{undecided} are undecided; {beyond} of these so few bases could not decide" in LEGGED
+    (line,) = re.findall(r"^\| quad.* holds \|$", report, re.MULTILINE)
+    assert line.startswith("| quad, T = 500 | score that the attack costs: uniform, rnd, vds, cl > vds+p75 |")
+
+
+def test_the_page_of_robots_has_the_arm(robots):
+    """Means of three bases, how far they are apart, and how little three bases tell."""
+    place, methods = Place("quad_arm", 100), ("uniform", "vds", "p50", "vds+p75")
+    scores, easy, hard = (
+        [mean(measure, robots, place, name) for name in methods] for measure in (SCORE, under("naive"), ATTACKED)
+    )
+    assert max(scores) - min(scores) < 0.005
+    ours, rival = (contrast(robots, place, "vds+p75", name, WORST) for name in ("uniform", "vds"))
+    assert max(rival.differences) < 0
+    least, *_, most = sorted(-100 * np.expm1(ours.differences))
+    assert not missing([
+        "fall in {:.1f} % of the worst attacker's goals, VDS's in {:.1f}, p50's in {:.1f}, vds+p75's in {:.1f}".format(
+            *(100 * x for x in hard)
+        ),
+        f"(uniform goals: {', '.join(f'{100 * x:.1f}' for x in easy)})",
+        f"by {least:.0f} to {most:.0f} % against Uniform, so the interval is {change(ours.mean).partition('% ')[2]} %",
+    ], LEGGED)  # fmt: skip
 
 
 def test_the_page_of_robots_says_where_they_fall(robots):
-    """Uniform's policies under uniform goals: the share of their falls on stairs, and rates on easy and hard ground."""
+    """Uniform's policies under uniform goals: the share of their falls on stairs, and of their goals."""
     counts = [
-        (*place.split(), *both)
+        (kind, *both)
         for row in robots.evaluations(Place("quad", 100), "naive", "uniform").values()
-        for place, both in row["crashes_by_kind"].items()
+        for kind, both in row["crashes_by_kind"].items()
     ]
-    stairs = sum(falls for kind, _, falls, _ in counts if "stairs" in kind) / sum(falls for *_, falls, _ in counts)
-    low, high = (
-        100 * np.divide(*np.sum([both for _, level, *both in counts if level in levels], axis=0))
-        for levels in ("01", "89")
+    falls, goals = (
+        100 * sum(each[i] for each in counts if "stairs" in each[0]) / sum(each[i] for each in counts) for i in (1, 2)
     )
-    assert not missing([
-        f"{100 * stairs:.0f} % are on stairs",
-        f"from the two lowest levels of ground to the two highest they rise from {low:.1f} to {high:.1f} %",
-    ], LEGGED)  # fmt: skip
+    assert f"{falls:.0f} % are on stairs, where {goals:.0f} % of goals are given" in LEGGED
 
 
 def mean(measure, evidence, place, method):
