@@ -93,7 +93,8 @@ def as_rates(axes: "Axes", which: Literal["x", "y"], label: str, rates: Iterable
     """
     axis = axes.xaxis if which == "x" else axes.yaxis
     getattr(axes, f"set_{which}scale")("symlog", linthresh=0.01, linscale=0.5)
-    low, high, ticks = -0.002, 150.0, DECADES
+    low, high = -0.002, 150.0
+    ticks: Sequence[float] = DECADES
     shown = [rate for rate in rates if not math.isnan(rate)]
     if shown and min(shown) >= RATES[0]:
         low, high = max(x for x in RATES if x <= min(shown)), min(x for x in RATES if x > max(shown))
