@@ -144,14 +144,18 @@ def test_the_page_of_robots_has_what_is_exploratory(robots):
     score, falls, attacked = (mean(measure, robots, near, "uniform") for measure in (SCORE, under("naive"), ATTACKED))
     before = next(row for row in bases()[1] if "mean" in row["base"])["crashes per interaction [%]"].split()[0]
     p75, uniform = (mean(LEVEL, robots, near, name) for name in ("p75", "uniform"))
-    rate = contrast(robots, far, "penalty-30", "uniform", NAIVE).mean
-    lower, *ends = (-100 * math.expm1(x) for x in (rate.estimate, rate.high, rate.low))
+    rate, hard = (contrast(robots, far, "penalty-30", "uniform", each).mean for each in (NAIVE, WORST))
+    vds = change(contrast(robots, far, "vds", "uniform", WORST).mean)
+    less = [
+        "{:.0f} % [{:.0f}, {:.0f}] less".format(*(-100 * math.expm1(x) for x in (each.estimate, each.high, each.low)))
+        for each in (rate, hard)
+    ]
     assert not missing([
         f"| Uniform | {score:.3f} | {100 * falls:.1f} % | {100 * attacked:.1f} % |",
         f"from {before} to {100 * falls:.1f} %",
         f"the {mean(DOSE, robots, near, 'p75'):.0f}st percentile of fear",
         f"train at a mean level of {p75:.1f}, under Uniform at {uniform:.1f}",
-        f"penalty-30 falls {lower:.0f} % [{ends[0]:.0f}, {ends[1]:.0f}] less under uniform goals",
+        f"penalty-30 falls {less[0]} under uniform goals, {less[1]} under attack, VDS {vds.removeprefix('+')} more",
     ], LEGGED)  # fmt: skip
 
 
