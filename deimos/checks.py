@@ -63,6 +63,13 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
         raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value}.")
 
 
+def check_seed(seed: int, spare: int = 0) -> None:
+    """Raise ``ValueError`` unless a seed is a whole number in [0, 2^32), the last ``spare`` of them left out."""
+    check_whole("seed", seed)
+    if not 0 <= seed < 2**32 - spare:
+        raise ValueError(f"seed must be in [0, 2^32{f' - {spare}' if spare else ''}), got {seed}.")
+
+
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     """Raise ``ValueError`` unless ``value`` is one of ``choices``."""
     choices = list(choices)

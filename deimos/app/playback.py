@@ -7,7 +7,7 @@ import tyro
 
 from deimos.app import console
 from deimos.app.findings import percent, risk_name
-from deimos.checks import check_at_least, check_positive, check_range
+from deimos.checks import check_at_least, check_positive, check_range, check_seed
 from deimos.goals.fear_selector import FearSelector
 from deimos.learn.policy import Policy
 from deimos.run.film import SEED, caption, film, timing
@@ -54,7 +54,7 @@ class PlayOptions:
         for name in ("width", "height"):
             check_range(name, getattr(self, name), 16, LARGEST)
         check_at_least("world", self.world, 0)
-        check_range("seed", self.seed, 0, 2**32 - 1)
+        check_seed(self.seed)
         if self.goal_period is not None:
             check_at_least("goal_period", self.goal_period, 1)
         if (self.video is None) == (self.frames is None):

@@ -19,7 +19,7 @@ from deimos.app.viewer_panel import Moment, Panel
 from deimos.app.viewer_scene import Scene, build_scene, palette, shades
 from deimos.app.viewer_session import UNIFORM, Session, prepare
 from deimos.app.viewer_web import HOST, check_port, serve
-from deimos.checks import RunError, check_at_least, check_positive, check_range
+from deimos.checks import RunError, check_at_least, check_positive, check_range, check_seed
 from deimos.goals.shield import Mode
 from deimos.run.attack import names as attacker_names
 from deimos.run.saved import SavedRun
@@ -83,7 +83,7 @@ class ViewOptions:
             if getattr(self, name) is not None:
                 check_at_least(name, getattr(self, name), 1)
         check_at_least("world", self.world, 0)
-        check_range("seed", self.seed, 0, 2**32 - 1)
+        check_seed(self.seed)
         for name in ("fps", "seconds"):
             if getattr(self, name) is not None:
                 check_positive(name, getattr(self, name), finite=True)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_choice, check_is, check_range, one_line
+from deimos.checks import check_at_least, check_choice, check_is, check_seed, one_line
 from deimos.goals import given
 from deimos.goals.given import Bound, Candidates, Inputs
 from deimos.goals.selector import SelectorConfig
@@ -42,7 +42,7 @@ def check_options(
     check_choice("first_goals", first_goals, ["uniform", "chosen"])
     check_at_least("learn_every", learn_every, 1)
     check_at_least("total_steps", total_steps, 0)
-    check_range("seed", seed, 0, 2**32 - 1)
+    check_seed(seed)
 
 
 def placed(device: torch.device | str) -> torch.device:

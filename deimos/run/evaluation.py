@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from deimos.checks import RunError, check_at_least, check_is, check_names, check_range, check_whole
+from deimos.checks import RunError, check_at_least, check_is, check_names, check_seed
 from deimos.files import read_bytes
 from deimos.goals.fear import FearConfig
 from deimos.goals.interactions import Resolved
@@ -53,7 +53,7 @@ class EvalConfig:
     steps: int = 2000
     """Steps of every world, at least 2 T."""
     seed: int = 1_000_003
-    """Seed of the worlds and their goals, in [0, 2^32 - 1). The same for all policies that are to be compared."""
+    """Seed of the worlds and their goals, in [0, 2^32 - 2). The same for all policies that are to be compared."""
     attackers: tuple[str, ...] = ("argmax", "scripted")
     """Who attacks the policy, by name, each at most once (docs/how_to/evaluate.md)."""
     adversary_steps: int = 1500
@@ -69,8 +69,7 @@ class EvalConfig:
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "oracle_worlds"):
             check_at_least(name, getattr(self, name), 1)
-        check_whole("seed", self.seed)
-        check_range("seed", self.seed, 0, 2**32 - 2)
+        check_seed(self.seed, spare=2)  # the next one is of what attackers learn from, the one after it of the shield
         check_is("fear", self.fear, FearConfig)
         check_names("attackers", self.attackers)
         for name in self.attackers:

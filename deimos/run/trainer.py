@@ -19,6 +19,7 @@ from deimos.checks import (
     check_is,
     check_names,
     check_range,
+    check_seed,
     check_whole,
     one_line,
 )
@@ -96,16 +97,14 @@ class TrainConfig:
         check_at_least("env_steps", self.env_steps, 1)
         for name in ("critic_warmup", "video_every"):
             check_at_least(name, getattr(self, name), 0)
-        for name in ("seed", "threads"):
-            check_whole(name, getattr(self, name))
+        check_whole("threads", self.threads)
         check_range("threads", self.threads, 0, MOST_THREADS)
         check_device("device", self.device)
         check_choice("graph", self.graph, MODES)
         check_names("log", self.log)
         for name in self.log:
             check_choice("log", name, LOGS)
-        if not 0 <= self.seed < 2**32:
-            raise ValueError(f"seed must be in [0, 2^32), got {self.seed}.")
+        check_seed(self.seed)
         if self.method is not None and self.selector is not None:
             raise ValueError(f"method '{self.method}' and a selector cannot be combined; give one of them.")
         if self.method is not None:

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from deimos.checks import SimulationError, check_at_least, check_whole
+from deimos.checks import SimulationError, check_at_least, check_seed
 from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_worlds, record, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
@@ -65,9 +65,7 @@ class WarpEnv(Env):
     ) -> None:  # fmt: skip
         check_stream(device)
         check_at_least("num_envs", num_envs, 1)
-        check_whole("seed", seed)
-        if not 0 <= seed < 2**32:
-            raise ValueError(f"seed must be in [0, 2^32), got {seed}.")
+        check_seed(seed)
         self.config = config
         self.num_envs, self.device = num_envs, device
         self._seed, self._offset = seed, env_offset
