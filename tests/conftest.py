@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections import namedtuple
@@ -15,6 +16,9 @@ import torch
 from deimos import plugins
 
 torch.set_num_threads(1)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a script starts the tests in the background
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
 
 DEVICES = ["cpu"]
 one_stream = contextlib.nullcontext

@@ -62,13 +62,13 @@ def resolve_device(name: str) -> torch.device:
 
 def provenance() -> dict[str, str]:
     """Versions, commit and platform that a run's numbers belong to."""
-    packages = ("torch", "warp-lang", "numpy")
     return {
         "deimos": __version__,
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        **{name: version(name) for name in packages},
+        "torch": str(torch.__version__),  # names its build (+cu130), which the version of PyPI's package does not
+        **{name: version(name) for name in ("warp-lang", "numpy")},
     }
 
 
