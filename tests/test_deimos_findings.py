@@ -124,10 +124,11 @@ def test_rows_of_an_earlier_version_are_described():
         ),
         (
             [evaluated()[0], attacked("argmax", 40, 10), attacked("scripted", 20, 30)],
-            r".* scripted raises .* 25 %\. The worst attacker is argmax: 10 % in the worlds that did not choose it\.",
+            r".* scripted raises .* 25 %\. "
+            r"The worst attacker is argmax: 10 % in the worlds that were not used to choose it\.",
         ),
-        (evaluated(math.nan), "No goal was pursued to its end, so nothing can be said of crashes."),
-        (evaluated(None), "No goal was pursued to its end, so nothing can be said of crashes."),
+        (evaluated(math.nan), "No goal was pursued to its end, so nothing can be said about crashes."),
+        (evaluated(None), "No goal was pursued to its end, so nothing can be said about crashes."),
         (
             [*evaluated(), evaluated()[0] | {"goals": "oracle", "crash_rate": 0.5}],
             ".* raises that to 36 %; oracle raises that to 50 %.",

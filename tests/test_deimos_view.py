@@ -400,7 +400,7 @@ def test_a_mujoco_without_its_viewer_is_one_line(scared, capsys, monkeypatch):
     """Where MuJoCo is installed and lacks the web viewer, as on Windows, nobody is told to install it."""
     monkeypatch.setitem(sys.modules, "mujoco.studio", None)
     assert cli.main(["view", str(scared), "--seconds", "1"]) == 2
-    line = "deimos: This needs mujoco.studio, which the mujoco that is installed has not.\n"
+    line = "deimos: This needs mujoco.studio, which the installed mujoco does not have.\n"
     assert capsys.readouterr().err == line
 
 

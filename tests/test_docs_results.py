@@ -62,11 +62,11 @@ def test_the_readme_quotes_the_rows(evidence):
     policies = {row["hash"] for own in evidence.rows.values() for row in own.values()}
     uniform, penalty = rate(fresh, ATTACKED, "uniform"), rate(fresh, ATTACKED, "penalty-30")
     assert not missing([
-        f"{len(policies)} policies, all of them counted",
-        f"crash in {rate(fresh, under('naive'), 'uniform'):.1f} % of these, but in {uniform:.0f} % of the worst",
-        f"crash in {attacked.estimate:.1f} %, at {score.estimate:.2f} of the score",
+        f"{len(policies)} policies, none left out",
+        f"crash on {rate(fresh, under('naive'), 'uniform'):.1f} % of such goals, but on {uniform:.0f} % of the worst",
+        f"crash on {attacked.estimate:.1f} % of the worst attacker's goals, at {score.estimate:.2f} of Uniform's score",
         f"does not help: {penalty:.0f} %",
-        f"comes to {novel.estimate:.1f} % at {novel_score.estimate:.2f}",
+        f"reaches {novel.estimate:.1f} % at {novel_score.estimate:.2f} of the score",
     ], README)  # fmt: skip
 
 
@@ -135,7 +135,7 @@ def test_the_readme_quotes_the_robots(robots):
     """Changes of the worst attacker's rate."""
     p75, both, penalty = (contrast(robots, Place("quad", 100), name, "uniform", WORST).mean for name in PRIMARY)
     ends = [change(each).partition("% ")[2] for each in (p75, both)]
-    assert not missing([f"(falls {' and '.join(ends)} %)", f"({change(penalty)})"], README)
+    assert not missing([f"(change in falls: {' and '.join(ends)} %)", f"({change(penalty)})"], README)
 
 
 def test_the_page_of_robots_has_what_is_exploratory(robots):
@@ -155,7 +155,8 @@ def test_the_page_of_robots_has_what_is_exploratory(robots):
         f"from {before} to {100 * falls:.1f} %",
         f"the {mean(DOSE, robots, near, 'p75'):.0f}st percentile of fear",
         f"train at a mean level of {p75:.1f}, under Uniform at {uniform:.1f}",
-        f"penalty-30 falls {less[0]} under uniform goals, {less[1]} under attack, VDS {vds.removeprefix('+')} more",
+        f"penalty-30 falls {less[0]} under uniform goals and {less[1]} under attack, where VDS falls "
+        f"{vds.removeprefix('+')} more",
     ], LEGGED)  # fmt: skip
 
 
@@ -197,7 +198,9 @@ def test_both_engines_are_told(robots):
         falls.append([100 * math.expm1(x) for x in rate.differences])
         assert f"| {title} | {scores} | {logs} |" in LEGGED_LAB
     native, judged, warp = ("{:+.0f} and {:+.0f} %".format(*each) for each in falls)
-    assert f"is {native} on MuJoCo's, {judged} with the same policies on mujoco-warp, {warp} trained there" in LEGGED
+    assert (
+        f"is {native} on MuJoCo's, {judged} with the same policies on mujoco-warp, {warp} with training there" in LEGGED
+    )
 
 
 def test_the_page_of_robots_counts_clauses():
@@ -207,7 +210,7 @@ def test_the_page_of_robots_counts_clauses():
     (beyond,) = re.findall(r"For (\d+) of \d+ undecided there is no effect", report)
     held, undecided = map(int, counts)
     assert f"of {held + undecided} clauses one holds" in LEGGED
-    assert f"{undecided} are undecided; {beyond} of these so few bases could not decide" in LEGGED
+    assert f"{undecided} are undecided; {beyond} of these could not be decided with so few bases" in LEGGED
     (line,) = re.findall(r"^\| quad.* holds \|$", report, re.MULTILINE)
     assert line.startswith("| quad, T = 500 | score that the attack costs: uniform, rnd, vds, cl > vds+p75 |")
 
@@ -220,11 +223,11 @@ def test_the_page_of_robots_has_the_arm(robots):
     ours, rival = (contrast(robots, place, "vds+p75", name, WORST) for name in ("uniform", "vds"))
     assert max(rival.differences) < 0
     least, *_, most = sorted(-100 * np.expm1(ours.differences))
+    interval = change(ours.mean).partition("% ")[2]
     assert not missing([
-        "fall in {:.1f} % of the worst attacker's goals, VDS's in {:.1f}, p50's in {:.1f}, vds+p75's in {:.1f}".format(
-            *(100 * x for x in hard)
-        ),
-        f"by {least:.0f} to {most:.0f} % against Uniform, so the interval is {change(ours.mean).partition('% ')[2]} %",
+        "fall under {:.1f} % of the worst attacker's goals, VDS's under {:.1f}, p50's under {:.1f}, "
+        "vds+p75's under {:.1f}".format(*(100 * x for x in hard)),
+        f"by {least:.0f} to {most:.0f} % relative to Uniform, so the interval is {interval} %",
     ], LEGGED)  # fmt: skip
 
 

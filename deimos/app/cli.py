@@ -26,8 +26,8 @@ COMMANDS = {
     "pool": ("deimos.app.pool", "train the network of the attacker pooled on other runs"),
     "study": ("deimos.app.study", "train and compare populations of policies"),
     "play": ("deimos.app.playback", "show a trained policy at work, as a video or as pictures"),
-    "view": ("deimos.app.view", "watch a policy in the browser, and drive it, also while it trains"),
-    "shield": ("deimos.app.shield", "calibrate a shield against goals that would crash a policy, and try it"),
+    "view": ("deimos.app.view", "watch a policy in the browser and drive it, even while it trains"),
+    "shield": ("deimos.app.shield", "calibrate a shield against goals that would crash a policy, and test it"),
     "export": ("deimos.app.export", "write a policy as ONNX, with all that a robot's controller needs"),
     "robot": ("deimos.app.robot", "check a robot of your own, and draft its file from an MJCF"),
     "doctor": ("deimos.app.doctor", "say what this machine has, and what works on it"),
@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
         if package not in EXTRAS:
             raise
         if part and importlib.util.find_spec(package) is not None:
-            return _fail(f"This needs {error.name}, which the {package} that is installed has not.")
+            return _fail(f"This needs {error.name}, which the installed {package} does not have.")
         return _fail(f"This needs {package}, which is not installed: pip install 'deimos-rl[{EXTRAS[package]}]'")
     except ImportError as error:
         return _fail(f"{error.name or 'A library'} cannot be loaded ({error}).")

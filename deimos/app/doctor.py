@@ -39,21 +39,21 @@ PURPOSES = {
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions:
-    """Say what this machine has, and what of Deimos works on it: exit code 0 where a policy can be trained, else 1.
+    """Say what this machine has, and what of Deimos works on it: exit code 0 if a policy can be trained, else 1.
 
     With --gpu, run the stages that show on a GPU what no CPU can: ten minutes, a JSON report after each.
     """
 
     device: str = "auto"
     """Where to try: cpu, cuda or cuda:N; auto takes the GPU where there is one. The stages of --gpu need a GPU, unless
-    it says cpu: at tiny sizes then, to see that they run."""
+    this is cpu, which runs them at tiny sizes to see that they work."""
     gpu: bool = False
     """Run the stages."""
     science: bool = False
     """After the stages, measure the thesis's Table 4.1 and train Quad for as long as the thesis did: half an hour or
-    more, which continues where it was when the command is given again."""
+    more; repeated, the command continues where it was."""
     stages: tuple[str, ...] = ()
-    """Names of the stages that are wanted. By default all."""
+    """Names of the stages to run. By default all."""
     out: Path = Path("doctor")
     """Folder of the report of --gpu, and of what --science makes."""
 
@@ -93,9 +93,9 @@ def examine(device_name: str) -> bool:
     """
     facts = [(name, text) for name, text in training.provenance().items()]
     facts += [("cores", str(cores())), ("NVIDIA driver", gpu_stages.driver() or "none"), ("CUDA", _cuda())]
-    print(_table("here", facts), end="\n\n")
+    print(_table("this machine", facts), end="\n\n")
     packages = [(what, *_package(name, extra)) for name, (what, extra) in PURPOSES.items()]
-    print(_table("what more there is", packages), end="\n\n", flush=True)
+    print(_table("optional packages", packages), end="\n\n", flush=True)
     rows, works = [], True
     for what, check, is_needed in CHECKS:
         begin = time.perf_counter()

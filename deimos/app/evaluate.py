@@ -40,8 +40,8 @@ class Elsewhere:
     """What the policy is evaluated in, where that is not what it was trained in."""
 
     engine: Literal["warp", "native"] | None = None
-    """What simulates legged robots. By default as in training; the other one shows what the policy is worth in another
-    simulator, beside what it did in its own."""
+    """What simulates legged robots. By default as in training; the other one shows how the policy does in another
+    simulator, compared with its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +61,13 @@ class EvaluateOptions:
     device: str = "auto"
     """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
     attackers: tuple[str, ...] | None = None
-    """Attackers beside those that the run was set up with, by name: argmax-long, oracle, ..."""
+    """Attackers in addition to those that the run was set up with, by name: argmax-long, oracle, ..."""
     pool: Path | None = None
     """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
     env: Elsewhere = field(default_factory=Elsewhere)
     """What the policy is evaluated in."""
     oracle_worlds: int | None = None
-    """Worlds that meet an attacker that tries its goals in clones. By default as the run was set up."""
+    """Worlds that meet the attacker oracle, which tries goals in clones. By default as the run was set up."""
     calibration: int = 0
     """Instead of the policy, evaluate the fear network's probabilities on this many interactions, and draw
     calibration.png. 0 disables it."""

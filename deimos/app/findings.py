@@ -74,7 +74,7 @@ def _per_part(rows: list[dict]) -> list[tuple[str, list[str]]]:
 def conclude(rows: list[dict]) -> str:
     """What the shares of goals that ended in a crash mean, in a sentence."""
     if any(_is_missing(row["crash_rate"]) for row in rows):
-        return "No goal was pursued to its end, so nothing can be said of crashes."
+        return "No goal was pursued to its end, so nothing can be said about crashes."
     (naive,), attacked = ([row for row in rows if (row["goals"] == "naive") == own] for own in (True, False))
     low = naive["crash_rate"]
     said = f"Under uniform goals {percent(low) if low else 'none'} of the goals end in a crash"
@@ -98,8 +98,8 @@ def conclude(rows: list[dict]) -> str:
             f" Goals of {' and '.join(without)} are uniform: there was nothing to learn from, so they prove nothing."
         )
     for most in worst([rows]) if len(attacked) > 1 and any(row["crash_rate"] for row in attacked) else []:
-        said += f" The worst attacker is {most['attacker']}: {percent(most['crash_rate'])} in the worlds that did not"
-        said += " choose it."
+        said += f" The worst attacker is {most['attacker']}: {percent(most['crash_rate'])} in the worlds that were not"
+        said += " used to choose it."
     return said
 
 

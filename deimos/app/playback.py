@@ -21,7 +21,7 @@ LARGEST = 8192  # [pixels] along a side of a picture
 
 @dataclass(frozen=True, kw_only=True)
 class PlayOptions:
-    """Render the policy of a run in one world under uniform goals; pictures have the goal and its crash probability.
+    """Render the policy of a run in one world under uniform goals; pictures show the goal and its crash probability.
 
     Robots are rendered without a display: MUJOCO_GL says how (egl or osmesa; Debian has libegl1 and libosmesa6).
     Particles are drawn, with their trail in blue, their goal in orange and a cross where they crashed.
@@ -30,7 +30,7 @@ class PlayOptions:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     video: Path | None = None
-    """Video to write: .mp4, .mkv, .mov, .webm, .gif or .webp; one that is there is replaced."""
+    """Video to write: .mp4, .mkv, .mov, .webm, .gif or .webp; an existing one is replaced."""
     frames: Path | None = None
     """Folder for single pictures (.png) instead; must not exist."""
     seconds: float = 10.0

@@ -31,9 +31,9 @@ COLOURS = {"base": (0.85, 0.2, 0.15, 1.0), "feet": (0.1, 0.6, 0.25, 1.0), "limbs
 
 @dataclass(frozen=True, kw_only=True)
 class CheckOptions:
-    """Check a robot: stand it up for two seconds, and say what is missing or odd.
+    """Check a robot: let it stand for two seconds, and say what is missing or odd.
 
-    Ends with exit code 0 where it can be trained, and 1 where it cannot.
+    Ends with exit code 0 if it can be trained, and 1 if it cannot.
     """
 
     robot: tyro.conf.Positional[str]
@@ -43,7 +43,7 @@ class CheckOptions:
     engine: Literal["native", "warp"] = "native"
     """What simulates it; warp, mujoco-warp, compiles for a minute or two first."""
     picture: Path | None = None
-    """PNG file for the picture: what the robot looks like, and what of it collides. By default NAME.png here. One of an
+    """PNG file for the picture: the robot beside its collision geometry. By default NAME.png here. A picture of an
     earlier check is replaced, another file is not."""
 
 
@@ -68,7 +68,7 @@ def main(arguments: list[str], program: str) -> None:
         "check": ("say what is missing or odd, and draw it: deimos robot check scout.toml", check),
     }
     try:
-        console.dispatch(commands, "Makes a robot of an MJCF of your own.", arguments, program)
+        console.dispatch(commands, "Makes a robot from your own MJCF.", arguments, program)
     except ValueError as error:  # a file that is no robot's
         raise RunError(str(error)) from error
 

@@ -21,7 +21,7 @@ _CHANGES = ("worlds", "steps", "seed", "adversary_steps", "pool", "oracle_worlds
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """How shields are tried; what is left out is as the run was set up."""
+    """How shields are tried. By default as the run was set up."""
 
     worlds: int | None = None
     """Parallel worlds."""
@@ -39,11 +39,11 @@ class Evaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class ShieldOptions:
-    """Make a shield of a run's fear network: it refuses goals that would crash the policy, at a rate that is promised.
+    """Make a shield from a run's fear network: it refuses goals that would crash the policy, at a promised rate.
 
-    It is calibrated on uniform goals in fresh worlds, one of each, then tried under uniform goals (Naive) and under
-    attackers that learn with it in their worlds, beside refusing as many goals at random, or by a plain rule. The run's
-    folder gets shield.json and shield.png; an export made afterwards has the shield too.
+    It is calibrated on uniform goals in fresh worlds, one per world, then tried under uniform goals (Naive) and under
+    attackers that learn with it in their worlds, and compared with refusing as many goals at random or by a plain rule.
+    The run's folder gets shield.json and shield.png; an export made afterwards has the shield too.
     """
 
     run: tyro.conf.Positional[Path]

@@ -46,7 +46,7 @@ class TileOptions(Outputs):
     seed: int = 0
     """Seed of what is random, at least 0."""
     cell: float = 0.05
-    """Distance of two samples of the height grid [m]; must divide tile and border."""
+    """Distance between two samples of the height grid [m]; must divide tile and border."""
     border: float = 0.0
     """Width of the flat border around the tile [m], at least 0."""
     max_step: float = float("inf")
@@ -79,7 +79,7 @@ class GridOptions(Outputs):
     border: float | None = None
     """Width of the flat border [m], at least 0."""
     cell: float | None = None
-    """Distance of two samples of the height grid [m]; must divide tile and border. Robots take none below 0.05 m."""
+    """Distance between two samples of the height grid [m]; must divide tile and border. Robots need at least 0.05 m."""
     max_step: float | None = None
     """Highest step that any shape may have [m]."""
 
@@ -103,7 +103,7 @@ class GridOptions(Outputs):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImportOptions(Outputs):
-    """Make a terrain of a mesh, a grey picture or an array of heights, for --env.terrain and for other programs.
+    """Make a terrain from a mesh, a grey picture or an array of heights, for --env.terrain and for other programs.
 
     Without --out, --mjcf and --preview it is written to NAME.npz here. What deimos terrain wrote comes back exactly.
     """
@@ -111,9 +111,9 @@ class ImportOptions(Outputs):
     file: tyro.conf.Positional[Path]
     """STL, OBJ, PLY or GLB mesh with z up (y in GLB), PNG height map, or NumPy array of heights [m], x along axis 0."""
     resolution: float | None = None
-    """Distance of two samples of the height grid [m], positive. By default what a picture says of itself, or 0.05."""
+    """Distance between two samples of the height grid [m], positive. By default as stored in the picture, or 0.05."""
     height_range: tuple[float, float] | None = None
-    """Heights of a picture's lowest and highest possible grey value [m]. By default what it says of itself."""
+    """Heights of a picture's lowest and highest possible grey value [m]. By default as stored in it."""
     scale: float | None = None
     """Length of a mesh's unit [m], positive: 0.001 for millimetres. By default 1."""
     tile: float | None = None
@@ -126,7 +126,7 @@ def main(arguments: list[str], program: str) -> None:
         "list": ("show the shapes with their parameters, and the presets", show_list),
         "shape": ("build one tile: deimos terrain shape stairs-up --out stairs.stl --preview stairs.png", build_shape),
         "grid": ("build a grid of tiles, from a preset, a TOML file or a list of shapes", build_grid),
-        "import": ("make a terrain of an STL, OBJ, PLY, GLB, PNG or NumPy file", import_terrain),
+        "import": ("make a terrain from an STL, OBJ, PLY, GLB, PNG or NumPy file", import_terrain),
     }
     about = "Generates terrain for legged robots: triangle meshes, height grids, MuJoCo models, pictures."
     try:

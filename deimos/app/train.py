@@ -34,11 +34,11 @@ class ResumeOptions:
     resume: Path
     """Folder of the run."""
     env_steps: int | None = None
-    """A larger budget: steps of every world in all. By default the one that the run had."""
+    """A larger budget: steps of every world in all. By default that of the run."""
     device: str | None = None
-    """Where to continue. By default where it was."""
+    """Where to continue. By default on the device that the run had."""
     graph: Mode | None = None
-    """Whether a GPU replays CUDA graphs. By default as it did."""
+    """Whether a GPU replays CUDA graphs. By default as before."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class FirstOptions:
     """What decides which other options there are."""
 
     preset: str | None = None
-    """Name of a ready configuration to start from; the others change it."""
+    """Name of a ready-made configuration to start from; the other options change it."""
     resume: Path | None = None
     """Resume the run in this folder from its last checkpoint; takes only --env-steps, --device and --graph."""
     branch_from: Path | None = None
@@ -145,7 +145,7 @@ def _train_options() -> type:
     """``FolderOptions`` with every environment and selector that there is."""
     about = (
         "Train a policy under a goal selector, then evaluate it against uniform goals and attackers. "
-        f"--preset NAME starts from a ready configuration: {', '.join(presets.names())}."
+        f"--preset NAME starts from a ready-made configuration: {', '.join(presets.names())}."
     )
     selector = _subcommands(selectors, Annotated[None, tyro.conf.subcommand("none")])
     return make_dataclass(

@@ -46,19 +46,20 @@ class ViewOptions:
     goals: str = UNIFORM
     """Who chooses the goals at first: uniform, the method of the run if it has a fear network, or an attacker."""
     attackers: tuple[str, ...] = ()
-    """Attackers that may choose the goals: argmax, scripted, ... One that learns does so before the page is there, and
-    where the run has no fear network, the map shows what it has learnt."""
+    """Attackers that may choose the goals: argmax, scripted, ... One that learns does so before the page opens; if the
+    run has no fear network, the map shows what the attacker has learnt."""
     pool: Path | None = None
     """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
     shield: Mode | None = None
-    """Have the run's shield, which deimos shield makes, look at every goal before the policy gets it, those by hand
-    too: what becomes of one that it refuses."""
+    """Have the run's shield, which deimos shield makes, check every goal before the policy gets it, including those set
+    by hand: what becomes of a goal that it refuses."""
     attacker_worlds: int = 256
     """Worlds that attackers learn in, at least 1."""
     terrain: str | None = None
     """What robots stand on, as --env.terrain; by default the ground that they were trained on."""
     worlds: int | None = None
-    """Worlds side by side, at least 1: by default 8 particles or one robot. Of robots the first is seen."""
+    """Worlds side by side, at least 1: by default 8 particles or one robot. Of several robots only the first is
+    shown."""
     world: int = 0
     """Global number of the first world, at least 0: where it stands, and which goals it gets."""
     goal_period: int | None = None
@@ -66,10 +67,11 @@ class ViewOptions:
     seed: int = 1_000_003
     """Seed of the worlds and their goals, in [0, 2^32)."""
     record: Path | None = None
-    """Video to write meanwhile: .mp4, .mkv, .mov, .webm, .gif or .webp; one that is there is replaced. What is paused
-    is left out."""
+    """Video to write meanwhile: .mp4, .mkv, .mov, .webm, .gif or .webp; an existing one is replaced. Pauses are left
+    out."""
     seconds: float | None = None
-    """End after so many simulated seconds, or 50 steps each where the world has none; by default when stopped."""
+    """End after so many simulated seconds, or 50 steps each where the world has none; by default it runs until
+    stopped."""
     fps: float = 25.0
     """Changes of the panel, and pictures of the video, per second, positive."""
     width: int = 640

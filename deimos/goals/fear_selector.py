@@ -44,9 +44,9 @@ class FearSelectorConfig(SelectorConfig):
     """``shuffled`` hands every score to another candidate, which must equal Uniform; ``state-blind`` lets the
     network see goals only."""
     memory: int = 512
-    """Crashes that are remembered with survivals of the same time, at least 0, so that learning goes on where crashes
+    """Crashes that are remembered with survivals of the same time, at least 0, so that learning continues when crashes
     have become rare. 0 is the thesis's literal method: a fit learns from the interactions resolved in the last 2 T
-    steps, and is left out where they lack a class."""
+    steps, and is left out if they lack a class."""
     fear: FearConfig = field(default_factory=FearConfig)
     """The fear network."""
     former: ClassVar[dict[str, Any]] = {"gate": False}

@@ -31,7 +31,7 @@ LEARNING_RATE_RANGE = (1e-5, 1e-2)  # what the adaptive schedule may reach; rsl_
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig:
-    """Proximal policy optimization [1]_; the defaults are rsl_rl's but for sizes and reward scale.
+    """Proximal policy optimization [1]_; the defaults are rsl_rl's except for sizes and reward scale.
 
     .. [1] Schulman et al., *Proximal Policy Optimization Algorithms*, arXiv:1707.06347.
     """
@@ -71,7 +71,7 @@ class PPOConfig:
     """Standard deviation that the policy starts with, in units of the action, positive."""
     normalize_observations: bool = False
     """Whether actor and critic see observations less their running mean, in units of their running standard deviation.
-    The statistics are part of the policy, which no longer changes them."""
+    The statistics are part of the trained policy, and fixed in it."""
 
     def __post_init__(self) -> None:
         for name in ("num_steps", "epochs", "minibatches"):

@@ -64,7 +64,8 @@ class EvalConfig:
     pool: Path | None = None
     """File of the attacker ``pooled``, which ``deimos pool`` makes."""
     oracle_worlds: int = 200
-    """Worlds, at least 1 and of the others, that meet an attacker that tries its goals in clones: N T steps a goal."""
+    """How many of the worlds meet the attacker oracle, which tries goals in clones at N T steps per goal; at least
+    1."""
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "oracle_worlds"):

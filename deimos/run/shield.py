@@ -52,9 +52,10 @@ class ShieldConfig:
     """What becomes of a goal that is refused: ignore keeps the active goal, project takes the nearest acceptable one,
     stop the safe one. Against the worst attacker stop is the strongest: project gives it the worst acceptable goal."""
     guarantee: Guarantee = "conditional"
-    """What holds alpha: marginal, the mean over calibrations; conditional, this one with a confidence of 95 %."""
+    """What stays below alpha: marginal, the mean over calibrations; conditional, this calibration with a confidence of
+    95 %."""
     worlds: int = 20_000
-    """Worlds that it is calibrated and tested in, half of them each, one goal of each; at least 2."""
+    """Worlds that it is calibrated and tested in, half of them each, one goal per world; at least 2."""
     candidates: int = 100
     """Uniform goals that project may take, at least 1."""
     alphas: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)

@@ -84,7 +84,7 @@ class TrainConfig:
     """Where its numbers are shown while it trains: tensorboard, wandb (Weights & Biases), both or nowhere."""
     video_every: int = 0
     """Iterations from one video of the policy to the next, at least 0; 0 makes none. Each goes to ``videos`` in the
-    run's folder and into its logs, and takes some seconds, in which the training waits."""
+    run's folder and into its logs, and takes some seconds, during which training waits."""
     critic_warmup: int = 0
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 

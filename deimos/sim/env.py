@@ -72,7 +72,7 @@ class EnvConfig(abc.ABC):
     """T: steps that a goal is active, at least 1."""
     crash_penalty: float = 0.0
     """What the step of a crash costs the learner, in multiples of the largest goal-matching reward of one step, at
-    least 0. Scores and reported rewards do not see it."""
+    least 0. Scores and reported rewards do not include it."""
 
     def __post_init__(self) -> None:
         check_at_least("goal_period", self.goal_period, 1)

@@ -48,7 +48,7 @@ class _WorkOptions(_FolderOptions):
     gpus: float | None = None
     """GPUs of a cell with ray, at least 0; 0.25 puts four on one. By default 1 for cells whose device is cuda."""
     allow_uncommitted: bool = False
-    """Whether sources may differ from the commit that is checked out; a hash of them stands for it then."""
+    """Whether sources may differ from the commit that is checked out; a hash of them then takes its place."""
 
     def __post_init__(self) -> None:
         if self.workers is not None:
@@ -103,8 +103,8 @@ class RunOptions(_WorkOptions):
     methods: list[str] | None = None
     """Methods in place of the file's."""
     environments: list[str] | None = None
-    """Those of the file's environments that are wanted, each with all points of its design, or with one (fast.3). By
-    default all."""
+    """Which of the file's environments to run, each with all points of its design, or with one (fast.3). By default
+    all."""
     num_envs: int | None = None
     """Parallel worlds of the training, in place of the file's."""
     env_steps: int | None = None
@@ -112,12 +112,12 @@ class RunOptions(_WorkOptions):
     device: str | None = None
     """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
     threads: int | None = None
-    """CPU threads of every worker, in place of the file's, which is 1 unless said. They change no number of a cell, but
-    belong to what it is named by: give a study the same."""
+    """CPU threads of every worker, in place of the file's, by default 1. They change no number of a cell, but are part
+    of what names it: keep them the same throughout a study."""
     retry_failed: bool = False
-    """Whether to try the cells again that were given up."""
+    """Whether to retry cells that have failed."""
     estimate: bool = False
-    """Whether to print what the study takes, and start nothing."""
+    """Whether to print what the study would take, and start nothing."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -218,8 +218,8 @@ def _open(study: StudyFolder) -> list[plan.Cell]:
 class AttackOptions(_WorkOptions):
     """Evaluate the policies of a finished study under further attackers.
 
-    What was killed continues when the command is given again, or by ``run``. Policies that are not in the folder any
-    more come from its archive.
+    If killed, it continues when the command is repeated, or by ``run``. Policies that are no longer in the folder come
+    from its archive.
     """
 
     attackers: tuple[str, ...]
@@ -263,7 +263,7 @@ class AttackOptions(_WorkOptions):
 class CellOptions(_FolderOptions):
     """Train and evaluate one cell of a study, by its number: a task of a Slurm array (docs/cluster.md).
 
-    Any number of these work on a study at a time, wherever its folder is seen.
+    Any number of these may work on a study at a time, on any machine that sees its folder.
     """
 
     number: tyro.conf.Positional[int]
@@ -299,12 +299,12 @@ class CellOptions(_FolderOptions):
 class PoolOptions(_FolderOptions):
     """Make a file for the attacker pooled for every environment, from the policies of a finished study.
 
-    A file that is there stays as it is, so what was killed continues when the command is given again. Environments with
-    a cell that was given up are skipped and named.
+    Existing files stay as they are, so a command that was killed continues when repeated. Environments with a failed
+    cell are skipped and named.
     """
 
     out: Path | None = None
-    """Folder of the files NAME.pt, the ``pools`` of another study's file. By default ``pools`` in the study's."""
+    """Folder of the files NAME.pt, the ``pools`` of another study's file. By default the study's own ``pools``."""
     device: str = "cpu"
     """Where to simulate: cpu, cuda or cuda:N."""
 
@@ -325,7 +325,7 @@ class PoolOptions(_FolderOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class PackOptions(_FolderOptions):
-    """Put the policies of the finished cells into policies.zip, beside those that are in it."""
+    """Add the policies of the finished cells to policies.zip."""
 
     def run(self) -> None:
         """Write the archive; ``RunError`` if there is no policy."""

@@ -13,12 +13,12 @@ from deimos.goals.selector import Spaces
 
 @dataclass(frozen=True, kw_only=True)
 class Config(FearSelectorConfig):
-    """A fear network ranks uniform candidates; the goal is drawn from the frightening end of the ranking."""
+    """A fear network ranks uniform candidates; the goal is drawn from the most feared end of the ranking."""
 
     percentile: float = 25.0
     """p, in [0, 100]: the share of candidates that is discarded as too easy [%]. 0 is Uniform, 100 argmax."""
     rule: Literal["percentile", "argmin", "argmax"] = "percentile"
-    """Draw above the percentile, or take the least (Coop) or the most (Antagonist) frightening goal."""
+    """Draw above the percentile, or take the least (Coop) or the most (Antagonist) feared goal."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,12 +13,12 @@ from deimos.goals.selector import Delegate, GoalSelector, SelectorConfig, Spaces
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """A method chooses the goals, and every crash takes something from the learner's reward."""
+    """A method chooses the goals, and every crash costs the learner some of its reward."""
 
     base: str = "uniform"
     """Name of the method."""
     size: float = 30.0
-    """What a crash takes, in units of the largest reward of a step, in [0, 1e6]."""
+    """What a crash costs, in units of the largest reward of a step, in [0, 1e6]."""
 
     def __post_init__(self) -> None:
         method(self.base)

@@ -27,7 +27,7 @@ class Config(SelectorConfig):
     replay: float = 0.8
     """Share of decisions that replay a level, in [0, 1], once the buffer holds enough."""
     robust: bool = False
-    """Whether the learner takes gradients on replayed goals only, and on first goals, which nobody chooses."""
+    """Whether the learner takes gradients only on replayed goals, and on first goals, which no selector chooses."""
     capacity: int = 4000
     """Levels in the buffer, at least 1."""
     fill: float = 0.5

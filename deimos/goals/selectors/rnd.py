@@ -25,7 +25,7 @@ CLIP = 5.0  # bound of whitened inputs, as in the paper
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """The goal whose (state, active goal, next goal) a trained network predicts a frozen random one worst on."""
+    """The goal on whose (state, active goal, next goal) a trained network predicts a frozen random one worst."""
 
     rule: Literal["argmax", "proportional"] = "argmax"
     """Take the most surprising candidate, or draw in proportion to the surprise."""

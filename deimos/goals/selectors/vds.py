@@ -29,8 +29,8 @@ class Config(SelectorConfig):
     """Goals by the standard deviation of an ensemble's values."""
 
     rule: Literal["proportional", "argmax", "percentile", "uniform"] = "proportional"
-    """Draw in proportion to the deviation, take its largest, draw from above its percentile, or never mind it: what
-    the ensemble is worth as a baseline alone."""
+    """Draw in proportion to the deviation, take its largest, draw from above its percentile, or ignore it, which shows
+    what the ensemble alone is worth as a baseline."""
     percentile: float = 75.0
     """Share of candidates that ``percentile`` discards, in [0, 100] [%]."""
     role: Literal["replace", "auxiliary"] = "replace"

@@ -15,12 +15,12 @@ from deimos.sim.legged.task import Locomotion
 
 @dataclass(frozen=True, kw_only=True)
 class Config(LocomotionConfig):
-    """Quad+arm: a Go1 and its arm. Goals are a velocity goal and a place of the end effector, in [-1, 1]^6."""
+    """Quad+arm: a Go1 and its arm. Goals are a velocity and a position of the end effector, in [-1, 1]^6."""
 
     robot: str = "go1_rx150"
-    """Who walks and reaches, a name of ``deimos.sim.legged.robots``; it must have an arm."""
+    """Which robot walks and reaches: a name of ``deimos.sim.legged.robots``; it must have an arm."""
     speed: float = 1.0
-    """Share of the range of the velocity goals, in [0, 1]; 0 for standing and reaching."""
+    """Fraction of the range of the velocity goals, in [0, 1]; 0 for standing and reaching."""
     arm_rewards: ArmWeights = field(default_factory=ArmWeights)
     """Weights of the reward's terms for the arm."""
     hold_trunk: bool = False

@@ -21,10 +21,10 @@ from deimos.terrain import Terrain, importing
 
 @dataclass(frozen=True, kw_only=True)
 class LocomotionConfig(EnvConfig):
-    """A legged robot on a terrain. Defaults are Legged Gym's but for those that say otherwise."""
+    """A legged robot on a terrain. Defaults are Legged Gym's unless stated otherwise."""
 
     robot: str = "go1"
-    """Who walks, a name of ``deimos.sim.legged.robots`` or the path of a robot file (.toml)."""
+    """Which robot walks: a name of ``deimos.sim.legged.robots``, or the path of a robot file (.toml)."""
     terrain: str = "flat"
     """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a terrain file (.npz)."""
     engine: engines.Name = field(default="auto", metadata={"before": "warp"})
@@ -35,27 +35,27 @@ class LocomotionConfig(EnvConfig):
     episode_steps: int = 1000
     """Steps after which an episode is truncated, at least 0; 0 for never, as in evaluations."""
     levels: Literal["reward", "displacement", "frozen"] = "reward"
-    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far its goals led it
-    beside how far they should have (an arc where they ask for yaw; less than 0.3 m does not count), or nothing."""
+    """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far it got compared with
+    its commanded path (an arc if its goals ask for yaw; less than 0.3 m does not count), or nothing."""
     start_levels: int = 6
     """Levels that first episodes are drawn from, the easiest ones, at least 1; all where the terrain has fewer."""
     rewards: RewardWeights = field(default_factory=RewardWeights)
     """Weights of the reward's terms."""
     air_time_target: float = 0.3
-    """Time in the air from which on a step is rewarded [s], at least 0. Legged Gym has 0.5 s, for larger robots."""
+    """Air time above which a step is rewarded [s], at least 0. Legged Gym has 0.5 s, for larger robots."""
     friction: tuple[float, float] = (0.5, 1.25)
     """Range of the feet's friction, drawn once per world; at least 0.05, below which contacts are ill-conditioned."""
     payload: float = 1.0
     """Bound of the mass that is added to or taken from the base, drawn once per world [kg], at least 0 and less than
-    the base's own. Off in Legged Gym, but for its ANYmal."""
+    the base's own. Off in Legged Gym, except for its ANYmal."""
     push_interval: float = 15.0
-    """Time from push to push, each robot in a phase of its own [s], at least 0; 0 disables them."""
+    """Time between pushes, each robot in its own phase [s], at least 0; 0 disables them."""
     push_speed: float = 1.0
     """Bound of the horizontal velocity that a push sets [m/s], at least 0."""
     noise: bool = True
     """Whether observations are noisy."""
     privileged: tuple[str, ...] = ()
-    """Entries of the observation that the critic alone sees, such as linear_velocity and heights: what the robot itself
+    """Entries of the observation that only the critic sees, such as linear_velocity and heights: what the robot itself
     cannot measure."""
     stagger: bool = True
     """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
