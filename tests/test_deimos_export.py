@@ -351,6 +351,22 @@ def test_fear_that_is_no_probability_is_not_exported_as_one(tmp_path, capsys):
     assert "fear.onnx, batches of" in capsys.readouterr().out
 
 
+def test_a_folder_has_its_name_when_it_is_whole(particles, tmp_path, monkeypatch):
+    """As long as something is missing there is no folder of the name, and an interrupt leaves nothing."""
+    out = tmp_path / "out"
+
+    def interrupt(*arguments):
+        (unfinished,) = tmp_path.iterdir()
+        assert unfinished != out
+        assert (unfinished / "deploy.json").exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export, "_play", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        export.export_run(RunFolder.open(particles), out, check=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsys):
     """A folder that exists, no run, a policy or a shield of another one, each in a line; a run without fear is told."""
     assert cli.main(["export", str(particles), str(tmp_path)]) == 2
