@@ -69,7 +69,7 @@ class GridOptions(Outputs):
     seed: int | None = None
     """Seed of all tiles, at least 0."""
     difficulty: tuple[float, float] | None = None
-    """Difficulty of the first level and of the last, each in [0, 1]."""
+    """Difficulty of the first level and of the last, each in [0, 1]; a single level has the first."""
     levels: int | None = None
     """Tiles along x, at least 1."""
     columns: int | None = None
