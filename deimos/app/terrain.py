@@ -77,7 +77,7 @@ class GridOptions(Outputs):
     tile: float | None = None
     """Side of a tile [m]."""
     border: float | None = None
-    """Width of the flat border [m], at least 0."""
+    """Width of the flat border [m], at least 0; with --shapes 1 by default."""
     cell: float | None = None
     """Distance of two samples of the height grid [m]; must divide tile and border. Robots take none below 0.05 m."""
     max_step: float | None = None
