@@ -65,6 +65,8 @@ class Grid:
         check_range("border", self.border, 0, 1e6)
         check_range("easiest", self.easiest, 0, 1)
         check_range("hardest", self.hardest, 0, 1)
+        if self.levels > 1 and self.hardest < self.easiest:  # robots that do well would be moved to easier tiles
+            raise ValueError(f"hardest must be at least easiest = {self.easiest:g}, got {self.hardest:g}.")
         check_range("max_step", self.max_step, 0, np.inf)
         cells("tile", self.tile, self.cell)
         cells("border", self.border, self.cell)

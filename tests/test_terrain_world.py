@@ -150,6 +150,7 @@ def test_progress_counts_tiles_and_rays():
         ({"max_step": float("nan")}, r"max_step must be in \[0, inf\], got nan"),
         ({"hardest": 1.1}, r"hardest must be in \[0, 1\], got 1.1"),
         ({"easiest": -0.1}, r"easiest must be in \[0, 1\], got -0.1"),
+        ({"easiest": 0.9, "hardest": 0.1}, r"hardest must be at least easiest = 0.9, got 0.1"),
         ({"levels": 0}, r"levels must be at least 1, got 0"),
         ({"columns": 1.5}, r"columns must be a whole number, got 1.5"),
         ({"seed": -1}, r"seed must be at least 0, got -1"),
