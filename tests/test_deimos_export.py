@@ -145,6 +145,17 @@ def test_robots_walk_alone_as_they_did_at_the_export(walker, capfd):
     assert "It is what was exported." in said
 
 
+def test_a_check_finds_what_is_installed_for_its_user(tmp_path, monkeypatch, capsys):
+    """Packages that the export finds outside of the environment, the check finds too, and no module beside it."""
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages" / "own_package.py").write_text("WORD = 'found'")
+    (tmp_path / "json.py").write_text("raise RuntimeError")
+    (tmp_path / "controller.py").write_text("import json, own_package\nprint(own_package.WORD)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "packages"))
+    check(tmp_path)
+    assert capsys.readouterr().out == "found\n"
+
+
 def some_measurements(controller):
     """What robots measure that stand in their default position, under no goal."""
     return {
