@@ -19,6 +19,7 @@ POINTS = 16  # size of the letters: they can be read where a page shows the pict
 SAMPLES = 2  # samples per pixel, along each axis
 TURN, TILT = math.radians(25.0), math.radians(35.0)  # of the oblique view: about the vertical, above the horizon
 HIGHEST = 10.0  # times the longer side: beyond, a picture takes gigabytes
+LONGEST = 1000.0  # times the shorter side: beyond, that is less than a sample of the picture
 WALL = 0.45  # grey of the cut around the ground
 
 
@@ -32,7 +33,7 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
 
     Raises:
         RunError: If the file cannot be written.
-        ValueError: If the ground is too high to be drawn to scale.
+        ValueError: If the ground is too high or too narrow to be drawn to scale.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -40,10 +41,16 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     from PIL import Image
 
     low, high = float(terrain.heights.min()), float(terrain.heights.max())
-    if high - low > HIGHEST * max(terrain.size):
+    narrow, long = sorted(terrain.size)
+    if high - low > HIGHEST * long:
         raise ValueError(
             f"preview is to scale, so heights must differ by at most {HIGHEST:g} times the longer side of the ground, "
-            f"{max(terrain.size):g} m, got {high - low:g} m; are they in metres?"
+            f"{long:g} m, got {high - low:g} m; are they in metres?"
+        )
+    if long > LONGEST * narrow:
+        raise ValueError(
+            f"preview is to scale, so the longer side of the ground must be at most {LONGEST:g} times the shorter one, "
+            f"{narrow:g} m, got {long:g} m."
         )
     margin = max(0.05, 0.15 * (high - low))  # flat ground has neither the darkest nor the lightest colour
     colours = ScalarMappable(Normalize(low - margin, high + margin), "YlGnBu_r")

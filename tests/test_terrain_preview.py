@@ -1,5 +1,6 @@
 """Pictures of terrains: colours are heights, lengths are to scale, and what is in front hides what is behind."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -107,6 +108,21 @@ def test_ground_that_is_too_high_is_not_drawn(tmp_path):
     """Heights in a wrong unit would make a picture of gigabytes: they are named."""
     with pytest.raises(ValueError, match=r"at most 10 times .* ground, 10 m, got 101 m; are they in metres\?"):
         preview.save_preview(tmp_path / "x.png", wall(101.0), "wall")
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_ground_may_be_a_narrow_track(tmp_path, turned):
+    """A track a thousand times as long as it is wide is drawn, and one that no pixel would show is named."""
+    for length, is_drawn in ((3999, True), (4003, False)):
+        heights = np.zeros((5, length + 1), np.float32)
+        ground = dataclasses.replace(wall(0.0), heights=heights.T if turned else heights, corner=(0.0, 0.0))
+        path = tmp_path / f"{length}.png"
+        if is_drawn:
+            preview.save_preview(path, ground, "track")
+            assert path.exists()
+        else:
+            with pytest.raises(ValueError, match=r"at most 1000 times the shorter one, 0.2 m, got 200.15 m"):
+                preview.save_preview(path, ground, "track")
 
 
 def test_large_grids_are_thinned():
