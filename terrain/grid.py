@@ -37,9 +37,10 @@ class Terrain:
         check_positive("cell", self.cell, finite=True)
         check_positive("tile", self.tile, finite=True)
         levels, columns = len(self.difficulty), len(self.shapes)
-        for name, shape in (("origins", (levels, columns, 3)), ("difficulty", (levels,)), ("heights", None)):
+        shapes = {"origins": (levels, columns, 3), "difficulty": (levels,), "heights": self.heights.shape}
+        for name, shape in shapes.items():
             array = getattr(self, name)
-            if array.dtype != np.float32 or array.shape != (shape or array.shape):
+            if array.dtype != np.float32 or array.shape != shape:
                 raise ValueError(f"{name} must be float32 of shape {shape}, got {array.dtype} of shape {array.shape}.")
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite everywhere.")

@@ -161,10 +161,13 @@ def _read_picture(path: Path, resolution: float | None, height_range: tuple[floa
             raise ValueError(f"it is no picture, or it is broken ({first_line(error)}).") from error
     if mode not in ("L", "I", "I;16"):
         raise ValueError(f"it must have 8- or 16-bit grey values and nothing else, got the mode {mode}.")
+    most = 255 if mode == "L" else 65535
     says = {name: float(value) for name, value in note.groupdict().items()} if note else {}
     if height_range is not None:
         low, high = height_range
-        says |= {"low": low, "unit": (high - low) / (255 if mode == "L" else 65535)}
+        says |= {"low": low, "unit": (high - low) / most}
+    elif note:
+        says["unit"] *= 65535 / most  # another program may have made 8 bits of it, and kept the note
     if "low" not in says:
         raise ValueError("height_range must be given: the heights of its lowest and its highest grey value [m].")
     heights = says["low"] + says["unit"] * grey[::-1].T.astype(np.float64)

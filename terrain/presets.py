@@ -75,7 +75,7 @@ def _grid(table: dict[str, Any], changes: dict[str, Any]) -> Grid:
     if not isinstance(table["shape"], list):
         raise ValueError(f"shape must be a list of tables, [[shape]], got {table['shape']!r:.80}")
     numbers = {name: convert(name, value, hints[name]) for name, value in values.items()}
-    return Grid(shapes=tuple(map(_share, table["shape"])), **(numbers | changes))
+    return Grid(**({"shapes": tuple(map(_share, table["shape"]))} | numbers | changes))
 
 
 def _share(table: Any) -> Share:

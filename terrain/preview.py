@@ -18,6 +18,8 @@ WORDS = 240  # pixels for titles, names and the bar of colours
 POINTS = 16  # size of the letters: they can be read where a page shows the picture at the width of a phone
 SAMPLES = 2  # samples per pixel, along each axis
 TURN, TILT = math.radians(25.0), math.radians(35.0)  # of the oblique view: about the vertical, above the horizon
+HIGHEST = 10.0  # times the longer side: beyond, a picture takes gigabytes
+LONGEST = 1000.0  # times the shorter side: beyond, that is less than a sample of the picture
 WALL = 0.45  # grey of the cut around the ground
 
 
@@ -31,6 +33,7 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
 
     Raises:
         RunError: If the file cannot be written.
+        ValueError: If the ground is too high or too narrow to be drawn to scale.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -38,6 +41,17 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     from PIL import Image
 
     low, high = float(terrain.heights.min()), float(terrain.heights.max())
+    narrow, long = sorted(terrain.size)
+    if high - low > HIGHEST * long:
+        raise ValueError(
+            f"preview is to scale, so heights must differ by at most {HIGHEST:g} times the longer side of the ground, "
+            f"{long:g} m, got {high - low:g} m; are they in metres?"
+        )
+    if long > LONGEST * narrow:
+        raise ValueError(
+            f"preview is to scale, so the longer side of the ground must be at most {LONGEST:g} times the shorter one, "
+            f"{narrow:g} m, got {long:g} m."
+        )
     margin = max(0.05, 0.15 * (high - low))  # flat ground has neither the darkest nor the lightest colour
     colours = ScalarMappable(Normalize(low - margin, high + margin), "YlGnBu_r")
     stacked = max(terrain.size) > 1.5 * min(terrain.size)
@@ -88,6 +102,9 @@ def _draw(terrain: Terrain, colours: Any, step: float, turn: float, tilt: float)
 
     stride = max(1, int(step / terrain.cell))
     ground = (terrain.heights.T[::-1] if _is_wide(terrain) else terrain.heights)[::stride, ::stride]
+    low, high = float(ground.min()), float(ground.max())
+    level = 0.0 if low <= 0.0 <= high else low  # ground far from 0, as a survey has it, is cut not far below itself
+    ground = ground - level
     cell = stride * terrain.cell
     light = LightSource(azdeg=315, altdeg=30)  # brightness 1/2 where it is flat, which keeps the colour of its height
     south, east = np.gradient(ground, cell)
@@ -109,15 +126,16 @@ def _draw(terrain: Terrain, colours: Any, step: float, turn: float, tilt: float)
     foot = min(0.0, float(ground.min())) * rise - 0.01 * max(terrain.size) * rise  # of the cut around the ground
     up = np.arange(edge[0, 0] + foot + step / 2, top.max(), step)[:, None]  # middles of the pixels
     seen = np.stack([np.searchsorted(samples, up[:, 0]) for samples in top.T], axis=1)
-    near = edge[inside.argmax(axis=0), 0]  # where the ground begins
+    first = inside.argmax(axis=0)
+    near = np.minimum(edge[first, 0], np.take_along_axis(top, first[None], axis=0))  # where the ground begins
     beside = (seen == len(top)) | (up < near)
     seen = seen.clip(1, len(top) - 1)
     here, before = (np.take_along_axis(ground[place], index, axis=0) for index in (seen, seen - 1))
     height = ((up - edge[seen, 0]) / rise).clip(np.minimum(here, before), here)  # from the foot of a riser to its top
     shade = np.take_along_axis(brightness[place], seen, axis=0)
-    picture = light.blend_soft_light(colours.to_rgba(height)[..., :3], shade[..., None])
+    picture = light.blend_soft_light(colours.to_rgba(height + level)[..., :3], shade[..., None])
     picture[beside] = 1.0
-    picture[beside & (up < near) & (up >= near + foot) & inside.any(axis=0)] = WALL
+    picture[beside & (up < near) & (up >= edge[first, 0] + foot) & inside.any(axis=0)] = WALL
     bottom = up[0, 0] - step / 2
     return picture[::-1], (-reach, step * picture.shape[1] - reach, bottom, step * picture.shape[0] + bottom)
 

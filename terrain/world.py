@@ -51,9 +51,9 @@ class Grid:
     easiest: float = 0.0
     """Difficulty of the first level, in [0, 1]."""
     hardest: float = 0.9
-    """Difficulty of the last level, in [0, 1]."""
+    """Difficulty of the last level, in [0, 1]; a single level has that of the first."""
     max_step: float = np.inf
-    """Highest step that any shape may have at any level [m]."""
+    """Highest step that any shape may have at any level [m], at least 0."""
     seed: int = 0
     """Seed of every tile, at least 0."""
 
@@ -65,14 +65,18 @@ class Grid:
         check_range("border", self.border, 0, 1e6)
         check_range("easiest", self.easiest, 0, 1)
         check_range("hardest", self.hardest, 0, 1)
+        if self.levels > 1 and self.hardest < self.easiest:  # robots that do well would be moved to easier tiles
+            raise ValueError(f"hardest must be at least easiest = {self.easiest:g}, got {self.hardest:g}.")
+        check_range("max_step", self.max_step, 0, np.inf)
         cells("tile", self.tile, self.cell)
         cells("border", self.border, self.cell)
         if not self.shapes:
             raise ValueError("shapes must have at least one entry.")
         for part in self.shapes:
             check_positive("share", part.share, finite=True)
+        levels = np.linspace(self.easiest, self.hardest, self.levels)
         for shape in self.column_shapes:
-            difficulty = max(self.easiest, self.hardest, key=shape.step)
+            difficulty = max(levels, key=shape.step)
             if shape.step(difficulty) > self.max_step + 1e-9:
                 raise ValueError(
                     f"max_step is {self.max_step:g} m, but {catalog.name_of(shape)} at difficulty {difficulty:g} has "
@@ -86,7 +90,7 @@ class Grid:
         # The small shift is Legged Gym's: sums of shares such as 0.1 + 0.2 are not what they seem.
         choice = np.arange(self.columns) / self.columns + 0.001
         which = np.minimum(np.searchsorted(ends / ends[-1], choice, side="right"), len(ends) - 1)
-        return tuple(replace(self.shapes[k].shape, tile=self.tile) for k in which)
+        return tuple(_on_tile(self.shapes[k].shape, self.tile) for k in which)
 
     @property
     def difficulty(self) -> np.ndarray:
@@ -117,6 +121,14 @@ class Grid:
         x = (level + 0.5 - self.levels / 2) * self.tile
         y = (column + 0.5 - self.columns / 2) * self.tile
         return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+def _on_tile(shape: TileShape, tile: float) -> TileShape:
+    """A shape on a tile of another side [m]; whose numbers do not fit on it is named."""
+    try:
+        return replace(shape, tile=tile)
+    except ValueError as error:
+        raise ValueError(f"{catalog.name_of(shape)}: {error}") from error
 
 
 def build(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> Terrain:

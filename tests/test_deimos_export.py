@@ -14,23 +14,20 @@ import onnxruntime
 import pytest
 import torch
 import yaml
-from deimos.terrain.shapes.stairs import Shape as Stairs
 from short_training import CONFIG
 
-from deimos import terrain
 from deimos.app import cli
 from deimos.app.export import check
-from deimos.checks import RunError
 from deimos.goals.methods import method
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import director
 from deimos.learn.policy import Policy
 from deimos.nn.layout import ObsField, seen_by
 from deimos.nn.networks import Actor
-from deimos.run import export, export_controller, export_robot, training
+from deimos.run import export, export_controller, training
 from deimos.run.export_onnx import IR_VERSION, OPSET, fear_model, policy_model
 from deimos.run.folder import RunFolder
-from deimos.sim.envs import quad, quad_arm
+from deimos.sim.envs import quad
 
 HOME = Path(__file__).resolve().parent.parent
 WALK = HOME / "docs" / "results" / "quad_flat"
@@ -148,6 +145,17 @@ def test_robots_walk_alone_as_they_did_at_the_export(walker, capfd):
     assert "It is what was exported." in said
 
 
+def test_a_check_finds_what_is_installed_for_its_user(tmp_path, monkeypatch, capsys):
+    """Packages that the export finds outside of the environment, the check finds too, and no module beside it."""
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages" / "own_package.py").write_text("WORD = 'found'")
+    (tmp_path / "json.py").write_text("raise RuntimeError")
+    (tmp_path / "controller.py").write_text("import json, own_package\nprint(own_package.WORD)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "packages"))
+    check(tmp_path)
+    assert capsys.readouterr().out == "found\n"
+
+
 def some_measurements(controller):
     """What robots measure that stand in their default position, under no goal."""
     return {
@@ -238,48 +246,6 @@ def test_unitrees_tools_find_their_order(walker):
     ]  # fmt: skip
 
 
-def test_a_model_that_would_be_rounded_is_refused(tmp_path, monkeypatch):
-    """With the six digits that MuJoCo writes by itself, the export fails instead of writing another robot."""
-    env = quad.Config(engine="native").for_evaluation().build(1, CPU, seed=0)
-    monkeypatch.setattr(export_robot, "_to_xml", lambda spec: spec.to_xml())
-    with pytest.raises(RunError, match=r"differs from this robot's in .*armature"):
-        export_robot.write_model(env, tmp_path)
-
-
-@pytest.fixture(scope="module")
-def stairs(tmp_path_factory):
-    """A file of steep stairs."""
-    path = tmp_path_factory.mktemp("ground") / "stairs.npz"
-    grid = terrain.Grid(
-        shapes=(terrain.Share(shape=Stairs()),), levels=1, columns=1, tile=6.0, border=2.0, hardest=0.7, easiest=0.7
-    )
-    terrain.build(grid).save(path)
-    return path
-
-
-def test_what_the_controller_measures_is_what_the_policy_saw(stairs, tmp_path):
-    """On stairs, heights, end effector and all else in MuJoCo alone are the environment's observation."""
-    env = quad_arm.Config(terrain=str(stairs), engine="native").for_evaluation().build(8, CPU, seed=3)
-    export_robot.write_model(env, tmp_path)
-    deploy = {"robot": export_robot.describe_robot(env)}
-    (tmp_path / "deploy.json").write_text(json.dumps(deploy))
-    action = torch.zeros(8, env.action_dim)
-    for _ in range(20):
-        env.step(action)
-    worlds = export_controller.Simulation(
-        tmp_path, env.tensors["qpos"].double().numpy(), env.tensors["qvel"].double().numpy()
-    )
-    scale = torch.cat([torch.as_tensor(field.scale).expand(field.size) for field in env.layout])
-    seen = (env.obs / scale).split([field.size for field in env.layout], dim=1)
-    known = {field.name: part.numpy() for field, part in zip(env.layout, seen, strict=True)}
-    measured = worlds.measure(known["goal"])
-    assert measured.keys() == known.keys() - {"last_action"}
-    assert np.ptp(measured["heights"]) > 0.1
-    for name, value in measured.items():
-        bound = export_robot.CLIPS.get(name, np.inf)
-        np.testing.assert_allclose(np.clip(value, -bound, bound), known[name], atol=2e-4, err_msg=name)
-
-
 def test_an_actor_without_what_a_robot_cannot_measure(tmp_path, capsys):
     """What the critic alone sees, the export does not ask for, and its robots move as they did in training."""
     budget = "--preset quad-walk --no-evaluation --num-envs 8 --env-steps 24 --threads 1 --device cpu --ppo.hidden 16"
@@ -302,7 +268,10 @@ def test_only_what_there_is_can_be_privileged():
 
 
 def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
-    """Other actions, one that is not a number, a robot that falls, and a file that was exchanged are found."""
+    """Other actions, one that is not a number, a robot that falls, and a file that was exchanged are found.
+
+    A robot that leaves the ground at once is no fault.
+    """
     folder = tmp_path / "changed"
     folder.mkdir()
     for path in walker.iterdir():
@@ -323,6 +292,10 @@ def test_a_check_that_fails_says_so(walker, tmp_path, capsys):
     np.savez(folder / "check.npz", **known | {"walk.qpos": start})
     assert not export_controller.main(folder)
     assert "1 fall, at the export 0" in capsys.readouterr().out
+    gone = {name: known[name].copy() for name in ("walk.steps", "walk.tracking")}
+    gone["walk.steps"][0] = gone["walk.tracking"][0] = 0  # one that left the ground on its first step
+    np.savez(folder / "check.npz", **known | gone)
+    assert export_controller.main(folder)
     (folder / "policy.onnx").write_bytes((walker / "policy.onnx").read_bytes() + b" ")
     with pytest.raises(ValueError, match=r"policy.onnx is not the file that deploy.json describes"):
         export_controller.main(folder)
@@ -387,6 +360,22 @@ def test_fear_that_is_no_probability_is_not_exported_as_one(tmp_path, capsys):
     assert [output.name for output in onnx.load(out / "fear.onnx").graph.output] == ["logit"]
     assert export_controller.main(out)
     assert "fear.onnx, batches of" in capsys.readouterr().out
+
+
+def test_a_folder_has_its_name_when_it_is_whole(particles, tmp_path, monkeypatch):
+    """As long as something is missing there is no folder of the name, and an interrupt leaves nothing."""
+    out = tmp_path / "out"
+
+    def interrupt(*arguments):
+        (unfinished,) = tmp_path.iterdir()
+        assert unfinished != out
+        assert (unfinished / "deploy.json").exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export, "_play", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        export.export_run(RunFolder.open(particles), out, check=True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsys):

@@ -3,6 +3,8 @@
 import json
 import logging
 import pickle
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from deimos.run.attack import uniform_goals
 from deimos.run.evaluation import EvalConfig, make_target
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.shield import Guard, collect, plain_rule, random_rule
+from deimos.run.shield import Guard, ShieldConfig, Trial, collect, plain_rule, random_rule
 from deimos.sim.envs import particle, quad_arm
 
 CPU = torch.device("cpu")
@@ -297,6 +299,16 @@ def test_the_shield_of_a_run(run, tmp_path, capsys):
     assert Shield.from_dict(deploy, mode="stop", guarantee="marginal").threshold == deploy["threshold"]["marginal"]
     assert Shield.from_dict(deploy).threshold == deploy["threshold"]["conditional"]
     assert (run / "shield.png").stat().st_size > 10_000
+
+
+def test_the_advice_on_worlds_is_enough():
+    """As many worlds as it says nearly always meet as many crashes as a threshold takes, and not twice as many."""
+    rate, config = 0.02, ShieldConfig(worlds=1000)
+    trial = SimpleNamespace(config=config, _crashes=range(10), _calibration=SimpleNamespace(score=range(500)))
+    worlds = re.search(r"calibrate in about ([\d,]+) worlds", Trial._too_few(trial, ValueError("")))[1]
+    half, need = int(worlds.replace(",", "")) // 2, crashes_needed(config.alpha, config.guarantee)
+    assert stats.binom.cdf(need - 1, half, rate) < 0.05
+    assert half * rate < 2 * need
 
 
 def test_what_cannot_be_shielded_is_refused_in_a_line(run, tmp_path, capsys):

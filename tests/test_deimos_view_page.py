@@ -7,13 +7,15 @@ import socket
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
 
 from benchmarks import viewer
 from deimos.app.view import simulate
-from deimos.app.viewer_panel import Panel
+from deimos.app.viewer_panel import Moment, Panel
 from deimos.app.viewer_scene import build_scene
 from deimos.app.viewer_session import BY_HAND, Session
 from deimos.app.viewer_web import check_port, serve
@@ -146,6 +148,21 @@ def test_what_a_person_does_reaches_the_worlds(particles):
     assert particles.goal == pytest.approx([1.0, 2.0, 3.0])
     assert particles.paused
     particles.paused = False
+
+
+def test_a_drag_beyond_the_map_stays_on_it(particles):
+    """A mouse that leaves the map with its button down asks for goals of the map's edge, not for any beyond."""
+    scene = build_scene(particles)
+    panel, imgui = Panel(scene), MagicMock()
+    imgui.GetCursorScreenPos.return_value = SimpleNamespace(x=100.0, y=100.0)
+    imgui.IsItemActive.return_value, imgui.Combo.return_value = True, (False, 0)
+    low, high = (bound.tolist() for bound in particles.bounds())
+    for x, y, place in ((9999.0, -9999.0, high[:2]), (-9999.0, 9999.0, low[:2])):
+        imgui.GetMousePos.return_value = SimpleNamespace(x=x, y=y)
+        panel._draw_map(imgui, Moment.of(particles, scene), MagicMock())
+        for command in panel.commands():
+            command(particles)
+        assert particles.goal[:2] == pytest.approx(place)
 
 
 def own_addresses():

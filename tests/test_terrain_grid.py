@@ -109,7 +109,7 @@ def test_missing_file_is_an_os_error(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"heights": np.zeros((41, 61))}, r"heights must be float32 of shape .*, got float64"),
+        ({"heights": np.zeros((41, 61))}, r"heights must be float32 of shape \(41, 61\), got float64"),
         (
             {"heights": np.zeros((1, 61), np.float32)},
             r"heights must have at least 2 x 2 samples, got the shape \(1, 61",

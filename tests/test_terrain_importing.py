@@ -12,7 +12,7 @@ from deimos.terrain import export, importing
 from deimos.terrain.importing import import_file
 from deimos.terrain.mesh import rings
 from deimos.terrain.world import build_with_mesh
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from deimos import terrain
 
@@ -109,6 +109,18 @@ def test_arguments_come_before_what_a_picture_says(tmp_path, ground):
     assert (found.heights.min(), found.heights.max()) == (0.0, 1.0)
     nx, ny = ground[0].heights.shape
     assert (found.cell, found.corner) == (0.1, pytest.approx((-(nx - 1) * 0.05, -(ny - 1) * 0.05)))
+
+
+def test_a_picture_of_ours_that_became_one_of_8_bits(tmp_path, ground):
+    """Where another program keeps the note and half of the bits, heights come back to half of the larger grey value."""
+    export.save(tmp_path / "a.png", *ground)
+    with Image.open(tmp_path / "a.png") as image:
+        note, grey = PngImagePlugin.PngInfo(), np.asarray(image)
+        note.add_text("Description", image.info["Description"])
+    Image.fromarray(np.rint(grey / 257).astype(np.uint8)).save(tmp_path / "b.png", pnginfo=note)
+    found, heights = import_file(tmp_path / "b.png"), ground[0].heights
+    assert found.corner == ground[0].corner
+    np.testing.assert_allclose(found.heights, heights, rtol=0, atol=0.51 * np.ptp(heights) / 255)
 
 
 def test_tiles_are_laid_around_the_middle(tmp_path):

@@ -1,5 +1,6 @@
 """Pictures of terrains: colours are heights, lengths are to scale, and what is in front hides what is behind."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -76,6 +77,52 @@ def test_beside_the_ground_is_white():
         np.testing.assert_array_equal(picture[row, column], 1.0)
     cut = np.isclose(picture, preview.WALL).all(axis=-1)
     np.testing.assert_allclose(cut.sum(axis=0)[5:-5], 0.01 * 10 * math.sqrt(0.5) / STEP, atol=1.5)
+
+
+@pytest.mark.parametrize("height", [-30.0, 500.0])
+def test_ground_may_be_at_any_height(height):
+    """Far above 0, as surveys are, and below it, ground is drawn in full, and above a cut as low as elsewhere."""
+    ground = wall(1.0)
+    ground.heights[:] += np.float32(height)
+    colours = ScalarMappable(Normalize(height - 1.0, height + 2.0), "YlGnBu_r")
+    angles = math.radians(30.0), math.pi / 4
+    picture, expected = (preview._draw(*each, STEP, *angles)[0] for each in ((ground, colours), (wall(1.0), COLOURS)))
+    assert picture.shape == pytest.approx(expected.shape, abs=1)
+    for each in (preview.WALL, 1.0):
+        counts = [np.isclose(seen, each).all(axis=-1).sum(axis=0) for seen in (picture, expected)]
+        np.testing.assert_allclose(*counts, rtol=0, atol=2)
+
+
+def test_ground_whose_near_edge_is_below_0_is_drawn():
+    """A slope that begins below 0 and ends above it is seen from its near edge on, and the cut is below that."""
+    ground = wall(0.0)
+    ground.heights[:] = np.linspace(-2.0, 2.0, 161, dtype=np.float32)
+    picture, _ = preview._draw(ground, COLOURS, STEP, 0.0, math.pi / 4)
+    column, s = picture[:, 100], math.sqrt(0.5)
+    cut = np.isclose(column, preview.WALL).all(axis=-1)
+    assert np.count_nonzero(cut) == pytest.approx(0.01 * 10 * s / STEP, abs=2)
+    assert np.count_nonzero(~cut) == pytest.approx((8 + 4) * s / STEP, abs=3)
+
+
+def test_ground_that_is_too_high_is_not_drawn(tmp_path):
+    """Heights in a wrong unit would make a picture of gigabytes: they are named."""
+    with pytest.raises(ValueError, match=r"at most 10 times .* ground, 10 m, got 101 m; are they in metres\?"):
+        preview.save_preview(tmp_path / "x.png", wall(101.0), "wall")
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_ground_may_be_a_narrow_track(tmp_path, turned):
+    """A track a thousand times as long as it is wide is drawn, and one that no pixel would show is named."""
+    for length, is_drawn in ((3999, True), (4003, False)):
+        heights = np.zeros((5, length + 1), np.float32)
+        ground = dataclasses.replace(wall(0.0), heights=heights.T if turned else heights, corner=(0.0, 0.0))
+        path = tmp_path / f"{length}.png"
+        if is_drawn:
+            preview.save_preview(path, ground, "track")
+            assert path.exists()
+        else:
+            with pytest.raises(ValueError, match=r"at most 1000 times the shorter one, 0.2 m, got 200.15 m"):
+                preview.save_preview(path, ground, "track")
 
 
 def test_large_grids_are_thinned():

@@ -251,6 +251,9 @@ def test_every_number_is_checked(name):
         ("waves", {"spacing": 0.5}, r"spacing must be in \[0.01, 0.25\], got 0.5"),
         ("discrete", {"sides": (2.0, 9.0)}, r"sides must rise, from above 0 to at most 7.2 m"),
         ("rough-slope-up", {"room": 4.0}, r"room must be at most platform = 3 m, got 4 m"),
+        ("stairs-up", {"tile": 3.0}, r"stairs-up: tile must be at least platform \+ 2 tread = 3.2 m, got 3 m"),
+        ("stairs-down", {"tread": 3.0}, r"tile must be at least platform \+ 2 tread = 8.6 m, got 8 m"),
+        ("waves", {"fade": 3.5}, r"tile must be larger than platform \+ 2 fade = 8 m, got 8 m"),
         ("stepping-stones", {"rim": 3.0}, r"tile must be larger than platform \+ 2 rim \+ 4 gap"),
     ],
 )

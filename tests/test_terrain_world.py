@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from deimos.terrain import catalog, presets, world
-from deimos.terrain.mesh import highest_riser, steepest_slope
+from deimos.terrain.mesh import highest_riser, rings, steepest_slope
+from deimos.terrain.shape import TileShape
 
 from deimos import terrain
 
@@ -145,9 +146,11 @@ def test_progress_counts_tiles_and_rays():
     [
         ({"cell": 0.3}, r"cell must divide tile = 8 m, got 0.3 m; 0.296296 m would do"),
         ({"border": 0.25}, r"cell must divide border = 0.25 m, got 0.1 m"),
-        ({"tile": 3.0}, r"platform must be smaller than tile = 3 m, got 3 m"),
+        ({"tile": 3.0}, r"discrete: platform must be smaller than tile = 3 m, got 3 m"),
+        ({"max_step": float("nan")}, r"max_step must be in \[0, inf\], got nan"),
         ({"hardest": 1.1}, r"hardest must be in \[0, 1\], got 1.1"),
         ({"easiest": -0.1}, r"easiest must be in \[0, 1\], got -0.1"),
+        ({"easiest": 0.9, "hardest": 0.1}, r"hardest must be at least easiest = 0.9, got 0.1"),
         ({"levels": 0}, r"levels must be at least 1, got 0"),
         ({"columns": 1.5}, r"columns must be a whole number, got 1.5"),
         ({"seed": -1}, r"seed must be at least 0, got -1"),
@@ -170,6 +173,29 @@ def test_refuses_with_a_reason(changes, message):
     """A grid whose numbers do not fit together is refused before anything is built, with the way out."""
     with pytest.raises(ValueError, match=message):
         small(**changes)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Hump(TileShape):
+    """A block that is highest at difficulty 0.5."""
+
+    def step(self, difficulty):
+        """See ``TileShape.step``."""
+        return difficulty * (1.0 - difficulty)
+
+    def surface(self, difficulty, generator):
+        """See ``TileShape.surface``."""
+        return rings(np.array([self.tile, self.platform]) / 2, np.array([0.0, self.step(difficulty)]))
+
+
+@pytest.mark.parametrize(("levels", "hardest", "most"), [(1, 0.5, 0.0), (2, 1.0, 0.0), (3, 1.0, 0.25)])
+def test_steps_are_those_of_the_levels_that_there_are(levels, hardest, most):
+    """The highest step is looked for among all levels, and at no difficulty that none has."""
+    hump = (world.Share(shape=Hump()),)
+    assert small(shapes=hump, levels=levels, hardest=hardest, max_step=most).max_step == most
+    if most:
+        with pytest.raises(ValueError, match=r"at difficulty 0\.5 has steps of 0\.25 m"):
+            small(shapes=hump, levels=levels, hardest=hardest, max_step=0.99 * most)
 
 
 def test_grid_that_does_not_fit_is_refused(monkeypatch):
@@ -270,6 +296,7 @@ def test_toml_file_may_build_on_a_preset(tmp_path):
     path.write_text('preset = "go1"\n[[shape]]\nname = "flat"\n')
     flat = (world.Share(shape=catalog.make("flat")),)
     assert presets.read_grid(path) == dataclasses.replace(terrain.preset("go1"), shapes=flat)
+    assert presets.read_grid(path) == terrain.preset("go1", shapes=flat)
 
 
 def test_dropped_in_file_is_a_preset(tmp_path, monkeypatch):

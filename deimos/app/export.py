@@ -53,8 +53,9 @@ def check(folder: Path) -> None:
         RunError: If it does not do what was exported.
     """
     sys.stdout.flush()
+    # Not -I: what is installed for this user alone, or found by PYTHONPATH, is there for the check too.
     done = subprocess.run(
-        [sys.executable, "-I", folder / "controller.py"], check=False, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-P", folder / "controller.py"], check=False, stdout=subprocess.PIPE, text=True
     )
     print(done.stdout, end="")
     if done.returncode:

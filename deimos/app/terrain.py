@@ -69,7 +69,7 @@ class GridOptions(Outputs):
     seed: int | None = None
     """Seed of all tiles, at least 0."""
     difficulty: tuple[float, float] | None = None
-    """Difficulty of the first level and of the last, each in [0, 1]."""
+    """Difficulty of the first level and of the last, each in [0, 1]; a single level has the first."""
     levels: int | None = None
     """Tiles along x, at least 1."""
     columns: int | None = None
@@ -77,7 +77,7 @@ class GridOptions(Outputs):
     tile: float | None = None
     """Side of a tile [m]."""
     border: float | None = None
-    """Width of the flat border [m], at least 0."""
+    """Width of the flat border [m], at least 0; with --shapes 1 by default."""
     cell: float | None = None
     """Distance between two samples of the height grid [m]; must divide tile and border. Robots need at least 0.05 m."""
     max_step: float | None = None

@@ -230,8 +230,8 @@ class Panel:
             lists.AddCircle(middle, radius, imgui.ColorConvertFloat4ToU32(imgui.Vec4(*colour)), 0, 2.5)
         if imgui.IsItemActive():
             mouse, goal = imgui.GetMousePos(), list(shown.goal)
-            goal[fear.axes[0]] = low[0] + size[0] * (mouse.x - corner.x) / MAP
-            goal[fear.axes[1]] = low[1] + size[1] * (1.0 - (mouse.y - corner.y) / MAP)
+            place = fear.at((mouse.x - corner.x) / MAP, 1.0 - (mouse.y - corner.y) / MAP)
+            goal[fear.axes[0]], goal[fear.axes[1]] = place
             self.ask(lambda session: session.ask(goal))
         first, second = (shown.components[axis].label for axis in fear.axes)
         least, most = float(fear.probability.min()), float(fear.probability.max())

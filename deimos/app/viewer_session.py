@@ -48,6 +48,15 @@ class FearMap:
     """In (0, 1), float32, shape (SIDE, SIDE): the second component grows along the first axis, the first along the
     second; both ends are included."""
 
+    def at(self, right: float, up: float) -> tuple[float, float]:
+        """The two components at a place: how far right and up it is, as shares of the sides; 0 and 1 are the ends.
+
+        What is beyond the map has those of its edge: who drags the mouse that far asks for no goal that is not on it.
+        """
+        shares = zip(self.low, self.high, (right, up), strict=True)
+        first, second = (low + (high - low) * min(max(share, 0.0), 1.0) for low, high, share in shares)
+        return first, second
+
 
 class Steered(GoalSelector):
     """Whoever of some selectors is asked for at the moment, or a person's own goal.

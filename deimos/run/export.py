@@ -7,6 +7,8 @@ in the shape of Unitree's tools. No number is rounded.
 
 import hashlib
 import json
+import os
+import secrets
 import shutil
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +19,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import RunError
-from deimos.files import write_whole
+from deimos.files import PARTIAL, write_whole
 from deimos.goals.fear_selector import FearSelector
 from deimos.learn.policy import Policy
 from deimos.nn.layout import ObsField, goal_components
@@ -54,23 +56,24 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
     Raises:
         RunError: If ``out`` exists, the run is broken, or something cannot be written.
     """
+    if os.path.lexists(out):
+        raise RunError(f"{out} exists and is not overwritten; choose another folder.")
     run, steps = SavedRun.open(folder.path), STEPS
     if isinstance(run.config.env, LocomotionConfig):
         steps = round(SECONDS / run.config.env.physics.control_period)
     env = SavedRun.open(folder.path, goal_period=steps).build(ROBOTS, run.config.eval.seed, 0)
     policy, afraid = run.policy(env), run.fear(env)
+    # Half a folder would be taken for a whole one: it gets its name when it is whole, so that a kill leaves none.
+    unfinished = out.with_name(f"{out.name}.{secrets.token_hex(4)}{PARTIAL}")
     try:
-        out.mkdir(parents=True)
-    except FileExistsError as error:
-        raise RunError(f"{out} exists and is not overwritten; choose another folder.") from error
-    try:
-        _write(folder, run.config, policy, env, afraid, out)
+        unfinished.mkdir(parents=True)
+        _write(folder, run.config, policy, env, afraid, unfinished)
         if check:
             facts = _play(env, policy, afraid, steps)
-            write_whole(out / "check.npz", lambda file: np.savez(file, **facts))  # type: ignore[arg-type]
-    except BaseException:
-        shutil.rmtree(out, ignore_errors=True)  # half a folder would be taken for a whole one
-        raise
+            write_whole(unfinished / "check.npz", lambda file: np.savez(file, **facts))  # type: ignore[arg-type]
+        unfinished.rename(out)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _write(

@@ -292,7 +292,7 @@ def compare_walks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -> b
         fell |= worlds.step(controller.targets(measured)) & (t < steps)
         measured = worlds.measure(goal)
         met += track(measured, deploy["robot"]["tracking_variance"]) * (~fell & (t < steps))[:, None]
-    here, there = (met / steps[:, None]).mean(0), known["walk.tracking"].mean(0)
+    here, there = (met / np.maximum(steps, 1)[:, None]).mean(0), known["walk.tracking"].mean(0)
     seconds = steps.max() * deploy["control_period"]
     print(f"{len(goal)} robots walk {seconds:g} s: {fell.sum()} fall, at the export {fell_there.sum()}")
     for group, mine, theirs in zip(deploy["goal"]["groups"], here, there, strict=True):

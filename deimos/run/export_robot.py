@@ -1,6 +1,7 @@
 """What a deployment needs of a legged robot beside its policy: the model, its numbers, and how it walked here."""
 
 import ctypes
+import itertools
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -50,6 +51,8 @@ def write_model(env: Locomotion, folder: Path) -> None:
     import mujoco
 
     spec = build_spec(env.robot, env.physics.terrain, env.config.physics, visual=True)
+    for foot in itertools.chain.from_iterable(env.robot.parts[1:5]):
+        spec.geom(foot).friction[0] = env.config.friction[0]  # worlds without randomness have one, not the robot's own
     wanted = spec.compile()
     for field in spec.hfields:  # in the XML itself it would be some fifty megabytes
         data = np.asarray(field.userdata, np.float32)
@@ -60,9 +63,10 @@ def write_model(env: Locomotion, folder: Path) -> None:
     path = folder / "robot.xml"
     path.write_text(_to_xml(spec), encoding="utf-8")
     found = mujoco.MjModel.from_xml_path(str(path))
-    if different := [name for name in _numbers(wanted) if not _same(wanted, found, name)]:
+    there, here = _numbers(found), _numbers(wanted)
+    if different := [name for name in here if not np.array_equal(here[name], there[name])]:
         raise RunError(
-            f"MuJoCo {mujoco.__version__} writes a model to {path} that differs from this robot's in "
+            f"MuJoCo {mujoco.__version__} writes a model that differs from this robot's in "
             f"{', '.join(different)}; export with MuJoCo 4.0."
         )
 
@@ -85,18 +89,20 @@ def _to_xml(spec: "mujoco.MjSpec") -> str:
         change(before)
 
 
-def _numbers(model: "mujoco.MjModel") -> list[str]:
-    """Names of a model's arrays that physics depends on: all but looks and where texts are."""
+def _numbers(model: "mujoco.MjModel") -> dict[str, np.ndarray]:
+    """A model's arrays that physics depends on, by name: all but looks and where texts are.
+
+    Looks are visual geoms too: MuJoCo keeps meshes about their own middle, and writes the last bit of where that leaves
+    their geoms otherwise.
+    """
     looks = ("vis", "mat_", "tex_", "light_", "cam_", "geom_rgba", "site_rgba", "name", "paths", "text_")
-    return [
-        name for name in dir(model)
+    arrays = {
+        name: getattr(model, name) for name in dir(model)
         if not name.startswith(("_", *looks)) and not name.endswith("pathadr")
         and isinstance(getattr(model, name), np.ndarray)
-    ]  # fmt: skip
-
-
-def _same(one: "mujoco.MjModel", other: "mujoco.MjModel", name: str) -> bool:
-    return np.array_equal(getattr(one, name), getattr(other, name))
+    }  # fmt: skip
+    hard = (model.geom_contype | model.geom_conaffinity) != 0
+    return {name: array[hard] if name.startswith("geom_") else array for name, array in arrays.items()}
 
 
 def describe_robot(env: Locomotion) -> dict[str, Any]:

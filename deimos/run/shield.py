@@ -1,5 +1,6 @@
 """A run's shield: calibrated on fresh worlds, then tried under Naive and under attackers that learn about it."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -247,7 +248,8 @@ class Trial:
     def _too_few(self, error: ValueError) -> str:
         """What to do about too few crashes."""
         need, there = crashes_needed(self.config.alpha, self.config.guarantee), len(self._crashes)
-        worlds = f"about {2 * need * self.config.worlds // (2 * there):,}" if there else "many more"
+        enough = need + 2.0 * math.sqrt(need)  # on average: two standard deviations less are as many as it takes
+        worlds = f"about {round(enough / there * self.config.worlds):,}" if there else "many more"
         return (
             f"{error} In {len(self._calibration.score):,} goals, of half the worlds; calibrate in {worlds} worlds "
             "(--worlds), or with a larger --alpha."

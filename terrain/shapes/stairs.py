@@ -25,7 +25,18 @@ class Shape(TileShape):
     height: Ramp = (0.05, 0.23)
     """Height of a step at difficulty 0 and at 1 [m], each at least 0; Legged Gym's 0.05 + 0.18 d."""
     tread: float = 0.3
-    """Depth of a step [m], positive."""
+    """Depth of a step [m], positive; at least one fits between edge and platform."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self._count < 1:
+            room = self.platform + 2 * self.tread
+            raise ValueError(f"tile must be at least platform + 2 tread = {room:g} m, got {self.tile:g} m.")
+
+    @property
+    def _count(self) -> int:
+        """Steps from the edge to the middle."""
+        return math.floor((self.tile - self.platform) / (2 * self.tread) + 1e-9)
 
     def step(self, difficulty: float) -> float:
         """Height of every step [m]."""
@@ -33,7 +44,6 @@ class Shape(TileShape):
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
-        count = math.floor((self.tile - self.platform) / (2 * self.tread) + 1e-9)
-        k = np.arange(count + 1)
+        k = np.arange(self._count + 1)
         rise = k * self.step(difficulty)
         return rings(self.tile / 2 - k * self.tread, -rise if self.direction == "up" else rise)

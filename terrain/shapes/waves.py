@@ -29,6 +29,7 @@ class Shape(TileShape):
         super().__post_init__()
         check_at_least("count", self.count, 1)
         check_range("spacing", self.spacing, 0.01, self.tile / self.count / 8)
+        self.check_room("platform + 2 fade", self.platform + 2 * self.fade)
 
     def step(self, difficulty: float) -> float:
         """None: no face is vertical."""
