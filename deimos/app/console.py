@@ -79,7 +79,7 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
     registry.struct_rule(rule)
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(ImportError):  # then tyro's own, framed words stay, with exit code 2
-            from tyro._errors import on_parse_error  # since 1.0.17, and not promised
+            from tyro._errors import on_parse_error  # since 1.0.16, and not promised
 
             stack.enter_context(on_parse_error(_refuse))
         if is_help:
