@@ -300,7 +300,7 @@ def most_headroom(settings: Sequence[Setting]) -> Setting | None:
 
 @dataclass(frozen=True)
 class Contrast:
-    """The best new selector beside another method, in confirmation."""
+    """The best new selector compared with another method, in confirmation."""
 
     rival: str
     """The other one."""
@@ -317,7 +317,7 @@ class Contrast:
 
     @property
     def is_winner(self) -> bool:
-        """Whether the aims of the plan are met beside Uniform: beyond chance, and in the estimates."""
+        """Whether the aims of the plan are met against Uniform: beyond chance, and in the estimates."""
         return (
             self.p <= 0.05 and self.ratio.estimate >= AIM
             and self.score.estimate >= AIM_SCORE and self.score.low > LEAST_SCORE
@@ -325,7 +325,7 @@ class Contrast:
 
 
 def contrasts(data: Data, environment: str, new: str) -> list[Contrast]:
-    """The new selector beside every other method of a confirmation that has enough policies."""
+    """The new selector compared with every other method of a confirmation that has enough policies."""
     found = {name: [row for row in data.rows if (row["environment"], row["method"], row["goals"]) ==
                     (environment, name, "naive")] for name in data.methods(environment)}  # fmt: skip
     worst, score = (

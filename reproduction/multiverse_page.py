@@ -52,7 +52,8 @@ def write(options: MultiverseOptions) -> Path:
     """Write the page; returns the path of its HTML. Raises ``RunError`` if results are missing or do not fit."""
     settings = multiverse.read(options.screening, options.map)
     (options.out / FIGURES).mkdir(parents=True, exist_ok=True)
-    blocks: list[Block] = ["# The map", *_screened(settings)]
+    studies = [each for each in (options.screening, options.map, *options.confirmations) if each is not None]
+    blocks: list[Block] = ["# The map", _ran_from(studies), *_screened(settings)]
     if options.map is not None:
         Roles.of(settings)  # is it a map?
         new = multiverse.best_new(multiverse.standings(settings))
@@ -66,6 +67,12 @@ def write(options: MultiverseOptions) -> Path:
     ):  # fmt: skip
         write_bytes(options.out / name, text.encode())
     return options.out / "multiverse.html"
+
+
+def _ran_from(studies: Sequence[Path]) -> str:
+    """Where the plan is, and the code that the rows come from."""
+    codes = sorted({row["code"] for folder in studies for row in Data.read(folder).rows})
+    return f"Plan, committed before the first cell: reproduction/multiverse.md. Code of all rows: {', '.join(codes)}."
 
 
 def _screened(settings: Sequence[Setting]) -> list[Block]:
@@ -176,7 +183,7 @@ def _why(settings: Sequence[Setting], new: str) -> str:
 
 
 def _confirmed(data: Data, new: str) -> list[Block]:
-    """Means of the methods of a confirmation, and the best new selector beside each of the others."""
+    """Means of the methods of a confirmation, and the best new selector compared with each of the others."""
     blocks: list[Block] = []
     for environment in data.environments:
         own = [row for row in data.rows if (row["environment"], row["goals"]) == (environment, "naive")]
@@ -191,8 +198,9 @@ def _confirmed(data: Data, new: str) -> list[Block]:
             })  # fmt: skip
         found = multiverse.contrasts(data, environment, new)
         lines = [
-            {"beside": each.rival, "n": f"{each.n[0]} + {each.n[1]}", "attacked rate lower by": f"{each.lower:.4f}",
-             "its rate / the new one's": f"{each.ratio:.2f}", "score / its": f"{each.score:.3f}", "p": f"{each.p:.3g}"}
+            {f"{new} compared with": each.rival, "n": f"{each.n[0]} + {each.n[1]}",
+             "attacked rate lower by": f"{each.lower:.4f}", "rival's rate / its rate": f"{each.ratio:.2f}",
+             "its score / rival's": f"{each.score:.3f}", "p": f"{each.p:.3g}"}
             for each in found
         ]  # fmt: skip
         blocks += [f"## Confirmation: {environment}", rows]
@@ -200,7 +208,7 @@ def _confirmed(data: Data, new: str) -> list[Block]:
             blocks.append(f"There are too few policies of {new}, or of others, for a contrast.")
             continue
         blocks += [
-            f"{new} beside the others. Intervals are at {100 * multiverse.CONFIDENCE:.1f} %, p-values Holm's over the "
+            f"Intervals are at {100 * multiverse.CONFIDENCE:.1f} %; p-values are one-sided, by Holm's rule over the "
             f"rivals, times the {len(NEW)} selectors that were tried.", lines,
         ]  # fmt: skip
         blocks += _winner(found, new) if environment == OURS else []

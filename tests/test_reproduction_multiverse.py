@@ -444,7 +444,8 @@ def test_page_says_as_much_as_has_run(folders, tmp_path, capsys):
     assert "The best new selector is q-fear" in text
     assert "| p75 crashes less than uniform | " in text
     assert "Missing cells" not in text
-    assert text.count("q-fear beside the others") == 2
+    assert text.count("| q-fear compared with |") == 2
+    assert "Code of all rows: v." in text
     assert text.split("## Confirmation")[1].count("q-fear is a winner here") == text.count("winner") == 1
     pictures = {path.stem for path in (out / "figures").glob("*.png")}
     assert pictures == {*(f"curve-{name}" for name in METHODS if name != "uniform"), "headroom", "shares", "factors"}
