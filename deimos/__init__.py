@@ -16,6 +16,7 @@ _OFFERED = {
     "check_env": "deimos.sim.check_env",
     "evaluate": "deimos.run.api",
     "load_policy": "deimos.learn.policy",
+    "preset": "deimos.run.presets",
     "train": "deimos.run.api",
 }
 """What the package offers, and the module that holds it."""

@@ -19,20 +19,18 @@ import sys
 import tempfile
 import textwrap
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from decimal import Decimal
 from types import MappingProxyType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from deimos.checks import RunError
+from deimos.run.progress import number as number  # commands call them as they call the rest
+from deimos.run.progress import progress as progress
 
 Command = Callable[[list[str], str], None]
 """Runs on its arguments, under the name that a person calls it by, such as ``deimos study run``."""
 
 LEAST_WIDTH = 60  # columns of a terminal that help is wrapped at
-# From line to line where progress cannot be shown in place: seconds at least, and a share of what has passed.
-PLAIN_SECONDS, PLAIN_SHARE = 20.0, 0.05
 
 
 def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments: list[str], program: str) -> None:
@@ -238,27 +236,6 @@ def _refuse(event: Any) -> None:
 
 
 @contextlib.contextmanager
-def progress(title: str) -> Iterator[Callable[[str, float], None]]:
-    """Show how far something is: gives the function that reports (what is done, fraction of the whole that is done).
-
-    On a terminal a bar; elsewhere, such as in the log of a job, a plain line now and then, more seldom in a long job.
-    """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    screen = Console(stderr=True)
-    if not screen.is_terminal:
-        yield _plain_progress(title)
-        return
-    text = TextColumn(title + ": {task.description}", markup=False)
-    with Progress(
-        text, BarColumn(bar_width=12), TaskProgressColumn(), TimeRemainingColumn(), console=screen, transient=True
-    ) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
-
-
-@contextlib.contextmanager
 def log_shown() -> Iterator[None]:
     """Show what Deimos logs, such as why goals are uniform yet: a line each on stderr, above a progress bar."""
     logger, handler = logging.getLogger("deimos"), logging.StreamHandler()
@@ -272,19 +249,6 @@ def log_shown() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def _plain_progress(title: str) -> Callable[[str, float], None]:
-    begin = last = time.monotonic()
-
-    def report(stage: str, fraction: float) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= max(PLAIN_SECONDS, PLAIN_SHARE * (last - begin)):
-            last = now
-            print(f"{title}: {stage}, {fraction:.0%}", file=sys.stderr, flush=True)
-
-    return report
-
-
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Lines of a table, labels to the left and values to the right; as wide as it must be, on any terminal."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
@@ -293,16 +257,6 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         aligned = [value.rjust(width) for value, width in zip(values, widths[1:], strict=True)]
         lines.append("  ".join([label.ljust(widths[0]), *aligned]).rstrip())
     return "\n".join(lines)
-
-
-def number(value: float, digits: int = 3) -> str:
-    """A number with as many significant digits, in full: never in powers of ten, and 0 for nothing but zero."""
-    value += 0.0  # no -0
-    if 0 < abs(value) < 1e-6:
-        return "< 0.000001" if value > 0 else "> -0.000001"
-    if abs(value) >= 10.0**digits:
-        return f"{value:,.0f}"
-    return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
 class Stopped(KeyboardInterrupt):

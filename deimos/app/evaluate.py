@@ -1,6 +1,6 @@
 """``deimos evaluate``: the policy of a run under Naive and attackers, or its fear network against what happened."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +13,6 @@ from deimos.app.findings import describe, known
 from deimos.checks import check_at_least
 from deimos.nn.threads import torch_on_one
 from deimos.run import api, audit, training
-from deimos.run.attack import require_heard
 from deimos.run.config import kind
 from deimos.run.evaluation import EvalConfig, elsewhere, evaluate_run
 from deimos.run.folder import RunFolder
@@ -22,6 +21,7 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
 _CHANGES = ("worlds", "steps", "seed", "attackers", "pool", "oracle_worlds")
+_OTHERS = ("goal_period", "engine", "iteration")
 _AUDITS = ("contexts", "calibration")
 _AUDIT = (
     ("AUROC within contexts (0.5: chance, 1: perfect)", "auroc"),
@@ -33,15 +33,6 @@ _AUDIT = (
     ("after iteration", "iteration"),
 )
 _QUALITIES = {"auroc": "AUROC (0.5: chance, 1: perfect)", "brier": "Brier score", "ece": "expected calibration error"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Elsewhere:
-    """What the policy is evaluated in, where that is not what it was trained in."""
-
-    engine: Literal["warp", "native"] | None = None
-    """What simulates legged robots. By default as in training; the other one shows how the policy does in another
-    simulator, compared with its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +52,14 @@ class EvaluateOptions:
     device: str = "auto"
     """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
     attackers: tuple[str, ...] | None = None
-    """Attackers in addition to those that the run was set up with, by name: argmax-long, oracle, ..."""
+    """Who attacks the policy, by name: argmax-long, oracle, ... By default as the run was set up."""
     pool: Path | None = None
     """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
-    env: Elsewhere = field(default_factory=Elsewhere)
-    """What the policy is evaluated in."""
+    engine: Literal["warp", "native"] | None = None
+    """What simulates legged robots. By default as in training; the other one shows how the policy does in another
+    simulator, compared with its own."""
+    iteration: int | None = None
+    """The policy that --save-every has kept after this iteration of the training. By default the last one."""
     oracle_worlds: int | None = None
     """Worlds that meet the attacker oracle, which tries goals in clones. By default as the run was set up."""
     calibration: int = 0
@@ -79,8 +73,7 @@ class EvaluateOptions:
         for name in _AUDITS:
             check_at_least(name, getattr(self, name), 0)
         asked = [name for name in _AUDITS if getattr(self, name)]
-        others = [name for name in (*_CHANGES, "goal_period") if getattr(self, name) is not None] + asked[1:]
-        others += ["env.engine"] if self.env.engine else []
+        others = [name for name in (*_CHANGES, *_OTHERS) if getattr(self, name) is not None] + asked[1:]
         if asked and others:
             raise ValueError(
                 f"{asked[0]} evaluates the fear network of the run as it was trained and cannot be combined with "
@@ -103,11 +96,9 @@ def main(arguments: list[str], program: str) -> None:
                 _evaluate_fear(trainer, folder, options)
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
-    changes["attackers"] = tuple(dict.fromkeys((*config.eval.attackers, *changes.get("attackers", ()))))
-    env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes, options.env.engine)
-    require_heard(eval_config.attackers, options.pool, options.oracle_worlds)
+    env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes, options.engine)
     with one_stream(device):
-        show_evaluation(folder, config, env_config, eval_config, device)
+        show_evaluation(folder, config, env_config, eval_config, device, options.iteration)
     print(folder.path)
 
 
@@ -118,13 +109,17 @@ def title(config: TrainConfig) -> str:
 
 
 def show_evaluation(
-    folder: RunFolder, config: TrainConfig, env_config: EnvConfig, eval_config: EvalConfig, device: torch.device
-) -> None:
-    """Evaluate the policy of a run, whose configuration is ``config``; draw the summary and print what was found."""
+    folder: RunFolder, config: TrainConfig, env_config: EnvConfig, eval_config: EvalConfig, device: torch.device,
+    iteration: int | None = None,
+) -> None:  # fmt: skip
+    """Evaluate the policy of a run, whose configuration is ``config``; draw the summary and print what was found.
+
+    The summary is that of the last policy; for one that was kept after an ``iteration`` it stays as it is.
+    """
     with console.progress("evaluating") as report:
-        rows = evaluate_run(folder, env_config, eval_config, device, report)
-    # Before anything is printed: whoever reads it may be gone.
-    figures.draw_summary(folder, title(config), rows[0]["weights"])
+        rows = evaluate_run(folder, env_config, eval_config, device, report, iteration=iteration)
+    if iteration is None:  # before anything is printed: whoever reads it may be gone
+        figures.draw_summary(folder, title(config), rows[0]["weights"])
     print(describe(rows, elsewhere(folder, rows)))
 
 

@@ -41,6 +41,8 @@ class PlayOptions:
     """Width of a picture [pixels], in [16, 8192]."""
     height: int = 480
     """Height of a picture [pixels], in [16, 8192]."""
+    iteration: int | None = None
+    """The policy that --save-every has kept after this iteration of the training. By default the last one."""
     world: int = 0
     """Global number of the world, at least 0: where it stands, and which goals it gets."""
     goal_period: int | None = None
@@ -77,7 +79,8 @@ def main(arguments: list[str], program: str) -> None:
     if run.has_robots:
         load_renderer()
     env = run.build(1, options.seed, options.world)
-    _render(env, run.policy(env), run.fear(env), options)
+    fear = run.fear(env) if options.iteration is None else None  # that of an earlier policy is gone
+    _render(env, run.policy(env, options.iteration), fear, options)
     print(options.target)
 
 

@@ -3,7 +3,7 @@
 import contextlib
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union
@@ -21,6 +21,7 @@ from deimos.run import presets, training
 from deimos.run.branch import branch_config
 from deimos.run.evaluation import weights_hash
 from deimos.run.folder import RunFolder
+from deimos.run.progress import training_progress
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
 from deimos.sim.graphs import Mode
@@ -103,9 +104,9 @@ def _run(device: str, begin: Callable[[], tuple[Trainer, RunFolder]]) -> None:
 def _fit(trainer: Trainer, folder: RunFolder) -> None:
     """Train; a signal to one of the processes stops all of them after the same iteration."""
     first = ranks.place().first
-    progress = _training_progress(trainer) if first else contextlib.nullcontext(lambda row, fps: None)
+    shown = console.log_shown() if first else contextlib.nullcontext()
     with console.stop_on_interrupt() as stopped:
-        with progress as report:
+        with training_progress(trainer.config.iterations, first) as report, shown:
             finished = training.train(trainer, folder, report, lambda: bool(stopped()))
         (number,) = ranks.largest(stopped())
         if not finished or number:
@@ -127,18 +128,6 @@ def _finish(trainer: Trainer, folder: RunFolder) -> None:
     else:
         figures.draw_summary(folder, title(config), weights_hash(load_policy(folder.path).actor))
     print(folder.path)
-
-
-@contextlib.contextmanager
-def _training_progress(trainer: Trainer) -> Iterator[Callable[[dict[str, float], float], None]]:
-    """Frames per second, reward and crashes per 1000 transitions, short enough for 80 columns."""
-    total = trainer.config.iterations
-    with console.progress("training") as report, console.log_shown():
-        yield lambda row, fps: report(
-            f"{fps:,.0f} FPS, reward {console.number(row['reward'])}, "
-            f"crashes/1000 {console.number(row['crashes_per_1000'])}",
-            row["iteration"] / total,
-        )
 
 
 def _train_options() -> type:

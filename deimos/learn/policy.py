@@ -77,7 +77,7 @@ def load_policy(path: Path | str, device: str = "cpu") -> Policy:
     """Read a policy.
 
     Args:
-        path: A ``policy.pt``, or the run folder that holds one.
+        path: A ``policy.pt`` or one of ``policies``, or the run folder that holds the former.
         device: Where it shall act, one of torch's.
 
     Raises:

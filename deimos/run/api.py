@@ -1,7 +1,10 @@
 """Training and evaluation as two functions, for programs."""
 
+import warnings
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +13,30 @@ import torch
 from deimos.checks import RunError
 from deimos.nn import ranks
 from deimos.nn.threads import on_threads
-from deimos.run import training
+from deimos.run import presets, training
+from deimos.run.attack import require_heard
 from deimos.run.branch import branch_config
 from deimos.run.config import from_dict, require_readable, to_dict, with_plain_numbers
 from deimos.run.evaluation import EvalConfig, evaluate_run
 from deimos.run.folder import RunFolder
-from deimos.run.trainer import TrainConfig
+from deimos.run.progress import progress as shown
+from deimos.run.progress import training_progress
+from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.env import EnvConfig
+from deimos.sim.graphs import Mode
 from deimos.sim.shared import one_stream
+
+Callback = Callable[[dict[str, float]], Any]
+"""Takes the row of an iteration; ``False`` stops the run."""
 
 
 def train(
-    config: TrainConfig | None = None, out: Path | str | None = None, *, branch_from: Path | str | None = None
+    config: TrainConfig | None = None, out: Path | str | None = None, *, resume: Path | str | None = None,
+    env_steps: int | None = None, device: str | None = None, graph: Mode | None = None,
+    init_from: Path | str | None = None, branch_from: Path | str | None = None, callback: Callback | None = None,
+    progress: bool | None = None,
 ) -> Path:  # fmt: skip
-    """Train a policy and evaluate it.
+    """Train a policy and evaluate it, or resume an earlier run.
 
     The environment of the process is left alone. Where other programs use the cores too, set OMP_WAIT_POLICY=passive
     before torch is loaded, as the ``deimos`` command does: threads that spin while they wait are slow there.
@@ -32,33 +45,86 @@ def train(
     the first one evaluates.
 
     Args:
-        config: What to train; ``None`` for the main job, Particle Gym under the Director.
+        config: What to train; ``None`` for the main job, Particle Gym under the Director. For robots, start from
+            ``deimos.preset``: the default learner is Particle Gym's, and a warning says so.
         out: Folder of the run, which must not exist; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
+        resume: Folder of a run to resume from its last checkpoint; takes only ``env_steps``, ``device`` and ``graph``.
+        env_steps: A larger budget of a resumed run: steps of every world in all.
+        device: Where to resume; ``None`` for the device that the run had.
+        graph: Whether a GPU replays CUDA graphs in a resumed run; ``None`` for as before.
+        init_from: Folder of a run whose networks it starts with.
         branch_from: Folder of a run whose networks, optimiser, worlds and levels it starts with; ``config`` is
             by default ``deimos.run.branch.branch_config`` of its own.
+        callback: Called after every iteration with its row of ``progress.csv``, in the first process. If it returns
+            False, the run stops with a checkpoint and is not evaluated. If it raises, the last checkpoint stays.
+        progress: Whether to show progress on stderr; ``None`` shows it on a terminal and in a notebook.
 
     Returns:
         The run's folder, for ``evaluate`` and ``load_policy``.
 
     Raises:
-        RunError: If the folder exists, a value in ``config`` is not of its field's type, the worlds do not fit into
-            memory, a file cannot be written, or the other processes of torchrun cannot be reached.
+        RunError: If arguments exclude each other, the folder exists, a value in ``config`` is not of its field's type,
+            the other run does not fit, the worlds do not fit into memory, a file cannot be written, or the other
+            processes of torchrun cannot be reached.
         SimulationError: If a number is not finite; the last checkpoint is intact.
     """
-    if config is None and branch_from is not None:
-        config = branch_config(training.read_config(RunFolder.open(Path(branch_from))))
-    config = config or TrainConfig()
+    if resume is None:
+        _refuse("is for resume; a new run has it in config", env_steps=env_steps, device=device, graph=graph)
+        if config is None:
+            config = TrainConfig() if branch_from is None else branch_config(_config(branch_from))
+        device = config.device
+        begin = partial(training.start, config, _path(out), _path(init_from), _path(branch_from))
+    else:
+        _refuse("is not for resume", config=config, out=out, init_from=init_from, branch_from=branch_from)
+        begin = partial(training.resume, Path(resume), env_steps, device, graph)
+        device = device or _config(resume).device
+    is_new = resume is None and branch_from is None
+    return _train(device, begin, callback, progress, is_new)
+
+
+def _train(
+    device: str, begin: Callable[[], tuple[Trainer, RunFolder]], callback: Callback | None, wanted: bool | None,
+    is_new: bool,
+) -> Path:  # fmt: skip
+    """Begin a run, train and evaluate it; see ``train``."""
     with on_threads(torch.get_num_threads()), ExitStack() as stack:  # a run sets the number; the host gets its own back
         with ranks.joined():
             with ranks.together():
-                device = training.resolve_device(config.device)
-                stack.enter_context(one_stream(device))
-            trainer, folder = training.start(config, _path(out), branch_from=_path(branch_from))
-            training.train(trainer, folder)
+                stack.enter_context(one_stream(training.resolve_device(device)))
+            trainer, folder = begin()
             first = ranks.place().first
-        if first and config.evaluation:
-            evaluate_run(folder, config.env, config.eval, device)
+            if first and is_new and (advice := presets.advice(trainer.config)):
+                warnings.warn(advice, stacklevel=3)
+            finished = _fit(trainer, folder, callback, wanted if first else False)
+        config = trainer.config
+        if first and finished and config.evaluation:
+            with shown("evaluating", wanted) as report:
+                evaluate_run(folder, config.env, config.eval, trainer.env.device, report)
     return folder.path
+
+
+def _fit(trainer: Trainer, folder: RunFolder, callback: Callback | None, wanted: bool | None) -> bool:
+    """Train until the budget is used up or the callback stops it; returns whether it did not."""
+    stop = False
+
+    def report(row: dict[str, float], fps: float) -> None:
+        nonlocal stop
+        show(row, fps)
+        stop = callback is not None and callback(dict(row)) is False
+
+    with training_progress(trainer.config.iterations, wanted) as show:
+        return training.train(trainer, folder, report, lambda: stop) and not stop
+
+
+def _refuse(why: str, **arguments: Any) -> None:
+    """Raise ``RunError`` for an argument that is given."""
+    for name, value in arguments.items():
+        if value is not None:
+            raise RunError(f"{name} {why}.")
+
+
+def _config(path: Path | str) -> TrainConfig:
+    return training.read_config(RunFolder.open(Path(path)))
 
 
 def _path(name: Path | str | None) -> Path | None:
@@ -66,29 +132,38 @@ def _path(name: Path | str | None) -> Path | None:
 
 
 def evaluate(
-    run: Path | str, *, goal_period: int | None = None, device: str = "auto", engine: str | None = None, **changes: Any
+    run: Path | str, *, worlds: int | None = None, steps: int | None = None, seed: int | None = None,
+    attackers: tuple[str, ...] | None = None, goal_period: int | None = None, engine: str | None = None,
+    iteration: int | None = None, device: str = "auto", progress: bool | None = None, **changes: Any,
 ) -> list[dict]:  # fmt: skip
-    """Evaluate the policy of a run against uniform goals (Naive) and against attackers.
+    """Evaluate the policy of a run against uniform goals (Naive) and against attackers, as ``deimos evaluate`` does.
 
     Args:
         run: The run's folder; its ``evaluation.json`` gains the rows.
+        worlds: Parallel worlds; ``None`` for as the run was set up, as of the next three.
+        steps: Steps of every world.
+        seed: Seed of the worlds and their goals.
+        attackers: Who attacks the policy, by name; ``()`` for uniform goals alone.
         goal_period: T: steps that a goal is active; ``None`` for that of training.
-        device: ``auto``, ``cpu`` or ``cuda``.
         engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for what did in training.
-        changes: Fields of ``EvalConfig`` that differ from the run's, such as ``worlds``, ``steps`` or ``seed``.
+        iteration: The policy that ``save_every`` has kept after this iteration; ``None`` for the last one.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        progress: Whether to show progress on stderr; ``None`` shows it on a terminal and in a notebook.
+        changes: Other fields of ``EvalConfig`` that differ from the run's, such as ``pool`` or ``adversary_steps``.
 
     Returns:
         A row for uniform goals and one for each attacker; see ``evaluation.evaluate``.
 
     Raises:
-        RunError: If it is not a run folder, or a value is not allowed.
+        RunError: If it is not a run folder, it has not kept that policy, or a value is not allowed.
     """
     folder = RunFolder.open(Path(run))
-    config = training.read_config(folder)
-    env_config, eval_config = configure_evaluation(config, goal_period, changes, engine)
+    usual = {"worlds": worlds, "steps": steps, "seed": seed, "attackers": attackers}
+    changes |= {name: value for name, value in usual.items() if value is not None}
+    env_config, eval_config = configure_evaluation(training.read_config(folder), goal_period, changes, engine)
     found = training.resolve_device(device)
-    with one_stream(found):
-        return evaluate_run(folder, env_config, eval_config, found)
+    with one_stream(found), shown("evaluating", progress) as report:
+        return evaluate_run(folder, env_config, eval_config, found, report, iteration=iteration)
 
 
 def configure_evaluation(
@@ -97,7 +172,7 @@ def configure_evaluation(
     """What a run's policy is evaluated in and how, where that differs from how the run was set up.
 
     Raises:
-        RunError: If a value is not allowed.
+        RunError: If a value is not allowed, or is for an attacker that is not among them.
     """
     try:
         period = config.env.goal_period if goal_period is None else goal_period
@@ -110,4 +185,5 @@ def configure_evaluation(
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except (TypeError, ValueError) as error:
         raise RunError(str(error)) from error
+    require_heard(eval_config.attackers, changes.get("pool"), changes.get("oracle_worlds"))
     return env_config, eval_config

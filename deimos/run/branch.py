@@ -13,7 +13,7 @@ from deimos.run.trainer import TrainConfig
 WARM_UP = 10  # rollouts in which critics learn before the policy does: those of a selector know nothing yet
 MAY_DIFFER = (
     "method", "selector", "seed", "env_steps", "critic_warmup", "eval", "evaluation", "device", "threads",
-    "tf32", "graph", "log", "video_every", "env.crash_penalty", "env.goal_period", "env.engine",
+    "tf32", "graph", "log", "video_every", "save_every", "env.crash_penalty", "env.goal_period", "env.engine",
 )  # fmt: skip
 
 

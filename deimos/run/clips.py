@@ -10,32 +10,11 @@ from tempfile import TemporaryDirectory
 
 from deimos.checks import RunError, one_line
 from deimos.files import write_bytes
-from deimos.run.folder import RunFolder
+from deimos.run.folder import VIDEOS, RunFolder
 
-VIDEOS = "videos"
 PATIENCE_SECONDS = 600.0  # mujoco-warp compiles for a minute or two where it has not yet
 
 _log = logging.getLogger(__name__)
-
-
-def clips(folder: RunFolder) -> dict[int, Path]:
-    """The clips of a run, by the iteration after which each was made."""
-    found = (folder.path / VIDEOS).glob("*.gif")
-    return {int(path.stem): path for path in sorted(found) if path.stem.isdecimal()}
-
-
-def cut_clips(folder: RunFolder, iteration: int) -> None:
-    """Drop the clips after an iteration: a resumed run makes them again.
-
-    Raises:
-        RunError: If one cannot be deleted.
-    """
-    for number, path in clips(folder).items():
-        if number > iteration:
-            try:
-                path.unlink()
-            except OSError as error:
-                raise RunError(f"{path} could not be deleted ({error.strerror}).") from error
 
 
 def render(run: Path, policy: Path, clip: Path) -> None:
@@ -72,13 +51,12 @@ class Camera:
         """
         if not self._every or iteration % self._every:
             return None
-        path = self._folder.path / VIDEOS / f"{iteration:06d}.gif"
         try:
             with TemporaryDirectory() as home:
                 policy, clip = Path(home) / "policy.pt", Path(home) / "clip.gif"
                 save_policy(policy)
                 render(self._folder.path, policy, clip)
-                path.parent.mkdir(exist_ok=True)
+                path = self._folder.of_iteration(VIDEOS, iteration)
                 write_bytes(path, clip.read_bytes())
         except (OSError, RunError, subprocess.SubprocessError) as error:
             said = (getattr(error, "stderr", None) or "").strip()

@@ -114,6 +114,25 @@ def _check_fields(cls: type, names: Iterable[str]) -> None:
         )
 
 
+def changed(config: Any, changes: Mapping[str, Any]) -> Any:
+    """A configuration with some fields changed, as by ``dataclasses.replace``.
+
+    Args:
+        config: A dataclass.
+        changes: Values by the names of fields; where a field is a configuration, a dictionary changes fields of it.
+
+    Raises:
+        ValueError: If there is no such field, or a value is not allowed.
+    """
+    _check_fields(type(config), changes)
+    old = {name: getattr(config, name) for name in changes}
+    inner = {
+        name for name, value in changes.items() if isinstance(value, Mapping) and dataclasses.is_dataclass(old[name])
+    }
+    new = {name: changed(old[name], value) if name in inner else value for name, value in changes.items()}
+    return dataclasses.replace(config, **new)
+
+
 def multiplied(config: Any, factors: Mapping[str, Any]) -> Any:
     """A configuration with some of its numbers multiplied.
 

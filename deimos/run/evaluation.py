@@ -108,17 +108,19 @@ def weights_hash(module: nn.Module) -> str:
 def evaluate_run(
     folder: RunFolder, env_config: EnvConfig, config: EvalConfig, device: torch.device,
     progress: Progress = lambda stage, share: None, *, again: bool = True, once: Once = _at_once,
+    iteration: int | None = None,
 ) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
 
     There they replace the rows of the same evaluation of the same weights. One of another T, size, seed or engine, or
     of an Adversary that was trained otherwise, is another evaluation, and stays beside them. Rows that the folder has
-    are made ``again`` or given back as they are; for the other arguments see ``evaluate``.
+    are made ``again`` or given back as they are. The policy is the last one, or the one that was kept after an
+    ``iteration``. For the other arguments see ``evaluate``.
 
     Returns:
         The rows of this evaluation, those of ``evaluate`` with the policy's ``weights_hash``.
     """
-    policy = load_policy(folder.path, str(device))
+    policy = load_policy(folder.policy(iteration), str(device))
     env_config = env_config.resolved(device)
     weights = {"weights": weights_hash(policy.actor)}
     known = read_evaluation(folder)
@@ -194,10 +196,8 @@ def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
 def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
     """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
     shared = {name: value for name, value in to_dict(config).items() if name in ("worlds", "seed", "fear")}
-    environment, engine = (
-        _environment(env_config),
-        {"engine": env_config.engine} if hasattr(env_config, "engine") else {},
-    )
+    environment = _environment(env_config)
+    engine = {"engine": env_config.engine} if hasattr(env_config, "engine") else {}
     return [
         {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed,
          "worlds": config.worlds_against(goals), "steps": config.steps, "environment": environment}

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from deimos.checks import RunError
-from deimos.files import first_line, open_file, read_bytes, remove_partial, write_bytes
+from deimos.files import PARTIAL, first_line, open_file, read_bytes, remove_partial, write_bytes
 from deimos.lock import hold
 
 OF_TRAINING = ("config.json", "checkpoint.pt", "policy.pt", "progress.csv", "timing.csv")
 """Files that only the process that trains writes."""
+POLICIES, VIDEOS = "policies/*.pt", "videos/*.gif"
+"""Files that a run keeps of some iterations, the star being the number of one."""
 PATIENCE_SECONDS = 60.0  # to add to a file that another process is just adding to
 
 
@@ -126,6 +128,39 @@ class RunFolder:
         except ValueError as error:
             way_out = "mend it, or move it away: the run goes on without it."
             raise RunError(f"{path}, {first_line(error)}; {way_out}") from error
+
+    def of_iterations(self, pattern: str) -> dict[int, Path]:
+        """The files that the run keeps of some iterations, ``POLICIES`` or ``VIDEOS``, by the iteration."""
+        found = sorted(self.path.glob(pattern))
+        return {int(path.stem): path for path in found if path.stem.isdecimal()}
+
+    def of_iteration(self, pattern: str, iteration: int) -> Path:
+        """Where the file of an iteration is to be written; makes the folder that it is in."""
+        path = self.path / pattern.replace("*", f"{iteration:06d}")
+        try:
+            path.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise RunError(f"{path.parent} cannot be made ({error.strerror}).") from error
+        return path
+
+    def cut_iterations(self, pattern: str, iteration: int) -> None:
+        """Drop the files after an iteration, and what a kill has left of one: a resumed run writes them again."""
+        later = [path for number, path in self.of_iterations(pattern).items() if number > iteration]
+        for path in [*later, *self.path.glob(f"{pattern}.*{PARTIAL}")]:
+            try:
+                path.unlink()
+            except OSError as error:
+                raise RunError(f"{path} could not be deleted ({error.strerror}).") from error
+
+    def policy(self, iteration: int | None = None) -> Path:
+        """The file of the policy: as it is now, or as it was kept after an iteration (``save_every``)."""
+        if iteration is None:
+            return self.path / "policy.pt"
+        kept = self.of_iterations(POLICIES)
+        if iteration not in kept:
+            there = ", ".join(map(str, kept)) or "none"
+            raise RunError(f"{self.path} has kept no policy of iteration {iteration}; it has those of: {there}.")
+        return kept[iteration]
 
     def cut_csv(self, name: str, iteration: int) -> None:
         """Drop the rows after an iteration, and half a line: a resumed run writes them again."""

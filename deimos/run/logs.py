@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from deimos.checks import RunError, one_line
-from deimos.run.clips import clips
-from deimos.run.folder import RunFolder
+from deimos.run.folder import VIDEOS, RunFolder
 
 VIDEO = "policy"  # what clips are called in the logs
 WANDB = "wandb.json"  # in a run's folder: the name of the run among those of Weights & Biases
@@ -97,7 +96,10 @@ class WeightsAndBiases:
                 f"Weights & Biases cannot be reached ({one_line(error)}); log in by `wandb login`, or set "
                 f"WANDB_MODE=offline and send the run by `wandb sync` later."
             ) from error
-        fps, made = {row["iteration"]: row["fps"] for row in folder.read_csv("timing.csv")}, clips(folder)
+        fps, made = (
+            {row["iteration"]: row["fps"] for row in folder.read_csv("timing.csv")},
+            folder.of_iterations(VIDEOS),
+        )
         for row in folder.read_csv("progress.csv"):
             known = {name: float(cell) for name, cell in (row | {"fps": fps.get(row["iteration"], "")}).items() if cell}
             if self._run.step <= int(row["iteration"]) <= iteration:

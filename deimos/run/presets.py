@@ -6,10 +6,12 @@ defaults, in plain dictionaries as ``config.json`` has them: those of the enviro
 the command line, hyphens and underscores in a name are the same.
 """
 
+from types import ModuleType
 from typing import Any
 
 from deimos import plugins
-from deimos.run.config import from_dict, kind
+from deimos.learn.ppo import PPOConfig
+from deimos.run.config import changed, from_dict, kind
 from deimos.run.trainer import TrainConfig
 from deimos.sim import envs
 
@@ -17,10 +19,15 @@ from deimos.sim import envs
 def _all() -> dict[str, tuple[str, dict[str, Any]]]:
     """Environment and fields of every preset."""
     found: dict[str, tuple[str, dict[str, Any]]] = {}
-    for env, presets in plugins.load_all(envs, lambda module: dict(getattr(module, "PRESETS", {}))).items():
+    for env, presets in plugins.load_all(envs, _of_module).items():
         own = {spelled(env): {}} | presets
-        found |= {spelled(name): (env, fields) for name, fields in own.items()}
+        found |= {name: (env, fields) for name, fields in own.items()}
     return found
+
+
+def _of_module(module: ModuleType) -> dict[str, dict[str, Any]]:
+    """Fields of the presets that an environment's module holds."""
+    return {spelled(name): fields for name, fields in getattr(module, "PRESETS", {}).items()}
 
 
 def names() -> list[str]:
@@ -33,18 +40,41 @@ def environment(name: str) -> str:
     return kind(preset(name).env)
 
 
-def preset(name: str) -> TrainConfig:
-    """The configuration of a preset.
+def preset(name: str, **changes: Any) -> TrainConfig:
+    """The configuration of a preset, as ``deimos train --preset`` starts from, with some fields changed.
+
+    ``preset("quad-walk", seed=3, env={"terrain": "rough"})`` walks on rough ground, and keeps the rest of the task.
+
+    Args:
+        name: Its name; that of an environment, such as ``quad``, has what ``env:quad`` starts from.
+        changes: Fields of ``TrainConfig``, as for ``dataclasses.replace``. Where one is a configuration (``env``,
+            ``ppo``, ``eval``), a dictionary changes only the fields that it names.
 
     Raises:
-        ValueError: If there is no such preset; the message lists those that there are. Or if one of its fields is
-            unknown or not allowed.
+        ValueError: If there is no such preset, the message lists those that there are; or if a field is unknown, a
+            value is not allowed, or ``env`` is another environment.
     """
     found = _all()
     if spelled(name) not in found:
         raise ValueError(f"There is no preset '{name}'; there are: {', '.join(sorted(found))}.")
     env, fields = found[spelled(name)]
-    return from_dict(TrainConfig, fields | {"env": {"kind": env} | fields.get("env", {})})
+    config = from_dict(TrainConfig, fields | {"env": {"kind": env} | fields.get("env", {})})
+    made = changed(config, changes)
+    if type(made.env) is not type(config.env):
+        raise ValueError(f"The preset '{name}' is for {env}, not for {type(made.env).__module__}.Config.")
+    return made
+
+
+def advice(config: TrainConfig) -> str:
+    """What to do about an environment that has a learner of its own and is given the default one; else nothing."""
+    env = kind(config.env)
+    own = plugins.load(envs, env, _of_module).get(spelled(env), {})
+    if config.ppo != PPOConfig() or "ppo" not in own:
+        return ""
+    return (
+        f"{env} is trained with the default ppo, which is Particle Gym's, and may learn nothing; "
+        f"deimos.preset('{spelled(env)}') has the settings that are right for it."
+    )
 
 
 def spelled(name: str) -> str:

@@ -55,13 +55,13 @@ class SavedRun:
         """Whether MuJoCo simulates its worlds."""
         return isinstance(self.config.env, LocomotionConfig)
 
-    def policy(self, env: Env) -> Policy:
-        """The policy as it is now.
+    def policy(self, env: Env, iteration: int | None = None) -> Policy:
+        """The policy as it is now, or as it was kept after an iteration.
 
         Raises:
             RunError: If there is none, or it observes other things than ``env`` shows.
         """
-        policy = load_policy(self.folder.path)
+        policy = load_policy(self.folder.policy(iteration))
         if policy.layout != env.layout:
             has, needs = (
                 ", ".join(f"{field.name} ({field.size})" for field in seen) for seen in (env.layout, policy.layout)

@@ -85,6 +85,9 @@ class TrainConfig:
     video_every: int = 0
     """Iterations from one video of the policy to the next, at least 0; 0 makes none. Each goes to ``videos`` in the
     run's folder and into its logs, and takes some seconds, during which training waits."""
+    save_every: int = 0
+    """Iterations from one policy that is kept to the next, at least 0; 0 keeps only the last one. Each is a small file,
+    ``policies/000250.pt`` in the run's folder after iteration 250."""
     critic_warmup: int = 0
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 
@@ -95,7 +98,7 @@ class TrainConfig:
             check_is("selector", self.selector, SelectorConfig)
         check_at_least("num_envs", self.num_envs, 1)
         check_at_least("env_steps", self.env_steps, 1)
-        for name in ("critic_warmup", "video_every"):
+        for name in ("critic_warmup", "save_every", "video_every"):
             check_at_least(name, getattr(self, name), 0)
         check_whole("threads", self.threads)
         check_range("threads", self.threads, 0, MOST_THREADS)

@@ -1,5 +1,6 @@
 """From nothing or from a checkpoint to a trained policy: how a run begins, resumes, is saved and ends."""
 
+import logging
 import platform
 import shutil
 import subprocess
@@ -20,12 +21,12 @@ from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.nn import ranks
 from deimos.run import memory
 from deimos.run.branch import check_branch
-from deimos.run.clips import Camera, cut_clips
+from deimos.run.clips import Camera
 from deimos.run.config import from_dict, kind, require_readable, to_dict, with_plain_numbers
 from deimos.run.cores import cores
 from deimos.run.evaluation import check_memory, require_pool
 from deimos.run.failure import check_finite, dumped
-from deimos.run.folder import RunFolder
+from deimos.run.folder import POLICIES, VIDEOS, RunFolder
 from deimos.run.logs import Logs, open_logs
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.graphs import Mode
@@ -34,6 +35,8 @@ from deimos.sim.shared import find_cuda
 SCHEMA = 1  # of config.json
 CHECKPOINT_SCHEMA = 3  # of checkpoint.pt; of earlier ones the networks can be loaded, but not the rest
 CHECKPOINT_SECONDS = 30.0
+
+_log = logging.getLogger(__name__)
 
 
 def resolve_device(name: str) -> torch.device:
@@ -330,7 +333,7 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     with ranks.together():
         if ranks.place().first:
             save_tensors(folder.path / "checkpoint.pt", state)
-            _save_policy(trainer, folder.path / "policy.pt")
+            _save_policy(trainer, folder.policy())
 
 
 def _save_policy(trainer: Trainer, path: Path) -> None:
@@ -344,16 +347,22 @@ def train(
 ) -> bool:  # fmt: skip
     """Run all iterations that are left, and return whether the budget was used up.
 
-    Rows and clips of later iterations that the folder has are made again. Meanwhile no other process can train the run.
-    After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true
-    ends the run early, with a checkpoint. Where several ranks share a run, the first one writes and reports, and any
-    may end it.
+    Rows, policies and clips of later iterations that the folder has are made again. Meanwhile no other process can
+    train the run. After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is
+    asked: true ends the run early, with a checkpoint. Where several ranks share a run, the first one writes and
+    reports, and any may end it.
 
     Raises:
         SimulationError: If a number is not finite; the last checkpoint is intact, and ``failure.json`` has the details.
         RunError: If a file cannot be written, in which case the last checkpoint is intact; or another process trains
             the run.
     """
+    device = trainer.env.device
+    if device.type == "cuda" and ranks.place().first:
+        _log.warning(
+            "%s: the authors have not verified GPUs on real hardware yet; deimos doctor --gpu checks this machine, and "
+            "the device cpu does without.", device,
+        )  # fmt: skip
     with _held(folder), dumped(trainer, folder, provenance), ExitStack() as stack:
         with ranks.together():
             writer = stack.enter_context(_writer(trainer, folder, report)) if ranks.place().first else None
@@ -373,6 +382,9 @@ class _Writer:
         """Write and show the iteration that ``trainer`` has just ended."""
         self.folder.append_csv("progress.csv", row)
         self.folder.append_csv("timing.csv", timing)
+        every = trainer.config.save_every
+        if every and trainer.iteration % every == 0:
+            _save_policy(trainer, self.folder.of_iteration(POLICIES, trainer.iteration))
         clip = self.camera.after(trainer.iteration, partial(_save_policy, trainer))
         self.logs.write(trainer.iteration, row | {"fps": timing["fps"]}, clip)
         self.report(row, timing["fps"])
@@ -382,10 +394,11 @@ class _Writer:
 def _writer(
     trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None]
 ) -> Iterator[_Writer]:  # fmt: skip
-    """Open a run's tables and logs; rows and clips that it is about to make again are dropped."""
+    """Open a run's tables and logs; rows, policies and clips that it is about to make again are dropped."""
     for name in ("progress.csv", "timing.csv"):
         folder.cut_csv(name, trainer.iteration)
-    cut_clips(folder, trainer.iteration)
+    for pattern in (POLICIES, VIDEOS):
+        folder.cut_iterations(pattern, trainer.iteration)
     with open_logs(trainer.config.log, folder, to_dict(trainer.config), trainer.iteration) as logs:
         yield _Writer(folder, logs, Camera(folder, trainer.config.video_every), report)
 
