@@ -7,9 +7,9 @@ from PIL import Image, ImageSequence
 
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
-from deimos.run.clips import Camera, clips, cut_clips
+from deimos.run.clips import Camera
 from deimos.run.film import FPS, SECONDS, SIZE
-from deimos.run.folder import RunFolder
+from deimos.run.folder import VIDEOS, RunFolder
 from deimos.run.trainer import TrainConfig
 
 CONFIG = TrainConfig(
@@ -36,8 +36,8 @@ def test_a_clip_shows_the_policy_and_changes_no_bit(plain, tmp_path):
     trainer, folder = training.start(replace(CONFIG, video_every=2), tmp_path / "run")
     assert training.train(trainer, folder)
     assert kept(folder) == kept(plain)
-    assert list(clips(folder)) == [2]
-    with Image.open(clips(folder)[2]) as gif:
+    assert list(folder.of_iterations(VIDEOS)) == [2]
+    with Image.open(folder.of_iterations(VIDEOS)[2]) as gif:
         frames = [frame.convert("RGB").tobytes() for frame in ImageSequence.Iterator(gif)]
         assert gif.size == SIZE
     assert len(frames) == SECONDS * FPS
@@ -51,7 +51,7 @@ def test_a_run_goes_on_where_nothing_can_be_rendered(plain, tmp_path, monkeypatc
     trainer, folder = training.start(replace(CONFIG, video_every=1), tmp_path / "run")
     assert training.train(trainer, folder)
     assert kept(folder) == kept(plain)
-    assert not clips(folder)
+    assert not folder.of_iterations(VIDEOS)
     (said,) = [record.getMessage() for record in caplog.records if record.name == "deimos.run.clips"]
     assert said == "There will be no videos in the logs from iteration 1 on: There is no ffmpeg here."
 
@@ -75,9 +75,9 @@ def test_clips_after_an_iteration_are_dropped(tmp_path):
     (tmp_path / "videos").mkdir()
     for name in ("000002.gif", "000010.gif", "1000000.gif", "mine.gif"):
         (tmp_path / "videos" / name).touch()
-    cut_clips(RunFolder(tmp_path), 10)
+    RunFolder(tmp_path).cut_iterations(VIDEOS, 10)
     assert sorted(path.name for path in (tmp_path / "videos").iterdir()) == ["000002.gif", "000010.gif", "mine.gif"]
-    assert list(clips(RunFolder(tmp_path))) == [2, 10]
+    assert list(RunFolder(tmp_path).of_iterations(VIDEOS)) == [2, 10]
 
 
 def test_the_number_of_iterations_is_checked():

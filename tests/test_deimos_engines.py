@@ -328,7 +328,7 @@ def test_a_run_is_evaluated_on_the_other_engine_too(tmp_path, capsys):
     own = deimos.evaluate(run, device="cpu")
     assert {row["engine"] for row in own} == {"native"}
     for _ in range(2):
-        assert cli.main(["evaluate", str(run), "--env.engine", "warp", "--device", "cpu"]) == 0
+        assert cli.main(["evaluate", str(run), "--engine", "warp", "--device", "cpu"]) == 0
         kept = RunFolder.open(run).read_json("evaluation.json")
         assert [(row["engine"], row["goals"]) for row in kept] == [
             (engine, goals) for engine in ("native", "warp") for goals in ("naive", "argmax", "scripted")
@@ -342,7 +342,7 @@ def test_a_particle_is_evaluated_on_no_engine(tmp_path, capsys):
     """Whoever asks for one is told that there is none."""
     config = replace(TINY, env=particle.Config(goal_period=4))
     training.train(*training.start(config, tmp_path / "run", None))
-    assert cli.main(["evaluate", str(tmp_path / "run"), "--env.engine", "warp"]) != 0
+    assert cli.main(["evaluate", str(tmp_path / "run"), "--engine", "warp"]) != 0
     assert "deimos.sim.envs.particle.Config has no engine; it has: crash_penalty" in capsys.readouterr().err
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -164,6 +165,19 @@ def test_devices_by_their_names(cuda):
     with pytest.raises(ValueError, match="device must be auto, cpu, cuda or cuda:N, got 'cuda:'"):
         TrainConfig(device="cuda:")
     assert TrainConfig(device="cuda:3").device == "cuda:3"
+
+
+def test_a_run_on_a_gpu_says_that_it_is_unverified(tmp_path, monkeypatch, caplog):
+    """In one line at its start, with what checks the machine and what does without; on a CPU nothing is said."""
+    config = TrainConfig(num_envs=4, device="cpu", threads=1, evaluation=False, log=(), ppo=PPOConfig(hidden=(4,)))
+    trainer, folder = training.start(config, tmp_path / "run")
+    monkeypatch.setattr(training, "_iterate", lambda *args: True)
+    training.train(trainer, folder)
+    assert not caplog.records
+    trainer.env.device = GPU
+    training.train(trainer, folder)
+    (record,) = caplog.records
+    assert re.match("cuda:0: .* not verified .*doctor --gpu.* cpu", record.getMessage())
 
 
 @pytest.mark.parametrize("name", ["auto", "cuda", "cuda:0"])

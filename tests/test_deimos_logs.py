@@ -17,7 +17,7 @@ from deimos.checks import RunError
 from deimos.learn.ppo import PPOConfig
 from deimos.run import clips, training
 from deimos.run.config import to_dict
-from deimos.run.folder import RunFolder
+from deimos.run.folder import VIDEOS, RunFolder
 from deimos.run.trainer import TrainConfig
 
 STEPS, SAVED, KILLED, END = 8, 3, 5, 9  # of a rollout; iterations of the last checkpoint, of the kill and in all
@@ -93,7 +93,7 @@ def test_tensorboard_has_every_iteration_once(killed, tmp_path, monkeypatch):
     assert [event.value for event in board.Scalars("reward")] == pytest.approx([float(row["reward"]) for row in rows])
     shown = {event.step: event.encoded_image_string for event in board.Images("policy")}
     assert [event.step for event in board.Images("policy")] == FILMED
-    assert shown == {number: clip.read_bytes() for number, clip in clips.clips(RunFolder(whole)).items()}
+    assert shown == {number: clip.read_bytes() for number, clip in RunFolder(whole).of_iterations(VIDEOS).items()}
 
 
 class FakeWandb:
@@ -165,7 +165,7 @@ def test_wandb_has_every_iteration_once(offline, tmp_path, monkeypatch):
     assert [row["reward"] for row in wandb.history] == [float(row["reward"]) for row in rows]
     assert all(row["fps"] > 0 for row in wandb.history)
     shown = {row["step"]: bytes.fromhex(row["policy"]) for row in wandb.history if "policy" in row}
-    assert shown == {number: clip.read_bytes() for number, clip in clips.clips(RunFolder(path)).items()}
+    assert shown == {number: clip.read_bytes() for number, clip in RunFolder(path).of_iterations(VIDEOS).items()}
     assert list(shown) == FILMED
     identity = RunFolder(path).read_json("wandb.json")["id"]
     assert wandb.began == [(identity, CONFIG.seed)] * 2

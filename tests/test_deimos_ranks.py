@@ -268,7 +268,7 @@ def test_a_program_of_torchruns_trains_on_all_ranks(tmp_path):
         "import sys\nimport deimos\n"
         "from deimos.learn.ppo import PPOConfig\nfrom deimos.run.evaluation import EvalConfig\n"
         "config = deimos.TrainConfig(\n"
-        "    num_envs=16, env_steps=48, device='cpu', threads=1, log=(), ppo=PPOConfig(hidden=(8,)),\n"
+        "    num_envs=16, env_steps=48, device='cpu', threads=1, log=(), save_every=1, ppo=PPOConfig(hidden=(8,)),\n"
         "    eval=EvalConfig(worlds=8, steps=200, adversary_steps=200),\n"
         ")\n"
         "sys.stdout.write(f'{deimos.train(config, out=sys.argv[1])}\\n')\n"
@@ -283,6 +283,7 @@ def test_a_program_of_torchruns_trains_on_all_ranks(tmp_path):
     assert (state["iteration"], state["ranks"], len(rows(run))) == (2, RANKS, 2)
     assert len(state["loop"]["env"]["goal_count"]) == 16
     assert json.loads((run / "evaluation.json").read_text())
+    assert sorted(path.name for path in (run / "policies").iterdir()) == ["000001.pt", "000002.pt"]
 
 
 def test_a_signal_stops_all_ranks(tmp_path):

@@ -51,7 +51,7 @@ CONFIGS = {
             ),
         ),
         evaluation=False, seed=2**32 - 1, num_envs=11, env_steps=13, critic_warmup=3, device="cpu",
-        threads=2, tf32=True, graph="off", log=("wandb", "tensorboard"), video_every=4,
+        threads=2, tf32=True, graph="off", log=("wandb", "tensorboard"), video_every=4, save_every=5,
     ),
 }  # fmt: skip
 
