@@ -57,7 +57,7 @@ SMALL = {
     "num_envs": 16, "env_steps": 48, "threads": 1,
     "eval": EvalConfig(worlds=8, steps=200, adversary_steps=20),
 }  # fmt: skip
-"""The same for ``deimos.TrainConfig(...)`` in Python."""
+"""The same for ``deimos.TrainConfig(...)`` and ``deimos.preset(NAME, ...)`` in Python."""
 
 STUDY_EVAL = "eval = { worlds = 8, steps = 200, adversary_steps = 20 }"
 """The same in a study's file."""
@@ -172,7 +172,8 @@ class Session:
     def python(self, block):
         """Run a program."""
         script = self.folder / "program.py"
-        script.write_text(block.text.replace("deimos.TrainConfig(", "deimos.TrainConfig(**SMALL, "), encoding="utf-8")
+        text = re.sub(r'deimos\.(TrainConfig\(|preset\("[\w-]+",)', r"deimos.\1 **SMALL, ", block.text)
+        script.write_text(text, encoding="utf-8")
         runpy.run_path(str(script), init_globals={"SMALL": SMALL})
 
     def command(self, line):
