@@ -27,11 +27,11 @@ class Engine(Protocol):
         """Let all running cells write their checkpoints and end; from now on ``run`` begins nothing."""
 
     def kill(self) -> None:
-        """End all that runs at once; from now on ``run`` begins nothing."""
+        """End everything that runs, at once; from now on ``run`` begins nothing."""
 
 
 class LocalProcesses:
-    """An engine that makes a process of its own for each cell; each ends when this process does."""
+    """An engine that starts a process for each cell; each ends when this process does."""
 
     def __init__(self, study: StudyFolder) -> None:
         self._study = study
