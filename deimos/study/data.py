@@ -104,7 +104,7 @@ class Data:
 
     @property
     def environments(self) -> list[str]:
-        """Their names, in order."""
+        """Names of the environments, in order."""
         return self._sorted({row["environment"] for row in self.rows})
 
     def periods(self, environment: str) -> list[int]:
