@@ -14,7 +14,7 @@ from deimos.checks import check_at_least
 from deimos.goals import given
 from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore, window_between
-from deimos.goals.director_checks import check_candidates, check_options, placed, refuse_unsound, settings, unpacked
+from deimos.goals.director_checks import check_candidates, check_options, placed, settings, unpacked
 from deimos.goals.fear_selector import FearEstimate, fear_selector
 from deimos.goals.given import A, Array, Bound, Candidates, GoalBox, Inputs, Rows
 from deimos.goals.horizons import Horizons
@@ -193,8 +193,8 @@ class GoalDirector:
         check_candidates(candidates, inputs.num_envs, inputs, self._goal_box is not None)
         clocks = self._clocks or self._begin(inputs)
         unseen = None if self._choose_first and not self._next_step else crashed | cut_off
-        refuse_unsound("state", states, but=unseen)
-        refuse_unsound("goal", goals)
+        given.refuse_unsound("state", states, but=unseen)
+        given.refuse_unsound("goal", goals)
         if executed is None:
             clocks.refuse_other_goals(goals)
         step = clocks.outcome(crashed, cut_off, own=True)
@@ -276,8 +276,8 @@ class GoalDirector:
         clocks = self._clocks or self._begin(inputs)
         if not len(listed):
             return given.like(goals, goal)
-        refuse_unsound("state", states, listed, but=clocks.uniform(listed))
-        refuse_unsound("goal", goals, listed)
+        given.refuse_unsound("state", states, listed, but=clocks.uniform(listed))
+        given.refuse_unsound("goal", goals, listed)
         clocks.refuse_other_goals(goals, listed)
         offered = self._candidates(candidates, listed, goal)
         clocks.end(listed)
@@ -432,7 +432,7 @@ class GoalDirector:
         if callable(candidates):
             candidates = candidates(given.like(rows, model))
         offered = self._expected(rows, None, None, None).candidates(candidates, len(rows))
-        given.refuse_not_finite("candidates", offered, rows)
+        given.refuse_unsound("candidates", offered, rows)
         if self._box is not None:
             self._box.check(offered, rows, share)
         return offered

@@ -11,6 +11,7 @@ from torch import Tensor
 from deimos.goals.core import GoalCore
 from deimos.goals.selector import Delegate, GoalSelector, Transitions, with_parts
 from deimos.nn.random import Purpose, uniforms
+from deimos.nn.stateful import LARGEST, is_sound
 
 Array = Tensor | np.ndarray
 A = TypeVar("A", Tensor, np.ndarray)  # what comes back is of the kind of what came in
@@ -125,6 +126,26 @@ def refuse_not_finite(
         raise ValueError(f"{name} of {what} {world} must be finite, got {numbers[row].tolist()}.")
 
 
+def refuse_unsound(name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None) -> None:
+    """Raise ``ValueError`` where a number is not finite, or so large that what is learnt from it would not be.
+
+    Args:
+        name: What they are.
+        numbers: Shape (m, n, ...), not empty.
+        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
+        but: Rows that do not matter, bool, shape (m,).
+    """
+    if bool(is_sound(torch.stack(numbers.aminmax())).all()):
+        return
+    refuse_not_finite(name, numbers, rows, but)
+    large = ~is_sound(numbers).flatten(1).all(1)
+    large = large if but is None else large & ~but
+    if bool(large.any()):
+        row = int(large.nonzero()[0])
+        world = row if rows is None else int(rows[row])
+        raise ValueError(f"{name} of world {world} must be at most {LARGEST:g} in size, got {numbers[row].tolist()}.")
+
+
 def refuse_outside_0_and_1(name: str, numbers: Tensor) -> None:
     """Raise a ``ValueError`` that names the first world with a number outside [0, 1] by more than rounding.
 
@@ -203,7 +224,7 @@ class Inputs:
             refuse_outside_0_and_1("tracking", met)
         if executed is not None:
             pursued = self.goals(executed, self.num_envs, "executed")
-            refuse_not_finite("executed", pursued)
+            refuse_unsound("executed", pursued)
         return crashed, cut_off, met, pursued
 
     def check_candidates(self, value: Candidates, count: int) -> None:
