@@ -219,15 +219,12 @@ class Panel:
         imgui.Image(self._texture, imgui.Vec2(MAP, MAP))
         imgui.SetCursorScreenPos(corner)
         imgui.InvisibleButton("map", imgui.Vec2(MAP, MAP))  # else a click would move the panel
-        lists, low, size = (
-            imgui.GetWindowDrawList(),
-            fear.low,
-            [b - a for a, b in zip(fear.low, fear.high, strict=True)],
-        )
         for goal, colour, radius in ((shown.next_goal, CYAN, 4.0), (shown.goal, WHITE, 6.0)):
-            share = [(goal[axis] - low[k]) / size[k] for k, axis in enumerate(fear.axes)]
-            middle = imgui.Vec2(corner.x + MAP * share[0], corner.y + MAP * (1.0 - share[1]))
-            lists.AddCircle(middle, radius, imgui.ColorConvertFloat4ToU32(imgui.Vec4(*colour)), 0, 2.5)
+            right, up = fear.shares(goal)
+            middle = imgui.Vec2(corner.x + MAP * right, corner.y + MAP * (1.0 - up))
+            imgui.GetWindowDrawList().AddCircle(
+                middle, radius, imgui.ColorConvertFloat4ToU32(imgui.Vec4(*colour)), 0, 2.5
+            )
         if imgui.IsItemActive():
             mouse, goal = imgui.GetMousePos(), list(shown.goal)
             place = fear.at((mouse.x - corner.x) / MAP, 1.0 - (mouse.y - corner.y) / MAP)

@@ -57,6 +57,12 @@ class FearMap:
         first, second = (low + (high - low) * min(max(share, 0.0), 1.0) for low, high, share in shares)
         return first, second
 
+    def shares(self, goal: Sequence[float]) -> tuple[float, float]:
+        """The place of a goal, as in ``at``; the middle along an axis without extent, such as a speed of always 0."""
+        ends = zip(self.axes, self.low, self.high, strict=True)
+        right, up = ((goal[axis] - low) / (high - low) if high > low else 0.5 for axis, low, high in ends)
+        return right, up
+
 
 class Steered(GoalSelector):
     """The one of some selectors that is chosen at the moment, or a user's own goal.
