@@ -118,8 +118,8 @@ class Grid(GoalSelector):
         """Raise the weights around the cells of goals that were tracked well."""
         done = interactions.resolved(self._learnt_at)
         self._learnt_at = interactions.now
-        if bool((max_over_ranks(self._seen) > 0).all()):
-            self._half.copy_(self._seen)
+        if bool((max_over_ranks(self._seen) > 0).any()):
+            self._half.copy_(self._seen.masked_fill(self._seen == 0, 1.0))  # what never varies is always in one cell
             self.fitted = True
         row = {}
         for i, group in enumerate(self._groups):
