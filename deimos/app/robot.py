@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SIZE = 480  # [pixels] of either side of each of the two views
 SEEN = 3.2  # distance of the camera, in heights of the base
-DRAWN_BY = "deimos robot check"  # what a picture says of itself
+DRAWN_BY = "deimos robot check"  # the software that a picture names
 COLOURS = {"base": (0.85, 0.2, 0.15, 1.0), "feet": (0.1, 0.6, 0.25, 1.0), "limbs": (0.2, 0.4, 0.8, 1.0)}
 
 

@@ -153,7 +153,7 @@ def simulate(
         scene: What is shown of it.
         panel: The panel next to it.
         handle: The viewer, from ``serve``.
-        write: Takes every moment that the panel shows, unless it stands still.
+        write: Takes every moment that the panel shows, unless it is paused.
         fps: Moments per second, positive.
         seconds: Duration, positive, in the seconds of the simulation; ``None`` for no end.
     """

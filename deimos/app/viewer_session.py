@@ -198,7 +198,7 @@ class Session:
 
     @property
     def seconds_per_step(self) -> float:
-        """Duration of a step as it is shown [s]: 1/50 where the world has no seconds."""
+        """Duration of a step as it is shown [s]: 1/50 in worlds without units of time."""
         return seconds_per_step(self.env)
 
     def choose(self, name: str) -> None:

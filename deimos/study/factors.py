@@ -37,7 +37,7 @@ def expand(factors: Mapping[str, Any], design: Mapping[str, Any]) -> list[Point]
         factors: By name, a list of levels, or for a Sobol sample also a range ``{low, high}``, logarithmic with
             ``log = true``, whole if both ends are.
         design: ``kind``: ``full`` (the default), all combinations; ``fractional``, of factors with two levels, where
-            ``generators`` names for each factor that is no combination of its own those that it is the product of;
+            ``generators`` gives for each factor that is not a base factor those that it is the product of;
             ``sobol``, a sample of ``points`` with a ``seed`` (0).
 
     Raises:

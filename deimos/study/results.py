@@ -118,7 +118,7 @@ class Results:
             raise RunError(f"{path} is not the result of a cell of schema {SCHEMA} ({one_line(error)}).") from error
 
     def add(self, other: "Results", *, attacks: bool = False) -> int:
-        """Take over the rows of cells that are not here yet; returns how many rows of evaluations that were.
+        """Take over the rows of cells that are not here yet; returns how many rows of evaluations were added.
 
         With ``attacks``, also the rows of other attackers on the very policies that are here.
         """

@@ -1,4 +1,4 @@
-"""Statistics of populations of runs. The unit is one trained policy; robots and episodes are no replicates.
+"""Statistics of populations of runs. The unit is one trained policy; robots and episodes are not replicates.
 
 Samples are float arrays of shape (n,), one value per policy, n at least 2, without NaN; ``ValueError`` otherwise. Every
 interval is two-sided, at ``LEVEL`` unless stated; every bootstrap draws ``resamples`` (``None``: ``RESAMPLES``) with

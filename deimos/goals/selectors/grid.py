@@ -18,7 +18,7 @@ class Config(SelectorConfig):
     """Goals by the weights of grid cells, which rise around every cell whose goals are tracked well."""
 
     bins: int = 8
-    """Cells along every component of a goal, at least 2. Every group of components has a grid of its own."""
+    """Cells along every component of a goal, at least 2. Every group of components has its own grid."""
     start: float = 0.5
     """Share of the range whose cells have weight 1 at the start, in (0, 1]; the others have weight 0."""
     growth: float = 0.2

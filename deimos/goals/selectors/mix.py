@@ -44,7 +44,7 @@ class Mix(Delegate):
         """See ``GoalSelector.propose``."""
         share = self.config.share
         free, others = draws[:, 3] < share, draws.clone()
-        # Where the method chooses, the fourth number is no longer uniform; scaled it is, for a method that uses it.
+        # Where the method chooses, the fourth number is not uniform; it is scaled to be, for methods that use it.
         others[:, 3] = ((draws[:, 3] - share) / max(1.0 - share, 1e-6)).clamp_(min=0.0)
         own = self.current.propose(rows, state, goal, candidates, others)
         anything = uniform_proposal(candidates, draws[:, 0]).goal
