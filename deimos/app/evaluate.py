@@ -103,7 +103,7 @@ def main(arguments: list[str], program: str) -> None:
 
 
 def title(config: TrainConfig) -> str:
-    """What stands above the figures of a run."""
+    """Title of the figures of a run."""
     env = " ".join([kind(config.env), *filter(None, [getattr(config.env, "variant", None)])])
     return f"{env}, goals chosen by {config.label}, seed {config.seed}"
 
@@ -118,7 +118,7 @@ def show_evaluation(
     """
     with console.progress("evaluating") as report:
         rows = evaluate_run(folder, env_config, eval_config, device, report, iteration=iteration)
-    if iteration is None:  # before anything is printed: whoever reads it may be gone
+    if iteration is None:  # before anything is printed: its reader may be gone
         figures.draw_summary(folder, title(config), rows[0]["weights"])
     print(describe(rows, elsewhere(folder, rows)))
 

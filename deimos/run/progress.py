@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from decimal import Decimal
 
-# From line to line where progress cannot be shown in place: seconds at least, and a share of what has passed.
+# From line to line where progress cannot be shown in place: seconds at least, and a share of the time so far.
 PLAIN_SECONDS, PLAIN_SHARE = 20.0, 0.05
 
 
@@ -17,7 +17,7 @@ PLAIN_SECONDS, PLAIN_SHARE = 20.0, 0.05
 def progress(title: str, wanted: bool | None = True) -> Iterator[Callable[[str, float], None]]:
     """Show how far something is: gives the function that reports (what is done, fraction of the whole that is done).
 
-    On a terminal a bar; elsewhere, such as in the log of a job, a plain line now and then, more seldom in a long job.
+    On a terminal a bar; elsewhere, such as in the log of a job, a plain line now and then, less often in a long job.
 
     Args:
         title: What is being done.
@@ -70,7 +70,7 @@ def _plain_progress(title: str) -> Callable[[str, float], None]:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with as many significant digits, in full: never in powers of ten, and 0 for nothing but zero."""
+    """A number with ``digits`` significant digits, in full: never in powers of ten, and 0 only for zero."""
     value += 0.0  # no -0
     if 0 < abs(value) < 1e-6:
         return "< 0.000001" if value > 0 else "> -0.000001"
