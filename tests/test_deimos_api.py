@@ -135,7 +135,7 @@ def test_hidden_layers_are_whole_numbers(sizes):
     [
         ({"evaluation": "no"}, "evaluation must be true or false, got 'no'"),
         ({"ppo": PPOConfig(hidden=(8,), clip_value=0)}, "clip_value must be true or false, got 0"),
-        ({"selector": Unknown()}, "is not the Config of a plugin of deimos.goals.selectors; register its module by"),
+        ({"selector": Unknown()}, "is not the Config of a plugin of deimos.goals.selectors; register its module with"),
     ],
 )
 def test_a_run_that_could_not_be_read_again_does_not_begin(tmp_path, changes, message):

@@ -234,7 +234,7 @@ def test_the_audit_is_exact():
         ("seed", -1, r"seed must be in \[0, 2\^32 - 2\), got -1"),
         ("seed", 2**32 - 2, r"seed must be in \[0, 2\^32 - 2\), got 4294967294"),  # the shield's would be 2^32
         ("oracle_worlds", 0, "oracle_worlds must be at least 1, got 0"),
-        ("attackers", ("nobody",), "There is no attacker 'nobody'; there are: argmax, argmax-long, .*scripted"),
+        ("attackers", ("nobody",), "Unknown attacker 'nobody'; choose from: argmax, argmax-long, .*scripted"),
         ("attackers", ("argmax", "argmax"), "attackers must be different, got argmax, argmax"),
     ],
 )

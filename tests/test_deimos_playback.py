@@ -170,7 +170,7 @@ def write_into(writer, *pictures):
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_video_without_a_picture_is_one_line(tmp_path, ending):
     """A video that no picture was written into is refused, and nothing is left."""
-    with pytest.raises(RunError, match=rf"x{ending} could not be written \(there is no picture"):
+    with pytest.raises(RunError, match=rf"x{ending} could not be written \(there are no pictures"):
         write_into(video(tmp_path / f"x{ending}", (64, 48), 25.0))
     assert not list(tmp_path.iterdir())
 
@@ -191,7 +191,7 @@ def test_a_video_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
 def test_pictures_that_cannot_be_written_are_one_line(tmp_path):
     """A folder that exists or cannot be made, or that is gone when a picture comes, is named in one line."""
     (tmp_path / "file").touch()
-    with pytest.raises(RunError, match="file exists already; name another folder"):
+    with pytest.raises(RunError, match="file exists already; choose another folder"):
         write_into(pictures(tmp_path / "file"))
     with pytest.raises(RunError, match=r"file/x could not be written \(Not a directory\)"):
         write_into(pictures(tmp_path / "file" / "x"))

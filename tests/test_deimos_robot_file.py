@@ -125,7 +125,7 @@ def test_a_run_keeps_its_robot(tmp_path, capsys):
     (tmp_path / "run" / "robot.zip").write_bytes(b"nothing")
     capsys.readouterr()
     assert cli.main(["train", "--resume", str(tmp_path / "run"), "--env-steps", "144"]) == 2
-    assert "is not a robot that a run has kept" in capsys.readouterr().err
+    assert "is not a run's copy of a robot" in capsys.readouterr().err
 
 
 def test_a_robot_that_no_run_could_keep_is_refused(tmp_path):
@@ -159,7 +159,7 @@ def test_a_robot_that_no_run_could_keep_is_refused(tmp_path):
         ),
         (
             ["--env.robot", "light.toml"],
-            "payload must be less than the 0.9 kg of 'chassis', from which it is taken too, got 1; take --env.pa",
+            "payload must be less than the 0.9 kg of 'chassis', since it is also subtracted, got 1; use --env.pa",
         ),
         (["--env.robot", "scout.toml", "--num-envs", "2000000000"], "2000000000 worlds, each at least "),
         (["--env.robot", "bad.toml"], "joint 'abduct_rr' of body 'shoulder_rr' must have a range of angles; give it"),
