@@ -93,7 +93,7 @@ ODDITIES = {
     "legs that do not collide": (
         "xml", 'er"><geom', 'er"><geom contype="0" conaffinity="0"', "front left: neither thigh nor calf collides",
     ),
-    "a light base": ("xml", 'mass="4.5"', 'mass="1"', "base 'chassis' weighs 1 kg, .* take --env.payload 0.25"),
+    "a light base": ("xml", 'mass="4.5"', 'mass="1"', "base 'chassis' weighs 1 kg, .* use --env.payload 0.25"),
     "a pose at a limit": ("xml", "-2.5 -0.4", "-1.54 -0.4", "pose of 'knee_fl', -1.5 rad, is in the outer tenth of"),
     "motors near their limit": ("toml", "[9.0, 9.0, 9.0]", "[9.0, 9.0, 2.6]", "standing takes .* of the 2.6 N m of 'k"),
     "soft knees": ("toml", "stiffness = 25 ", "stiffness = [25, 25, 6] ", "'knee_rl' gives way by -.* raise stiffness"),

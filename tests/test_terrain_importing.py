@@ -201,7 +201,7 @@ FLAT = partial(np.save, arr=np.zeros((50, 50)))
         ("a.png", cut_off, {"height_range": (0, 1)}, "it is not a picture, or it is broken (image file is truncated"),
         ("a.stl", upright, {}, "it must extend over a cell of 0.05 m along x and y, got 40 x 0"),
         ("a.stl", with_a_hole, {}, "mesh must cover the grid, but there is nothing above x = "),
-        ("a.stl", with_a_hole, {"resolution": 1e-5}, "resolution must be at least 0.000122 m for 16384 cells"),
+        ("a.stl", with_a_hole, {"resolution": 1e-5}, "resolution must be at least 0.000122 m for at most 16384 cells"),
         ("a.stl", with_a_hole, {"scale": 1000.0}, "The mesh is 2000 m long; if its unit is a millimetre, give"),
         ("a.stl", with_a_hole, {"height_range": (0, 1)}, "height_range does not apply to"),
         ("a.npy", lambda path: np.save(path, np.zeros((3, 3))), {"scale": 2.0}, "takes resolution, tile"),

@@ -223,7 +223,7 @@ def test_memory_is_known_where_the_system_says_it(monkeypatch, names):
     assert free == (2**28 if names else np.inf)
     monkeypatch.setattr(world, "_free_memory", lambda: free)
     if names:
-        with pytest.raises(ValueError, match=r"and 0\.2 GiB are free"):
+        with pytest.raises(ValueError, match=r"but 0\.2 GiB are free"):
             world.require_memory((10, 10), 2**29, "cell", 0.1)
     else:
         world.require_memory((10, 10), 2**60, "cell", 0.1)

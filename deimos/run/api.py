@@ -47,7 +47,7 @@ def train(
     """
     if config is None and branch_from is not None:
         config = branch_config(training.read_config(RunFolder.open(Path(branch_from))))
-    config = config or TrainConfig()
+    config = with_plain_numbers(config or TrainConfig())
     with on_threads(torch.get_num_threads()), ExitStack() as stack:  # a run changes it; the host gets its own back
         with ranks.joined():
             with ranks.together():
@@ -101,7 +101,7 @@ def configure_evaluation(
     """
     try:
         period = config.env.goal_period if goal_period is None else goal_period
-        env_config = config.env.for_evaluation().with_goal_period(period)  # no episode is too short for it
+        env_config = with_plain_numbers(config.env.for_evaluation().with_goal_period(period))  # no episode limits T
         eval_config = with_plain_numbers(replace(config.eval, **changes))
         require_readable(eval_config)
         if engine is not None:

@@ -81,7 +81,7 @@ class Camera:
                 path.parent.mkdir(exist_ok=True)
                 write_bytes(path, clip.read_bytes())
         except (OSError, RunError, subprocess.SubprocessError) as error:
-            said = (getattr(error, "stderr", None) or "").strip()
+            said = error.stderr.strip() if isinstance(error, subprocess.CalledProcessError) else ""
             reason = said.splitlines()[-1] if said else one_line(error)
             _log.warning("There will be no videos in the logs from iteration %d on: %s", iteration, reason)
             self._every = 0

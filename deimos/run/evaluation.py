@@ -258,9 +258,9 @@ def evaluate(
         A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` returns, and ``score``: for
         robots the place of its ``matching`` between standing still (0) and perfect tracking (1); otherwise that of its
         ``return_per_step`` between the policy that does nothing (0) and the environment's reference policy (1), both
-        under Naive goals; NaN without a reference policy. A policy that crashes may be below 0. For an attacker also
-        its facts, see ``deimos.run.attack``, and ``adversary_setting``, a hash of all that determined how it was made,
-        except for the policy. In ``environment`` each has a hash of the task.
+        under Naive goals; NaN where there is none, or both are equal. A policy that crashes may be below 0. For an
+        attacker also its facts, see ``deimos.run.attack``, and ``adversary_setting``, a hash of all that determined how
+        it was made, except for the policy. In ``environment`` each has a hash of the task.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -285,7 +285,7 @@ def evaluate(
         env = target.build(identity["worlds"], config.seed)
         row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals))
         facts = attack.facts_beside(["score", *row, *identity], goals)
-        score = (row[measure] - low) / (high - low)
+        score = (row[measure] - low) / (high - low) if high != low else math.nan
         rows.append({"goals": goals} | row | facts | {"score": score} | identity)
         keep(rows[-1])
     return rows
