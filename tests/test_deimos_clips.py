@@ -8,8 +8,9 @@ import pytest
 from PIL import Image, ImageSequence
 
 from deimos.learn.ppo import PPOConfig
+from deimos.nn import ranks
 from deimos.run import training
-from deimos.run.clips import Camera, clips, cut_clips
+from deimos.run.clips import PATIENCE_SECONDS, Camera, clips, cut_clips
 from deimos.run.film import FPS, SECONDS, SIZE
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -83,6 +84,7 @@ def test_a_clip_that_takes_too_long_is_said_to(tmp_path, monkeypatch, caplog):
     assert Camera(RunFolder(tmp_path), 1).after(1, lambda path: None) is None
     (record,) = caplog.records
     assert record.getMessage().endswith("timed out after 1.0 seconds")
+    assert PATIENCE_SECONDS < ranks.PATIENCE.total_seconds()  # the other ranks wait for the clip
 
 
 def test_clips_after_an_iteration_are_dropped(tmp_path):

@@ -106,6 +106,10 @@ def test_a_particle_is_drawn_where_it_is():
     drawing()
     env.reset(torch.ones(1, dtype=torch.bool))
     assert int((drawing() == RED).all(axis=2).sum()) > counts[1] + 20
+    env.reset(torch.ones(1, dtype=torch.bool))
+    env.step(torch.zeros(1, 3))
+    drawing()
+    assert len(drawing._ends) == 2  # though the episode is older than the last one was in its picture
 
 
 @pytest.mark.parametrize("width", [160, 640, 1920])

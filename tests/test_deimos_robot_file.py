@@ -100,6 +100,18 @@ def test_a_broken_file_is_refused(scout, line, change, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_damaged_copy_of_a_robot_is_refused(tmp_path):
+    """Whatever damage makes the archive's reader raise, here a mark of encryption, it is one ValueError."""
+    path = tmp_path / "robot.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("robot.toml", "")
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"is not a run's copy of a robot: .* is encrypted"), robot_file.opened(path):
+        pass
+
+
 def test_a_run_keeps_its_robot(tmp_path, capsys):
     """Data file, MJCF, includes and meshes are kept in one file; the run goes on from it, bit for bit, without them.
 

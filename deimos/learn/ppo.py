@@ -230,7 +230,7 @@ class PPO(Stateful):
             order: The order in which the transitions of all ranks are split into minibatches, int64,
                 shape (num_steps * all worlds,); ``None`` draws one.
             critic: The value function to use as the baseline, from observations of shape (..., obs_dim) to values
-                in units of scaled rewards; ``None`` for PPO's own. PPO trains neither a given one nor, then, its own.
+                in units of scaled rewards; ``None`` for PPO's own. With a given one, PPO trains no critic.
             learn_policy: Whether the policy learns, its normaliser included.
 
         Returns:

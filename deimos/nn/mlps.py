@@ -21,7 +21,7 @@ _NAMES = {module: name for name, module in ACTIVATIONS.items()}
 
 
 class MLPs:
-    """K networks of one shape in one vector of parameters, each network's contiguous and in its module's order.
+    """K networks of one shape in one vector of parameters, each network's contiguous, in its module's order.
 
     Products are torch's or, on a CPU where Warp is installed, those of ``kernels.mlp``. Both agree up to rounding;
     the kernel's results do not depend on the number of threads.
@@ -154,7 +154,7 @@ class MLPs:
         return sums
 
     def _outputs(self, x: Tensor, first: int = 0, out: Tensor | None = None) -> list[Tensor]:
-        """The inputs and the outputs of all layers; from ``first`` on if that is not 0, for inputs not activated."""
+        """The inputs and the outputs of layers from ``first`` on; unless that is 0, ``x`` is not activated yet."""
         outputs = [x] if first == 0 else [_activated(x, self.activation)]
         *hidden, (weight, bias) = self._layers[first:]
         for layer in hidden:

@@ -10,10 +10,12 @@ from tempfile import TemporaryDirectory
 
 from deimos.checks import RunError, one_line
 from deimos.files import write_bytes
+from deimos.nn.ranks import PATIENCE
 from deimos.run.folder import RunFolder
 
 VIDEOS = "videos"
-PATIENCE_SECONDS = 600.0  # the first compilation of mujoco-warp takes a minute or two
+# The first compilation of mujoco-warp takes a minute or two; other ranks, which wait for the clip, must not give up.
+PATIENCE_SECONDS = 0.8 * PATIENCE.total_seconds()
 
 _log = logging.getLogger(__name__)
 

@@ -54,7 +54,8 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
         check: Whether to write ``check.npz``, which ``controller.py`` compares with.
 
     Raises:
-        RunError: If ``out`` exists, the run is broken, or something cannot be written.
+        RunError: If ``out`` exists, or the run is broken.
+        OSError, RunError: If something cannot be written.
     """
     if os.path.lexists(out):
         raise RunError(f"{out} exists and is not overwritten; choose another folder.")

@@ -39,18 +39,18 @@ class Drawing:
         self._legend = (("particle", BLUE), ("goal (or where it leads)", ORANGE), (ends, RED))
         self._trail: list[np.ndarray] = []
         self._ends: list[np.ndarray] = []
-        self._age = 0
+        self._episode = 0
 
     def __call__(self) -> np.ndarray:
         """The picture of this moment, uint8, shape (height, width, 3)."""
         from PIL import Image, ImageDraw
 
-        sketch, age = self._env.sketch(0), int(self._env.episode_step[0])
+        sketch, episode = self._env.sketch(0), int(self._env.tensors["episode_count"][0])
         assert sketch is not None
-        if age < self._age:  # another episode has begun
+        if self._trail and episode != self._episode:
             self._ends.append(self._trail[-1])
             self._trail.clear()
-        self._age = age
+        self._episode = episode
         self._trail = [*self._trail[-TRAIL:], sketch.position]
         picture = Image.new("RGB", (self._width, self._height), PAPER)
         gap = (self._width - 2 * self._side) // 3

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deimos.checks import check_positive, one_line
+from deimos.files import UNREADABLE
 from deimos.sim.legged import mjcf
 from deimos.sim.legged.robots import Joint, Robot
 from deimos.sim.legged.robots._primitives import add_actuators
@@ -166,7 +167,7 @@ def opened(path: Path) -> Iterator[tuple[RobotFile, Path]]:
             with zipfile.ZipFile(path) as archive:
                 archive.extractall(folder)
             text = (Path(folder) / "robot.toml").read_bytes()
-        except (OSError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise ValueError(f"{path} is not a run's copy of a robot: {one_line(error)}.") from error
         yield _parse(path, text), Path(folder)
 
@@ -188,12 +189,12 @@ def pack(path: Path) -> bytes:
     top = Path(os.path.commonpath([file.parent for file in files]))
     kept = dataclasses.replace(robot, mjcf=model.relative_to(top).as_posix())
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in [
             ("robot.toml", to_toml(kept).encode()),
             *((file.relative_to(top).as_posix(), file.read_bytes()) for file in files),
         ]:
-            archive.writestr(zipfile.ZipInfo(name), data)  # without a time, so that the same robot gives the same bytes
+            archive.writestr(zipfile.ZipInfo(name), data)  # without a time or compression: the same bytes everywhere
     _require_whole(buffer, kept)
     return buffer.getvalue()
 
