@@ -214,7 +214,7 @@ def test_a_preset_is_changed_field_by_field():
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("quad-wlak", {}, "no preset 'quad-wlak'; there are: .*quad-walk"),
+        ("quad-wlak", {}, "Unknown preset 'quad-wlak'; choose from: .*quad-walk"),
         ("quad", {"sed": 3}, "TrainConfig has no sed; it has: .*seed"),
         ("quad", {"env": {"terain": "rough"}}, "quad.Config has no terain; it has: .*terrain"),
         ("quad", {"seed": -1}, r"seed must be in \[0, 2\^32\), got -1"),

@@ -1,4 +1,4 @@
-"""Training and evaluation as two functions, for programs."""
+"""Training and evaluation as two functions."""
 
 import warnings
 from collections.abc import Callable
@@ -38,8 +38,8 @@ def train(
 ) -> Path:  # fmt: skip
     """Train a policy and evaluate it, or resume an earlier run.
 
-    The environment of the process is left alone. Where other programs use the cores too, set OMP_WAIT_POLICY=passive
-    before torch is loaded, as the ``deimos`` command does: threads that spin while they wait are slow there.
+    The environment variables of the process are left alone. Where other programs use the cores too, set
+    OMP_WAIT_POLICY=passive before torch is loaded, as the ``deimos`` command does: spinning threads are slow there.
 
     Processes that ``torchrun`` starts train one policy, each in its share of the worlds; all must call this, once, and
     the first one evaluates.
@@ -53,8 +53,8 @@ def train(
         device: Where to resume; ``None`` for the device that the run had.
         graph: Whether a GPU replays CUDA graphs in a resumed run; ``None`` for as before.
         init_from: Folder of a run whose networks it starts with.
-        branch_from: Folder of a run whose networks, optimiser, worlds and levels it starts with; ``config`` is
-            by default ``deimos.run.branch.branch_config`` of its own.
+        branch_from: Folder of a run whose networks, optimiser, worlds and levels it starts with; ``config`` then
+            defaults to ``deimos.run.branch.branch_config`` of that run's.
         callback: Called after every iteration with its row of ``progress.csv``, in the first process. If it returns
             False, the run stops with a checkpoint and is not evaluated. If it raises, the last checkpoint stays.
         progress: Whether to show progress on stderr; ``None`` shows it on a terminal and in a notebook.
@@ -87,7 +87,7 @@ def _train(
     is_new: bool,
 ) -> Path:  # fmt: skip
     """Begin a run, train and evaluate it; see ``train``."""
-    with on_threads(torch.get_num_threads()), ExitStack() as stack:  # a run sets the number; the host gets its own back
+    with on_threads(torch.get_num_threads()), ExitStack() as stack:  # a run changes it; the host gets its own back
         with ranks.joined():
             with ranks.together():
                 stack.enter_context(one_stream(training.resolve_device(device)))
@@ -145,7 +145,7 @@ def evaluate(
         seed: Seed of the worlds and their goals.
         attackers: Who attacks the policy, by name; ``()`` for uniform goals alone.
         goal_period: T: steps that a goal is active; ``None`` for that of training.
-        engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for what did in training.
+        engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for the one of training.
         iteration: The policy that ``save_every`` has kept after this iteration; ``None`` for the last one.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Whether to show progress on stderr; ``None`` shows it on a terminal and in a notebook.
@@ -169,14 +169,14 @@ def evaluate(
 def configure_evaluation(
     config: TrainConfig, goal_period: int | None, changes: dict[str, Any], engine: str | None = None
 ) -> tuple[EnvConfig, EvalConfig]:
-    """What a run's policy is evaluated in and how, where that differs from how the run was set up.
+    """Environment and settings of an evaluation that may differ from those of the run.
 
     Raises:
         RunError: If a value is not allowed, or is for an attacker that is not among them.
     """
     try:
         period = config.env.goal_period if goal_period is None else goal_period
-        env_config = config.env.for_evaluation().with_goal_period(period)  # no episode is too short for it
+        env_config = with_plain_numbers(config.env.for_evaluation().with_goal_period(period))  # no episode limits T
         eval_config = with_plain_numbers(replace(config.eval, **changes))
         require_readable(eval_config)
         if engine is not None:

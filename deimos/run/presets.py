@@ -1,8 +1,8 @@
-"""Ready configurations: what an environment is trained with unless somebody says otherwise.
+"""Ready-made configurations: what an environment is trained with by default.
 
 A module of ``deimos.sim.envs`` may hold ``PRESETS``: by name, the fields of ``TrainConfig`` that differ from its
 defaults, in plain dictionaries as ``config.json`` has them: those of the environment in ``env``, of the learner in
-``ppo``, of the evaluation in ``eval``. The one with the environment's own name is what ``env:NAME`` starts from. As on
+``ppo``, of the evaluation in ``eval``. The one with the environment's own name is where ``env:NAME`` starts from. As on
 the command line, hyphens and underscores in a name are the same.
 """
 
@@ -17,7 +17,7 @@ from deimos.sim import envs
 
 
 def _all() -> dict[str, tuple[str, dict[str, Any]]]:
-    """Environment and fields of every preset."""
+    """Environment and fields of every preset, by name."""
     found: dict[str, tuple[str, dict[str, Any]]] = {}
     for env, presets in plugins.load_all(envs, _of_module).items():
         own = {spelled(env): {}} | presets
@@ -51,12 +51,12 @@ def preset(name: str, **changes: Any) -> TrainConfig:
             ``ppo``, ``eval``), a dictionary changes only the fields that it names.
 
     Raises:
-        ValueError: If there is no such preset, the message lists those that there are; or if a field is unknown, a
-            value is not allowed, or ``env`` is another environment.
+        ValueError: If there is no such preset (the message lists all), a field is unknown, a value is not allowed, or
+            ``env`` is another environment.
     """
     found = _all()
     if spelled(name) not in found:
-        raise ValueError(f"There is no preset '{name}'; there are: {', '.join(sorted(found))}.")
+        raise ValueError(f"Unknown preset '{name}'; choose from: {', '.join(sorted(found))}.")
     env, fields = found[spelled(name)]
     config = from_dict(TrainConfig, fields | {"env": {"kind": env} | fields.get("env", {})})
     made = changed(config, changes)
