@@ -66,8 +66,8 @@ def test_the_readme_quotes_the_rows(evidence):
         f"{len(policies)} policies, none left out",
         f"crash on {rate(fresh, under('naive'), 'uniform'):.1f} % of such goals, but on {uniform:.0f} % of the worst",
         f"crash on {attacked.estimate:.1f} % of the worst attacker's goals, at {score.estimate:.2f} of Uniform's score",
-        f"does not help: {penalty:.0f} %. Nor does VDS, the thesis's strongest rival: "
-        f"{rate(fresh, ATTACKED, 'vds'):.0f} %",
+        f"does not help ({penalty:.0f} %), nor does VDS, the thesis's strongest rival "
+        f"({rate(fresh, ATTACKED, 'vds'):.0f} %)",
         f"reaches {novel.estimate:.1f} % at {novel_score.estimate:.2f} of the score",
     ], README)  # fmt: skip
 
