@@ -23,15 +23,15 @@ class Coverage:
     """Share of simulated populations whose 95 % interval contains the truth."""
 
     statistic: str
-    """What is estimated."""
+    """The statistic."""
     interval: str
-    """How."""
+    """The interval."""
     normal: float
     """In normal populations."""
     lognormal: float
     """In populations whose logarithm is normal with a standard deviation of 1."""
     bimodal: float
-    """In populations of which 45 % are 0, and the others lognormal."""
+    """In populations of which 45 % are 0 and the others lognormal."""
 
 
 def simulate(n: int = 10, populations: int = 2000, resamples: int = 2000, seed: int = 0) -> list[Coverage]:
