@@ -32,7 +32,7 @@ def measure_training(
     """Training speed of every method on one environment, alternating iteration by iteration.
 
     Args:
-        config: What to train; its method does not count.
+        config: What to train; its method is ignored.
         methods: Selectors by name, ``uniform`` among them.
         thesis: Thousands of frames per second in the thesis, by name.
         device: Where.

@@ -30,7 +30,7 @@ class Page:
     """What a browser does for the page, except drawing it: it loads the model, takes control, receives states.
 
     Args:
-        port: Of the viewer, on 127.0.0.1.
+        port: Port of the viewer, on 127.0.0.1.
     """
 
     def __init__(self, port: int) -> None:

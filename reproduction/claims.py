@@ -125,7 +125,7 @@ class Result:
     place: Place
     """Where."""
     finding: Finding
-    """What was found."""
+    """The finding."""
 
     @property
     def verdict(self) -> Verdict:

@@ -41,7 +41,7 @@ def simulate(n: int = 10, populations: int = 2000, resamples: int = 2000, seed: 
         n: Policies in a population.
         populations: How many are simulated.
         resamples: Bootstrap resamples of each.
-        seed: Of it all.
+        seed: Random seed.
     """
     spread = permutation.log_spread_ratio([(0, 1)])
     kinds: list[tuple[str, str, Callable[[Array, Array, int], Interval], Callable[[str], float]]] = [

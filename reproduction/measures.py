@@ -104,7 +104,7 @@ class Evidence:
         return self.rows.get((self._name(place, method), goals, place.environment, place.period), {})
 
     def goals(self, place: Place) -> list[str]:
-        """Who chose the goals of a place's evaluations: naive, then attackers by name."""
+        """The goals of a place's evaluations: naive, then attackers by name."""
         found = {goals for _, goals, name, period in self.rows if (name, period) == (place.environment, place.period)}
         return sorted(found, key=lambda name: (name != "naive", name))
 
