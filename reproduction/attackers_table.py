@@ -1,7 +1,7 @@
 """Every attacker on Uniform policies of each variant of Particle, and on two planted policies: docs/lab/attackers.md.
 
-    python -m reproduction.attackers_table runs/attackers                                  # after particle_pool python
-    -m reproduction.attackers_table runs/attackers --variants directional --show    # prints the existing results
+    python -m reproduction.attackers_table runs/attackers                                  # after particle_pool
+    python -m reproduction.attackers_table runs/attackers --variants directional --show    # prints the existing results
 
 After an interruption the same command continues.
 """

@@ -1,7 +1,7 @@
 """How well does fear rank goals within a context, late in training, depending on its data? Prints a table.
 
-    python -m reproduction.fear_table runs/fear_table.csv                                 # 60 training runs python -m
-    reproduction.fear_table runs/try.csv --seeds 1000 --methods p75 p75-literal --variants directional
+    python -m reproduction.fear_table runs/fear_table.csv                                 # 60 training runs
+    python -m reproduction.fear_table runs/try.csv --seeds 1000 --methods p75 p75-literal --variants directional
 
 Every method is trained in every variant with every seed. At five points of the last quarter a copy of the run is
 audited: the exact outcomes of 50 candidates in each of at most 200 contexts with both outcomes, from clones. A run that

@@ -1,7 +1,7 @@
 """Train the policies that the legged studies branch off, and the networks of the attacker ``pooled`` used on them.
 
-    python -m reproduction.legged_bases runs/legged_bases    # eight; repeat it to continue after a kill python -m
-    reproduction.legged_bases runs/legged_bases --robots quad
+    python -m reproduction.legged_bases runs/legged_bases    # eight; repeat it to continue after a kill
+    python -m reproduction.legged_bases runs/legged_bases --robots quad
 
 A base is trained under Uniform, in two stages, the second starting from the first one's networks; studies branch off
 the second. Its policy is evaluated under uniform goals before anything branches off. The pool of a base is made from

@@ -1,7 +1,7 @@
 """Evaluate the policies of ``studies/legged.toml``, which were trained on the native engine, on mujoco-warp.
 
-    python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp    # repeat it to continue after a kill python
-    -m reproduction.legged_on_warp runs/legged runs/legged_on_warp --methods uniform p75 --seeds 1-2
+    python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp    # repeat it to continue after a kill
+    python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp --methods uniform p75 --seeds 1-2
 
 Uniform goals at T2, as in ``studies/legged_warp.toml``. The rows belong to a separate environment, ``quad_on_warp``, in
 a folder that ``deimos study merge`` accepts. A policy whose row is in the tables of that folder is not evaluated again;

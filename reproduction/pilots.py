@@ -1,7 +1,7 @@
 """The pilots of docs/lab/pilots.md: a small, equal budget for every new selector, on settings that no study uses.
 
-    python -m reproduction.pilots runs/pilots           # trains what is missing, then prints python -m
-    reproduction.pilots runs/pilots --show    # prints the existing results
+    python -m reproduction.pilots runs/pilots           # trains what is missing, then prints
+    python -m reproduction.pilots runs/pilots --show    # prints the existing results
 
 After an interruption the same command continues.
 """

@@ -1,9 +1,9 @@
 """Train a policy that walks on rough ground, and print the tables of docs/lab/quad.md.
 
-    python train.py --preset quad-walk --seed 1 --out runs/walk    # five minutes of one core python -m
-    reproduction.quad_rough runs/rough --init-from runs/walk --seed 1    # an hour; repeat it to continue python -m
-    reproduction.quad_rough runs/rough --minutes 0 --figure rough.png    # tables and curves of the existing run python
-    -m reproduction.quad_rough runs/pilot --init-from runs/walk --minutes 8 --change '{"num_envs": 1024}'
+    python train.py --preset quad-walk --seed 1 --out runs/walk    # five minutes of one core
+    python -m reproduction.quad_rough runs/rough --init-from runs/walk --seed 1    # an hour; repeat it to continue
+    python -m reproduction.quad_rough runs/rough --minutes 0 --figure rough.png    # tables and curves of that run
+    python -m reproduction.quad_rough runs/pilot --init-from runs/walk --minutes 8 --change '{"num_envs": 1024}'
 
 The run is that of ``python train.py --preset quad-rough --init-from RUN``, on one thread and without the evaluation at
 its end, stopped after ``--minutes`` of processor time. Per-world rewards and levels of every iteration go to worlds.npz

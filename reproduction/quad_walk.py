@@ -1,9 +1,9 @@
 """From scratch to a walking robot: train a preset over seeds, and print the tables of docs/lab/quad.md.
 
-    python -m reproduction.quad_walk runs/walk --seeds 1 2 3 4 5 --engines native warp    # repeat to continue python -m
-    reproduction.quad_walk runs/walk --engines native warp --worlds 512    # the policies in both simulators python -m
-    reproduction.quad_walk runs/both --preset quad-arm-walk    # walks and reaches: docs/lab/quad_arm.md python -m
-    reproduction.quad_walk runs/pilot --seeds 1 --minutes 3 --change '{"ppo": {"desired_kl": 0.02}}'
+    python -m reproduction.quad_walk runs/walk --seeds 1 2 3 4 5 --engines native warp    # repeat to continue
+    python -m reproduction.quad_walk runs/walk --engines native warp --worlds 512    # the policies in both simulators
+    python -m reproduction.quad_walk runs/both --preset quad-arm-walk    # walks and reaches: docs/lab/quad_arm.md
+    python -m reproduction.quad_walk runs/pilot --seeds 1 --minutes 3 --change '{"ppo": {"desired_kl": 0.02}}'
 
 Every run is that of ``python train.py --preset NAME --seed SEED``, on one thread and without the evaluation at its
 end. The processor time so far goes to processor.csv in the run's folder, with the tracking of every iteration.
