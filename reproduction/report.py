@@ -40,7 +40,7 @@ def write(folder: Path, out: Path, speeds: Path | None = None) -> Path:
         folder: A study's folder, or one of exported tables; ``shifted_goals.csv`` in it is drawn too.
         out: Where to write; created if it does not exist.
         speeds: File of ``python -m benchmarks table41 --json``, on which the claim on speed is judged; ``None`` for
-        none.
+            none.
 
     Raises:
         RunError: If there are no results, or a file cannot be read.
