@@ -431,8 +431,7 @@ def test_page_says_as_much_as_has_run(folders, tmp_path, capsys):
     out = tmp_path / "page"
     write(MultiverseOptions(out=out, screening=folders[0]))
     text = (out / "multiverse.md").read_text()
-    assert "of 32 settings have headroom" in text
-    assert "so these are enough" in text
+    assert all(part in text for part in ("of 32 settings have headroom", "so these are enough"))
     assert "Headline" not in text
     ours, room = tmp_path / "ours", tmp_path / "headroom"
     confirmation(ours, 0.2)
