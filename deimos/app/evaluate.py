@@ -52,14 +52,14 @@ class EvaluateOptions:
     device: str = "auto"
     """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
     attackers: tuple[str, ...] | None = None
-    """Who attacks the policy, by name: argmax-long, oracle, ... By default as the run was set up."""
+    """Attackers of the policy, by name: argmax-long, oracle, ... By default as the run was set up."""
     pool: Path | None = None
     """File of the attacker pooled, made by ``deimos pool``. By default as the run was set up."""
     engine: Literal["warp", "native"] | None = None
     """What simulates legged robots. By default as in training; the other one shows how the policy does in another
     simulator, compared with its own."""
     iteration: int | None = None
-    """The policy that --save-every has kept after this iteration of the training. By default the last one."""
+    """Use the policy that --save-every kept after this iteration. By default the last one."""
     oracle_worlds: int | None = None
     """Worlds that meet the attacker oracle, which tries goals in clones. By default as the run was set up."""
     calibration: int = 0
@@ -114,7 +114,7 @@ def show_evaluation(
 ) -> None:  # fmt: skip
     """Evaluate the policy of a run, whose configuration is ``config``; draw the summary and print what was found.
 
-    The summary is that of the last policy; for one that was kept after an ``iteration`` it stays as it is.
+    The summary shows the last policy; an evaluation of one that was kept after an ``iteration`` leaves it alone.
     """
     with console.progress("evaluating") as report:
         rows = evaluate_run(folder, env_config, eval_config, device, report, iteration=iteration)

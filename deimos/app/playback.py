@@ -42,7 +42,7 @@ class PlayOptions:
     height: int = 480
     """Height of a picture [pixels], in [16, 8192]."""
     iteration: int | None = None
-    """The policy that --save-every has kept after this iteration of the training. By default the last one."""
+    """Use the policy that --save-every kept after this iteration. By default the last one."""
     world: int = 0
     """Global number of the world, at least 0: where it stands, and which goals it gets."""
     goal_period: int | None = None

@@ -27,7 +27,7 @@ from deimos.sim.graphs import Mode
 from deimos.sim.shared import one_stream
 
 Callback = Callable[[dict[str, float]], Any]
-"""Takes the row of an iteration; ``False`` stops the run."""
+"""Takes the row of an iteration; returning ``False`` stops the run."""
 
 
 def train(
@@ -104,7 +104,7 @@ def _train(
 
 
 def _fit(trainer: Trainer, folder: RunFolder, callback: Callback | None, wanted: bool | None) -> bool:
-    """Train until the budget is used up or the callback stops it; returns whether it did not."""
+    """Train until the budget is used up or the callback stops it; returns whether the run is complete."""
     stop = False
 
     def report(row: dict[str, float], fps: float) -> None:
@@ -140,13 +140,13 @@ def evaluate(
 
     Args:
         run: The run's folder; its ``evaluation.json`` gains the rows.
-        worlds: Parallel worlds; ``None`` for as the run was set up, as of the next three.
+        worlds: Parallel worlds; here and in the next three, ``None`` for as the run was set up.
         steps: Steps of every world.
         seed: Seed of the worlds and their goals.
-        attackers: Who attacks the policy, by name; ``()`` for uniform goals alone.
+        attackers: Attackers of the policy, by name; ``()`` for uniform goals alone.
         goal_period: T: steps that a goal is active; ``None`` for that of training.
         engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for the one of training.
-        iteration: The policy that ``save_every`` has kept after this iteration; ``None`` for the last one.
+        iteration: Use the policy that ``save_every`` kept after this iteration; ``None`` for the last one.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Whether to show progress on stderr; ``None`` shows it on a terminal and in a notebook.
         changes: Other fields of ``EvalConfig`` that differ from the run's, such as ``pool`` or ``adversary_steps``.

@@ -18,7 +18,7 @@ from deimos.lock import hold
 OF_TRAINING = ("config.json", "checkpoint.pt", "policy.pt", "progress.csv", "timing.csv")
 """Files that only the process that trains writes."""
 POLICIES, VIDEOS = "policies/*.pt", "videos/*.gif"
-"""Files that a run keeps of some iterations, the star being the number of one."""
+"""Files that a run keeps for some iterations; the star stands for the iteration."""
 PATIENCE_SECONDS = 60.0  # to wait for a file that another process is adding to
 
 
@@ -130,12 +130,12 @@ class RunFolder:
             raise RunError(f"{path}, {first_line(error)}; {way_out}") from error
 
     def of_iterations(self, pattern: str) -> dict[int, Path]:
-        """The files that the run keeps of some iterations, ``POLICIES`` or ``VIDEOS``, by the iteration."""
+        """The files that the run has kept, ``POLICIES`` or ``VIDEOS``, by iteration."""
         found = sorted(self.path.glob(pattern))
         return {int(path.stem): path for path in found if path.stem.isdecimal()}
 
     def of_iteration(self, pattern: str, iteration: int) -> Path:
-        """Where the file of an iteration is to be written; makes the folder that it is in."""
+        """Path of the file to write for an iteration; creates its folder."""
         path = self.path / pattern.replace("*", f"{iteration:06d}")
         try:
             path.parent.mkdir(exist_ok=True)
@@ -144,7 +144,7 @@ class RunFolder:
         return path
 
     def cut_iterations(self, pattern: str, iteration: int) -> None:
-        """Drop the files after an iteration, and what a kill has left of one: a resumed run writes them again."""
+        """Drop the files after an iteration, and half a file of a kill: a resumed run writes them again."""
         later = [path for number, path in self.of_iterations(pattern).items() if number > iteration]
         for path in [*later, *self.path.glob(f"{pattern}.*{PARTIAL}")]:
             try:
@@ -153,7 +153,7 @@ class RunFolder:
                 raise RunError(f"{path} could not be deleted ({error.strerror}).") from error
 
     def policy(self, iteration: int | None = None) -> Path:
-        """The file of the policy: as it is now, or as it was kept after an iteration (``save_every``)."""
+        """The file of the last policy, or of the one that was kept after an iteration (``save_every``)."""
         if iteration is None:
             return self.path / "policy.pt"
         kept = self.of_iterations(POLICIES)

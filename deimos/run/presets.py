@@ -46,7 +46,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     ``preset("quad-walk", seed=3, env={"terrain": "rough"})`` walks on rough ground, and keeps the rest of the task.
 
     Args:
-        name: Its name; that of an environment, such as ``quad``, has what ``env:quad`` starts from.
+        name: Its name; the preset of an environment's name, such as ``quad``, is what ``env:quad`` starts from.
         changes: Fields of ``TrainConfig``, as for ``dataclasses.replace``. Where one is a configuration (``env``,
             ``ppo``, ``eval``), a dictionary changes only the fields that it names.
 
@@ -66,14 +66,14 @@ def preset(name: str, **changes: Any) -> TrainConfig:
 
 
 def advice(config: TrainConfig) -> str:
-    """What to do about an environment that has a learner of its own and is given the default one; else nothing."""
+    """A warning if an environment is given the default learner and its own preset has another; otherwise empty."""
     env = kind(config.env)
     own = plugins.load(envs, env, _of_module).get(spelled(env), {})
     if config.ppo != PPOConfig() or "ppo" not in own:
         return ""
     return (
         f"{env} is trained with the default ppo, which is Particle Gym's, and may learn nothing; "
-        f"deimos.preset('{spelled(env)}') has the settings that are right for it."
+        f"start from deimos.preset('{spelled(env)}')."
     )
 
 

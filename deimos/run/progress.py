@@ -21,7 +21,7 @@ def progress(title: str, wanted: bool | None = True) -> Iterator[Callable[[str, 
 
     Args:
         title: What is being done.
-        wanted: Whether to show it; ``None`` for only on a terminal and in a notebook.
+        wanted: Whether to show it; ``None`` shows it only on a terminal and in a notebook.
     """
     if wanted is False:
         yield lambda stage, fraction: None

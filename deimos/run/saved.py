@@ -56,7 +56,7 @@ class SavedRun:
         return isinstance(self.config.env, LocomotionConfig)
 
     def policy(self, env: Env, iteration: int | None = None) -> Policy:
-        """The policy as it is now, or as it was kept after an iteration.
+        """The last policy, or the one that was kept after an iteration.
 
         Raises:
             RunError: If there is none, or its observations are not those of ``env``.

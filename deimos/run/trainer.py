@@ -85,8 +85,8 @@ class TrainConfig:
     """Iterations from one video of the policy to the next, at least 0; 0 makes none. Each goes into ``videos`` in the
     run's folder and into its logs, and takes some seconds, during which training waits."""
     save_every: int = 0
-    """Iterations from one policy that is kept to the next, at least 0; 0 keeps only the last one. Each is a small file,
-    ``policies/000250.pt`` in the run's folder after iteration 250."""
+    """Iterations from one kept policy to the next, at least 0; 0 keeps only the last one. Each is a small file in the
+    run's folder, such as ``policies/000250.pt``."""
     critic_warmup: int = 0
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
 

@@ -360,8 +360,8 @@ def train(
     device = trainer.env.device
     if device.type == "cuda" and ranks.place().first:
         _log.warning(
-            "%s: the authors have not verified GPUs on real hardware yet; deimos doctor --gpu checks this machine, and "
-            "the device cpu does without.", device,
+            "%s: the authors have not verified GPUs on real hardware yet; deimos doctor --gpu checks this machine, "
+            "device cpu avoids it.", device,
         )  # fmt: skip
     with _held(folder), dumped(trainer, folder, provenance), ExitStack() as stack:
         with ranks.together():
