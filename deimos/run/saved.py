@@ -1,4 +1,4 @@
-"""A finished run for use: its policy, its worlds, its fear network."""
+"""A saved run for use: its policy, its worlds, its fear network."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,7 +48,7 @@ class SavedRun:
                 env = replace(env, terrain=terrain)
         except ValueError as error:
             raise RunError(str(error)) from error
-        return cls(folder, replace(config, env=env, evaluation=False))  # its steps fit the training's T
+        return cls(folder, replace(config, env=env, evaluation=False))  # its steps are for the training's T
 
     @property
     def has_robots(self) -> bool:
