@@ -40,6 +40,15 @@ def test_crashing_does_not_pay_on_the_score(variant):
     assert blind["score"] < 0.9
 
 
+def test_a_scale_without_a_length_gives_no_score():
+    """Where doing nothing is as good as the reference, the evaluation ends, and the score is not a number."""
+    config = EvalConfig(worlds=4, steps=200, attackers=())
+    (row,) = evaluate(
+        lambda obs: torch.zeros(4, 3), particle.Config(), config, CPU, once=lambda task, compute: ("reward", 0.5, 0.5)
+    )
+    assert math.isnan(row["score"])
+
+
 def test_the_mean_reward_pays_for_crashing():
     """Why there is a score: the reward per transition puts the blind follower above the braking one."""
     config = particle.Config()
@@ -234,7 +243,7 @@ def test_the_audit_is_exact():
         ("seed", -1, r"seed must be in \[0, 2\^32 - 2\), got -1"),
         ("seed", 2**32 - 2, r"seed must be in \[0, 2\^32 - 2\), got 4294967294"),  # the shield's would be 2^32
         ("oracle_worlds", 0, "oracle_worlds must be at least 1, got 0"),
-        ("attackers", ("nobody",), "There is no attacker 'nobody'; there are: argmax, argmax-long, .*scripted"),
+        ("attackers", ("nobody",), "Unknown attacker 'nobody'; choose from: argmax, argmax-long, .*scripted"),
         ("attackers", ("argmax", "argmax"), "attackers must be different, got argmax, argmax"),
     ],
 )

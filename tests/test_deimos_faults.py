@@ -306,7 +306,7 @@ def test_what_stopped_a_run_is_written_down(run, monkeypatch):
         return row
 
     monkeypatch.setattr(type(trainer), "iterate", poisoned)
-    with pytest.raises(SimulationError, match=r"Iteration 6: .*What it was about is in .*failure\.json"):
+    with pytest.raises(SimulationError, match=r"Iteration 6: .*Details are in .*failure\.json"):
         training.train(trainer, folder)
     report = run.read_json("failure.json")
     assert report["versions"]["deimos"] == deimos.__version__

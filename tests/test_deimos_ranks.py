@@ -326,7 +326,7 @@ def test_a_rank_ends_when_another_is_killed(tmp_path):
             end(process)
     assert processes[0].returncode == 2, errors
     (line,) = [line for line in errors.splitlines() if line.startswith("deimos: ")]
-    assert line.startswith("deimos: Rank 0 has lost another one")
+    assert line.startswith("deimos: Rank 0 has lost another rank, ")
 
 
 def flags(out):

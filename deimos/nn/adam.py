@@ -10,7 +10,7 @@ class Adam(Stateful):
     """Adam [1]_ without weight decay: a few operations on one vector, and no host round trip.
 
     ``torch.optim.Adam`` spends 0.2 ms per step in Python whatever the size of the network; an
-    iteration of training makes 28 steps, which would be 4 % of it. A test holds this one to its numbers.
+    iteration of training makes 28 steps, which would be 4 % of it. A test compares the numbers of both.
 
     Args:
         parameters: The vector, of any shape.
@@ -27,7 +27,7 @@ class Adam(Stateful):
 
     def __init__(self, parameters: Tensor, grad: Tensor, learning_rate: Tensor) -> None:
         self.learning_rate = learning_rate
-        self.steps = torch.zeros((), dtype=torch.float64, device=grad.device)  # counted there, as a graph needs it
+        self.steps = torch.zeros((), dtype=torch.float64, device=grad.device)  # counted on the device, for graphs
         self._betas = torch.tensor([self.BETA_1, self.BETA_2], dtype=torch.float64, device=grad.device)
         self._parameters, self._grad = parameters, grad
         self._mean = torch.zeros_like(self._grad)
@@ -37,7 +37,8 @@ class Adam(Stateful):
         """Move the parameters against their gradient.
 
         Args:
-            part: Which of them, along the first axis; the others, and what is known of their gradients, stay.
+            part: Which of them, along the first axis; the others and their moment estimates do not change,
+                but the count of steps, which corrects the bias of all of them, does.
         """
         self.steps += 1
         parameters, grad, mean, square = (
