@@ -149,7 +149,7 @@ def _watch(trainer: Trainer, act: _Explorer, chooser: GoalSelector, count: int) 
     steps = (-(-count // env.num_envs) + 1) * env.goal_period
     loop = GoalLoop(env, chooser, window=steps)
     for _ in range(steps):
-        loop.advance(env.step(act(env.obs)))
+        loop.advance(env.step(act(env.obs)), in_time=True)
     return loop.outcomes()
 
 

@@ -58,12 +58,21 @@ class GoalLoop:
         self.core.percentile.masked_fill_(mask, 50.0)
         self.begin(mask)
 
-    def advance(self, step: Step) -> None:
+    def advance(self, step: Step, *, in_time: bool = False) -> None:
         """Do what ``step`` calls for; ``env.obs`` is then what the policy acts on next.
 
         Interactions are resolved before anything is reset, so one whose T-th step is the time
         limit keeps its label. Worlds that are done get a first goal, not one of the selector's.
+
+        Args:
+            step: What the environment's step gave back.
+            in_time: Whether goals that were issued less than T steps before the time limit are no interactions: only
+                their crashes would count, and a share of crashes would be too large. For those who measure.
         """
+        if in_time and self.env.time_limit:
+            lasted = self.interactions.now + 1 - self.interactions.issued_at
+            last = self.env.episode_step - lasted + self.env.goal_period  # of the episode's steps, under the goal
+            self.interactions.active &= ~(step.terminated & (last > self.env.time_limit))
         self.renew(step, self.resolve(step))
 
     def resolve(self, step: Step) -> Changes:
