@@ -262,6 +262,8 @@ def _decide(trainer: Trainer, rows: Tensor) -> _Decision:
     candidates = env.sample_goals(rows, CANDIDATES, scale).clone()
     worlds = {name: tensor[rows] for name, tensor in env.tensors.items()}
     chosen = selector.propose(rows, state, goal, candidates, env.draw(rows)).goal
+    own = ~(candidates == chosen.unsqueeze(1)).all(2).any(1, keepdim=True)
+    candidates[:, 0] = torch.where(own, chosen, candidates[:, 0])  # a goal that was none of them takes part too
     if scale is not None:  # it chose from a part of the range, as a curriculum does, and is judged among goals of all
         candidates = torch.where(
             (candidates == chosen.unsqueeze(1)).all(2, keepdim=True), candidates, env.sample_goals(rows, CANDIDATES)
