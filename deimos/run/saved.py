@@ -41,7 +41,8 @@ class SavedRun:
         folder = RunFolder.open(path)
         config = read_config(folder)
         try:
-            env = config.env.for_evaluation().with_goal_period(goal_period or config.env.goal_period)
+            period = config.env.goal_period if goal_period is None else goal_period
+            env = config.env.for_evaluation().with_goal_period(period)
             if terrain is not None:
                 if not isinstance(env, LocomotionConfig):
                     raise RunError(f"terrain is for legged robots; {path} is a run of another environment.")

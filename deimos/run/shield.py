@@ -107,7 +107,7 @@ def collect(
     env = target.build(worlds, seed)
     loop = GoalLoop(env, uniform_goals(env), window=steps)
     for t in range(steps):
-        loop.advance(env.step(target.policy(env.obs)))
+        loop.advance(env.step(target.policy(env.obs)), in_time=True)
         if t % 100 == 0:
             progress(t / steps)
     env.check()
