@@ -289,6 +289,9 @@ def test_a_pool_is_refused_in_one_line(tmp_path):
     other = make_target(blind(), replace(config, max_speed=20.0), SMALL, CPU)
     with pytest.raises(RunError, match="The policies have different observations"):
         make_pool([make_target(blind(), config, SMALL, CPU), other], pool)
+    shorter = make_target(blind(), replace(config, goal_period=50), SMALL, CPU)
+    with pytest.raises(RunError, match=r"goals of the same period T, got 50, 100\."):
+        make_pool([make_target(blind(), config, SMALL, CPU), shorter], pool)
     pool.write_bytes(b"broken")
     with pytest.raises(RunError, match=r"pool\.pt"):
         evaluate(stay, config, sizes, CPU)

@@ -67,9 +67,9 @@ def learn(case):
             found["minibatches"] = [part.table[:, part.table[-3] > 0].clone() for part in parts]
         return parts
 
-    def note_gradient(*part):
+    def note_gradient(**options):
         found.setdefault("gradient", ppo._grad.clone())
-        step(*part)
+        step(**options)
 
     ppo._minibatches, ppo.optimizer.step = note_minibatches, note_gradient
     for _ in range(ITERATIONS):

@@ -214,6 +214,8 @@ def test_an_attacker_can_choose_and_lends_its_fear(scared, tmp_path):
     del state["loop"]["selector"]["fear"]
     torch.save(state, run / "checkpoint.pt")
     told = []
+    with pytest.raises(RunError, match="goal_period must be at least 1, got 0"):
+        SavedRun.open(run, goal_period=0)
     saved = SavedRun.open(run)
     attacks, afraid = prepare(saved, ["argmax", "scripted"], 32, lambda stage, share: told.append((stage, share)))
     assert told[-1][0] == "argmax"

@@ -159,9 +159,8 @@ class PPO(Stateful):
             for module, part in zip((self.actor, self.critic), memory.split(sizes, dim=1), strict=True)
         )
         self._parameters, self._grad = memory
-        self._critic_part = slice(sizes[0], None)
         self.learning_rate = torch.tensor(config.learning_rate, dtype=torch.float32, device=device)
-        self.optimizer = Adam(self._parameters, self._grad, self.learning_rate)
+        self.optimizer = Adam(self._parameters, self._grad, self.learning_rate, late=sizes[0])
         shape = obs_dim + 2 * action_dim + 5, rows
         self._batch, self._shuffled = (
             Batch(torch.zeros(shape, dtype=torch.float32, device=device), obs_dim) for _ in range(2)
@@ -357,7 +356,7 @@ class PPO(Stateful):
         sum_over_ranks(self._critic.grad, loss)
         self._critic.grad *= self.config.value_coef
         self._critic.clip_gradient(self.config.max_grad_norm)
-        self.optimizer.step(self._critic_part)
+        self.optimizer.step(without_late=True)
         return torch.stack([loss[0, 0], *loss.new_full((2,), math.nan)])
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:

@@ -115,7 +115,7 @@ class AttackerConfig(abc.ABC):
 
     @abc.abstractmethod
     def prepare(self, target: Target) -> Attack:
-        """Learn about a policy what it needs."""
+        """Learn what it needs about a policy."""
 
 
 def names() -> list[str]:

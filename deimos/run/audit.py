@@ -149,7 +149,7 @@ def _watch(trainer: Trainer, act: _Explorer, chooser: GoalSelector, count: int) 
     steps = (-(-count // env.num_envs) + 1) * env.goal_period
     loop = GoalLoop(env, chooser, window=steps)
     for _ in range(steps):
-        loop.advance(env.step(act(env.obs)))
+        loop.advance(env.step(act(env.obs)), in_time=True)
     return loop.outcomes()
 
 
@@ -262,6 +262,8 @@ def _decide(trainer: Trainer, rows: Tensor) -> _Decision:
     candidates = env.sample_goals(rows, CANDIDATES, scale).clone()
     worlds = {name: tensor[rows] for name, tensor in env.tensors.items()}
     chosen = selector.propose(rows, state, goal, candidates, env.draw(rows)).goal
+    own = ~(candidates == chosen.unsqueeze(1)).all(2).any(1, keepdim=True)
+    candidates[:, 0] = torch.where(own, chosen, candidates[:, 0])  # a goal that was not a candidate is ranked too
     if scale is not None:  # it chose from part of the range, as a curriculum does, but is judged among goals of all
         candidates = torch.where(
             (candidates == chosen.unsqueeze(1)).all(2, keepdim=True), candidates, env.sample_goals(rows, CANDIDATES)

@@ -124,7 +124,7 @@ def evaluate_run(
     weights = {"weights": weights_hash(policy.actor)}
     known = read_evaluation(folder)
     identities = [(identity | weights).items() for identity in _identities(env_config, config)]
-    same = [row for row in known if any(row.items() >= identity for identity in identities)]
+    same = [row for identity in identities for row in known if row.items() >= identity]
     if len(same) == len(identities) and not again:
         return same
     folder.require_writable()
@@ -389,7 +389,7 @@ def play(
             values[t] = torch.where(met, env.errors[name], torch.nan)
         first_goal_steps += first
         first_goal_crashes += first & step.terminated
-        loop.advance(step)
+        loop.advance(step, in_time=True)
         if t % 100 == 0:
             progress(t / steps)
     env.check()

@@ -1,7 +1,7 @@
 """``deploy.yaml``, as ``unitree_rl_lab`` writes it for the controllers in its folder ``deploy``.
 
 The model is ``source/unitree_rl_lab/unitree_rl_lab/utils/export_deploy_cfg.py`` of that repository, which rounds to
-three digits; nothing is rounded here. A controller of theirs multiplies observations by their ``scale`` and then runs
+three digits; nothing is rounded here. Its controllers multiply observations by their ``scale`` and then run
 a network, but ``policy.onnx`` takes physical ones and scales them itself: so every ``scale`` is 1. Their
 ``last_action`` is the network's output, ours is what the joints took of it; they differ where a target is beyond a
 joint's range.

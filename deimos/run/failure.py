@@ -38,6 +38,8 @@ def dump(trainer: Trainer, folder: RunFolder, error: SimulationError, versions: 
     """
     worlds = trainer.env.num_envs
     rollout = {name: value for name, value in vars(trainer.rollout).items() if isinstance(value, Tensor)}
+    cut_off = trainer.rollout.truncated.unsqueeze(2)
+    rollout["last_obs"] = trainer.rollout.last_obs.where(cut_off, 0.0)  # elsewhere is what the memory held before
     found = [*unsound("", _parts(trainer)), *unsound("rollout", rollout)]
     report = {
         "schema": SCHEMA, "error": str(error), "rank": error.rank, "iteration": trainer.iteration, "versions": versions,

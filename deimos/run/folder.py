@@ -169,6 +169,7 @@ class RunFolder:
         path = self.path / name
         if not kept:
             path.unlink(missing_ok=True)
+            self._columns.pop(name, None)  # or the next row would go without their names
         elif len(kept) < len(rows) or not read_bytes(path).endswith(b"\n"):
             self._write_csv(name, kept[0], kept)
 

@@ -58,12 +58,21 @@ class GoalLoop:
         self.core.percentile.masked_fill_(mask, 50.0)
         self.begin(mask)
 
-    def advance(self, step: Step) -> None:
+    def advance(self, step: Step, *, in_time: bool = False) -> None:
         """Process the outcome of ``step``; ``env.obs`` is then what the policy acts on next.
 
         Interactions are resolved before anything is reset, so one whose T-th step is the time
         limit keeps its label. Worlds that are done get a first goal, which the selector does not choose.
+
+        Args:
+            step: What the environment's step returned.
+            in_time: Whether to leave out goals that were issued less than T steps before the time limit: of these only
+                crashes would count, which biases a crash rate upwards. For measurements.
         """
+        if in_time and self.env.time_limit:
+            lasted = self.interactions.now + 1 - self.interactions.issued_at
+            last = self.env.episode_step - lasted + self.env.goal_period  # of the episode's steps, under the goal
+            self.interactions.active &= ~(step.terminated & (last > self.env.time_limit))
         self.renew(step, self.resolve(step))
 
     def resolve(self, step: Step) -> Changes:

@@ -1,4 +1,4 @@
-"""A finished run for use: its policy, its worlds, its fear network."""
+"""A saved run for use: its policy, its worlds, its fear network."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,14 +41,15 @@ class SavedRun:
         folder = RunFolder.open(path)
         config = read_config(folder)
         try:
-            env = config.env.for_evaluation().with_goal_period(goal_period or config.env.goal_period)
+            period = config.env.goal_period if goal_period is None else goal_period
+            env = config.env.for_evaluation().with_goal_period(period)
             if terrain is not None:
                 if not isinstance(env, LocomotionConfig):
                     raise RunError(f"terrain is for legged robots; {path} is a run of another environment.")
                 env = replace(env, terrain=terrain)
         except ValueError as error:
             raise RunError(str(error)) from error
-        return cls(folder, replace(config, env=env, evaluation=False))  # its steps fit the training's T
+        return cls(folder, replace(config, env=env, evaluation=False))  # its steps are for the training's T
 
     @property
     def has_robots(self) -> bool:

@@ -107,7 +107,7 @@ def collect(
     env = target.build(worlds, seed)
     loop = GoalLoop(env, uniform_goals(env), window=steps)
     for t in range(steps):
-        loop.advance(env.step(target.policy(env.obs)))
+        loop.advance(env.step(target.policy(env.obs)), in_time=True)
         if t % 100 == 0:
             progress(t / steps)
     env.check()
@@ -404,7 +404,7 @@ def read_shield(folder: RunFolder, weights: str) -> dict[str, Any] | None:
         shield = folder.read_json(SHIELD)["deploy"]
         known = shield["weights"]
     except (KeyError, TypeError) as error:
-        raise RunError(f"{folder.path / SHIELD} is not a shield's; make it again with deimos shield.") from error
+        raise RunError(f"{folder.path / SHIELD} is not a shield file; make it again with deimos shield.") from error
     if known != weights:
         raise RunError(
             f"{folder.path / SHIELD} was made for an earlier policy; make it again with deimos shield, or delete it."
@@ -434,5 +434,5 @@ def stored_guard(folder: RunFolder, policy: Policy, env: Env, afraid: FearSelect
         reach = [value * each for value, each in zip(stored["goal_range"], scale, strict=True)]
         shield = Shield.from_dict(stored | {"safe_goal": safe, "goal_range": reach}, mode)
     except (KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{folder.path / SHIELD} is not a shield's for these goals: {one_line(error)}") from error
+        raise RunError(f"{folder.path / SHIELD} is not a shield for these goals: {one_line(error)}") from error
     return Guard(shield, fear_rule(afraid), ShieldConfig.candidates)

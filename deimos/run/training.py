@@ -78,7 +78,7 @@ def provenance() -> dict[str, str]:
 def _commit() -> str:
     """The commit of the checkout that this file is in; unknown if it is installed, or without git."""
     home = Path(__file__).resolve().parents[2]
-    describe = ["git", "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]  # not one around it
+    describe = ["git", "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]  # of no repository around it
     try:
         return subprocess.run(describe, cwd=home, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
@@ -304,7 +304,7 @@ def read_config(folder: RunFolder) -> TrainConfig:
     """
     data = folder.read_json("config.json")
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise RunError(f"{folder.path / 'config.json'} is not a run's of schema {SCHEMA}.")
+        raise RunError(f"{folder.path / 'config.json'} does not belong to a run of schema {SCHEMA}.")
     try:
         config = from_dict(TrainConfig, data["config"] | {"eval": _today(data["config"].get("eval", {}))}, stored=True)
         kept = {name: str(folder.path / copy) for name, copy in data.get("files", {}).items()}

@@ -67,6 +67,8 @@ def make_pool(targets: Sequence[Target], path: Path, *, may_be_uninformed: bool 
     envs = [target.build(1, target.seed) for target in targets]
     if len({str(env.layout) for env in envs}) > 1:
         raise RunError("The policies have different observations, so they cannot share a fear network.")
+    if len(periods := sorted({env.goal_period for env in envs})) > 1:
+        raise RunError(f"The policies must have goals of the same period T, got {', '.join(map(str, periods))}.")
     fear, facts = fear_of(targets, targets[0].steps, own_goals=True)
     if facts["uninformed"] and not may_be_uninformed:
         raise RunError("These policies never or always crashed, so there is nothing to learn; pool others.")
