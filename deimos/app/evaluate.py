@@ -22,6 +22,7 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
 _CHANGES = ("worlds", "steps", "seed", "attackers", "pool", "oracle_worlds")
+_OTHERS = ("goal_period", "terrain_seed")
 _AUDITS = ("contexts", "calibration")
 _AUDIT = (
     ("AUROC within contexts (0.5: chance, 1: perfect)", "auroc"),
@@ -58,6 +59,9 @@ class EvaluateOptions:
     """Seed of the worlds and their goals. By default as the run was set up."""
     goal_period: int | None = None
     """T: steps that a goal is active. By default as in training."""
+    terrain_seed: int | None = None
+    """Seed of the ground of legged robots. By default as in training; another one draws random tiles that they have not
+    met."""
     device: str = "auto"
     """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
     attackers: tuple[str, ...] | None = None
@@ -79,7 +83,7 @@ class EvaluateOptions:
         for name in _AUDITS:
             check_at_least(name, getattr(self, name), 0)
         asked = [name for name in _AUDITS if getattr(self, name)]
-        others = [name for name in (*_CHANGES, "goal_period") if getattr(self, name) is not None] + asked[1:]
+        others = [name for name in (*_CHANGES, *_OTHERS) if getattr(self, name) is not None] + asked[1:]
         others += ["env.engine"] if self.env.engine else []
         if asked and others:
             raise ValueError(
@@ -104,7 +108,9 @@ def main(arguments: list[str], program: str) -> None:
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
     changes["attackers"] = tuple(dict.fromkeys((*config.eval.attackers, *changes.get("attackers", ()))))
-    env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes, options.env.engine)
+    env_config, eval_config = api.configure_evaluation(
+        config, options.goal_period, changes, options.env.engine, options.terrain_seed
+    )
     require_heard(eval_config.attackers, options.pool, options.oracle_worlds)
     with one_stream(device):
         show_evaluation(folder, config, env_config, eval_config, device)

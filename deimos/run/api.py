@@ -66,7 +66,8 @@ def _path(name: Path | str | None) -> Path | None:
 
 
 def evaluate(
-    run: Path | str, *, goal_period: int | None = None, device: str = "auto", engine: str | None = None, **changes: Any
+    run: Path | str, *, goal_period: int | None = None, device: str = "auto", engine: str | None = None,
+    terrain_seed: int | None = None, **changes: Any,
 ) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run against uniform goals (Naive) and against attackers.
 
@@ -75,6 +76,8 @@ def evaluate(
         goal_period: T: steps that a goal is active; ``None`` for that of training.
         device: ``auto``, ``cpu`` or ``cuda``.
         engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for what did in training.
+        terrain_seed: Seed of the ground of legged robots; ``None`` for that of training. Another one draws random tiles
+            that they have not met.
         changes: Fields of ``EvalConfig`` that differ from the run's, such as ``worlds``, ``steps`` or ``seed``.
 
     Returns:
@@ -85,15 +88,16 @@ def evaluate(
     """
     folder = RunFolder.open(Path(run))
     config = training.read_config(folder)
-    env_config, eval_config = configure_evaluation(config, goal_period, changes, engine)
+    env_config, eval_config = configure_evaluation(config, goal_period, changes, engine, terrain_seed)
     found = training.resolve_device(device)
     with one_stream(found):
         return evaluate_run(folder, env_config, eval_config, found)
 
 
 def configure_evaluation(
-    config: TrainConfig, goal_period: int | None, changes: dict[str, Any], engine: str | None = None
-) -> tuple[EnvConfig, EvalConfig]:
+    config: TrainConfig, goal_period: int | None, changes: dict[str, Any], engine: str | None = None,
+    terrain_seed: int | None = None,
+) -> tuple[EnvConfig, EvalConfig]:  # fmt: skip
     """What a run's policy is evaluated in and how, where that differs from how the run was set up.
 
     Raises:
@@ -104,8 +108,9 @@ def configure_evaluation(
         env_config = config.env.for_evaluation().with_goal_period(period)  # no episode is too short for it
         eval_config = with_plain_numbers(replace(config.eval, **changes))
         require_readable(eval_config)
-        if engine is not None:
-            env_config = from_dict(EnvConfig, to_dict(env_config) | {"engine": engine})
+        settings = {"engine": engine, "terrain_seed": terrain_seed}
+        if given := {name: value for name, value in settings.items() if value is not None}:
+            env_config = from_dict(EnvConfig, to_dict(env_config) | given)
         if eval_config.steps < 2 * period:
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except (TypeError, ValueError) as error:
