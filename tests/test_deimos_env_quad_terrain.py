@@ -322,7 +322,7 @@ def test_unknown_and_broken_terrains_are_refused(tmp_path):
     """A terrain that is neither a name nor a file, and a file that is not one, each give one clear line."""
     with pytest.raises(ValueError, match=r"one of flat, rough, go1, .* or the path of a terrain file, got 'moon'"):
         Config(terrain="moon").load_terrain()
-    with pytest.raises(ValueError, match=r"got 'h.stl'; make one of it by: deimos terrain import h.stl --out h.npz"):
+    with pytest.raises(ValueError, match=r"got 'h.stl'; convert it with: deimos terrain import h.stl --out h.npz"):
         Config(terrain="h.stl").load_terrain()
     with pytest.raises(ValueError, match=r"or the path of a terrain file, got 'my.toml'"):
         Config(terrain="my.toml").load_terrain()
