@@ -158,8 +158,7 @@ def read_evaluation(folder: RunFolder) -> list[dict]:
                 raise RunError(
                     f"{folder.path / EVALUATION}, row {number}: {name} must be {words}, got {row.get(name)!r:.80}."
                 )
-        if "engine" in row:  # before there was the seed, it was 0
-            row.setdefault("terrain_seed", 0)
+        row.update({"terrain_seed": 0} | row if "engine" in row else {})  # of rows from before there was the seed
     return rows
 
 
