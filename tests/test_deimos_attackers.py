@@ -332,8 +332,10 @@ def test_rows_tell_tasks_apart(tmp_path):
             assert old != new
     with pytest.raises(RunError, match=r"none\.npz cannot be read"):
         identities(replace(config, terrain="none.npz"))
-    for old, new in zip(before, identities(replace(config, engine="warp")), strict=True):
-        assert old | {"engine": "warp"} == new
+    rough = replace(config, terrain="rough")
+    for base, change in ((config, {"engine": "warp"}), (rough, {"terrain_seed": 3})):
+        for old, new in zip(identities(base), identities(replace(base, **change)), strict=True):
+            assert old | change == new != old
 
 
 def test_argmax_finds_what_crashes_a_policy():

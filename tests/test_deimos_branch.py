@@ -72,6 +72,8 @@ def test_a_branch_takes_over_what_was_learnt_and_the_worlds(origin, tmp_path):
     for name, tensor in trainer.env.state_dict().items():
         source = fresh.env.state_dict() if name in DRAW_COUNTS else state["loop"]["env"]
         assert torch.equal(tensor, source[name]), name
+    assert torch.equal(trainer.episodes.so_far, state["episodes"]["so_far"])
+    assert trainer.episodes.so_far[:, 1].any()
     assert state["loop"]["interactions"]["active"].any()
     assert not trainer.loop.interactions.active.any()
     assert trainer.iteration == trainer.loop.interactions.now == 0

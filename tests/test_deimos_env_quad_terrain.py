@@ -1,6 +1,7 @@
 """Legged robots on rough ground: levels, where they start, and what becomes of those that leave it."""
 
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +20,11 @@ from worlds import build_loop, mask_of, rows_of
 
 import deimos
 from deimos import terrain
+from deimos.app import cli
 from deimos.learn.ppo import PPOConfig
 from deimos.run import training
+from deimos.run.evaluation import EvalConfig
+from deimos.run.folder import RunFolder
 from deimos.sim.envs.quad import Config
 
 
@@ -247,13 +251,80 @@ def test_rough_ground_is_made_once():
             array[0] = 1.0
 
 
+@pytest.fixture
+def grid_file(tmp_path):
+    """A small grid as a TOML file."""
+    path = tmp_path / "my.toml"
+    shapes = 'shape = [{ name = "stairs-up", height = [0.05, 0.1] }, { name = "discrete", height = [0.03, 0.09] }]\n'
+    path.write_text(f"levels = 2\ncolumns = 2\ntile = 4.0\nborder = 2.0\ncell = 0.1\nseed = 7\n{shapes}")
+    return str(path)
+
+
+def test_a_grid_is_taken_by_its_name_or_its_file(grid_file, monkeypatch):
+    """Presets by the names of the terrain tool, rough for go1, and a TOML file are what the tool makes of them."""
+    assert np.array_equal(
+        Config(terrain=grid_file).load_terrain().heights, terrain.build(terrain.read_grid(grid_file)).heights
+    )
+    monkeypatch.setattr(terrain, "build", lambda grid: grid)
+    monkeypatch.setattr("deimos.sim.legged.config._build", lambda grid: grid)
+    for name, preset in (("rough", "go1"), ("go1", "go1"), ("legged-gym", "legged-gym")):
+        assert Config(terrain=name).load_terrain() == terrain.preset(preset)
+        assert not Config(terrain=name).files
+
+
+def test_a_seed_draws_other_ground(grid_file, hills):
+    """Added to the grid's own seed, it changes rectangles and not stairs; where nothing is drawn it is refused."""
+    ground, other = (Config(terrain=grid_file, terrain_seed=seed).load_terrain() for seed in (0, 2))
+    assert np.array_equal(other.heights, terrain.build(terrain.read_grid(grid_file, seed=9)).heights)
+    assert ground.shapes == ("stairs-up", "discrete")
+    stairs, rectangles = (other.heights[:, half] == ground.heights[:, half] for half in (slice(60), slice(60, None)))
+    assert stairs.all()
+    assert not rectangles.all()
+    for fixed in ("flat", hills):
+        with pytest.raises(ValueError, match=f"terrain_seed must be 0 on {fixed}, where nothing is drawn, got 1"):
+            Config(terrain=fixed, terrain_seed=1)
+    with pytest.raises(ValueError, match="terrain_seed must be at least 0, got -1"):
+        Config(terrain="rough", terrain_seed=-1)
+
+
+def test_ground_in_memory_is_refused_at_once(grid_file):
+    """A configuration holds names and paths, and the message says how objects become one."""
+    for ground in (terrain.flat(), terrain.read_grid(grid_file), None):
+        message = f"terrain must be a name or the path of a file, got a {type(ground).__name__}; save a Terrain by"
+        with pytest.raises(ValueError, match=message):
+            Config(terrain=ground)
+
+
+def test_a_run_is_evaluated_on_ground_that_it_has_not_met(grid_file, tmp_path, capsys):
+    """Its rows stand beside those of the ground of training, in the folder and in the table, and so in Python."""
+    config = deimos.TrainConfig(
+        env=Config(goal_period=4, episode_steps=40, terrain=grid_file, engine="native"), method="uniform", num_envs=6,
+        env_steps=4, ppo=PPOConfig(hidden=(8,), num_steps=4), eval=EvalConfig(worlds=6, steps=12, attackers=()),
+        device="cpu", threads=1,
+    )  # fmt: skip
+    run = deimos.train(config, tmp_path / "run")
+    Path(grid_file).unlink()  # the run has its own
+    stored = RunFolder(run).read_json("evaluation.json")
+    assert [row.pop("terrain_seed") for row in stored] == [0]  # as before there was the seed
+    RunFolder(run).write_json("evaluation.json", stored)
+    assert cli.main(["evaluate", str(run), "--terrain-seed", "2", "--device", "cpu"]) == 0
+    text = capsys.readouterr().out
+    assert "a goal every 4 steps, on native, ground of seed 2" in text
+    assert re.search(r"^seed of the ground +2 +0$", text, re.MULTILINE)
+    (own,) = deimos.evaluate(run, device="cpu")
+    (other,) = deimos.evaluate(run, device="cpu", terrain_seed=2)
+    assert other["reward"] != own["reward"]
+    assert (other["environment"], other["terrain_seed"]) == (own["environment"], 2)
+    assert RunFolder(run).read_json("evaluation.json") == [own, other]
+
+
 def test_unknown_and_broken_terrains_are_refused(tmp_path):
     """A terrain that is neither a name nor a file, and a file that is not one, each give one clear line."""
-    with pytest.raises(ValueError, match=r"terrain must be flat, rough or the path of a terrain file, got 'moon'"):
+    with pytest.raises(ValueError, match=r"one of flat, rough, go1, .* or the path of a terrain file, got 'moon'"):
         Config(terrain="moon").load_terrain()
     with pytest.raises(ValueError, match=r"got 'h.stl'; convert it with: deimos terrain import h.stl --out h.npz"):
         Config(terrain="h.stl").load_terrain()
-    with pytest.raises(ValueError, match=r"convert it with: deimos terrain grid --file my.toml --out my.npz"):
+    with pytest.raises(ValueError, match=r"or the path of a terrain file, got 'my.toml'"):
         Config(terrain="my.toml").load_terrain()
     (tmp_path / "x.npz").write_bytes(b"no terrain")
     with pytest.raises(ValueError, match="is not a terrain file"):

@@ -21,7 +21,7 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.shared import one_stream
 
 _CHANGES = ("worlds", "steps", "seed", "attackers", "pool", "oracle_worlds")
-_OTHERS = ("goal_period", "engine", "iteration")
+_OTHERS = ("goal_period", "engine", "terrain_seed", "iteration")
 _AUDITS = ("contexts", "calibration")
 _AUDIT = (
     ("AUROC within contexts (0.5: chance, 1: perfect)", "auroc"),
@@ -49,6 +49,9 @@ class EvaluateOptions:
     """Seed of the worlds and their goals. By default as the run was set up."""
     goal_period: int | None = None
     """T: steps that a goal is active. By default as in training."""
+    terrain_seed: int | None = None
+    """Seed of the ground of legged robots. By default as in training; another one draws random tiles that they have not
+    met."""
     device: str = "auto"
     """Where to simulate: cpu, cuda or cuda:N; auto takes the GPU where there is one."""
     attackers: tuple[str, ...] | None = None
@@ -96,7 +99,9 @@ def main(arguments: list[str], program: str) -> None:
                 _evaluate_fear(trainer, folder, options)
         return
     changes = {name: getattr(options, name) for name in _CHANGES if getattr(options, name) is not None}
-    env_config, eval_config = api.configure_evaluation(config, options.goal_period, changes, options.engine)
+    env_config, eval_config = api.configure_evaluation(
+        config, options.goal_period, changes, options.engine, options.terrain_seed
+    )
     with one_stream(device):
         show_evaluation(folder, config, env_config, eval_config, device, options.iteration)
     print(folder.path)

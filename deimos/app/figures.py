@@ -10,7 +10,7 @@ from deimos.app.console import number
 from deimos.app.findings import conditions, heading, percent, wilson
 from deimos.files import write_whole
 from deimos.goals.calibration import reliability
-from deimos.run.evaluation import read_evaluation
+from deimos.run.evaluation import SETTINGS, read_evaluation
 from deimos.run.folder import RunFolder
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def _bars(axes: "Axes", rows: list[dict]) -> None:
     """Shares of goals that ended in a crash, with the score where there is one: large evaluations first."""
     groups: dict[tuple, list[dict]] = {}
     for row in sorted(rows, key=lambda row: -row["worlds"] * row["steps"]):
-        alike = tuple(row.get(name) for name in ("worlds", "steps", "goal_period", "seed", "engine"))
+        alike = tuple(row.get(name) for name in ("worlds", "steps", "goal_period", "seed", *SETTINGS))
         groups.setdefault(alike, []).append(row)
     shown = list(groups.values())[:MOST_EVALUATIONS]
     width = min(BAR, 0.9 / max(map(len, shown)))

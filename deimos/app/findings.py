@@ -28,10 +28,12 @@ def describe(rows: list[dict], elsewhere: Sequence[dict] = ()) -> str:
 
     Args:
         rows: Those that ``deimos.run.evaluation.evaluate`` gives.
-        elsewhere: Those of the same evaluation on another engine, which the table has too.
+        elsewhere: Those of the same evaluation on another engine or other ground, which the table has too.
     """
     columns = [*rows, *elsewhere]
     lines = [("simulated by", [known(row.get("engine"), str) for row in columns])]
+    if any(row.get("terrain_seed") for row in columns):
+        lines += [("seed of the ground", [known(row.get("terrain_seed"), str) for row in columns])]
     lines += [("goals that ended in a crash", [percent(row["crash_rate"]) for row in columns])]
     ends = "standing still, 1: perfect tracking" if "matching" in rows[0] else "no action, 1: reference controller"
     named = ((f"score (0: {ends})", "score"), *_LINES)
@@ -56,7 +58,8 @@ def heading(goals: str) -> tuple[str, str]:
 def conditions(row: dict) -> str:
     """What an evaluation was made under."""
     engine = f", on {row['engine']}" if "engine" in row else ""
-    return f"{row['worlds']:,} worlds x {row['steps']:,} steps, a goal every {row['goal_period']} steps{engine}"
+    ground = f", ground of seed {row['terrain_seed']}" if row.get("terrain_seed") else ""
+    return f"{row['worlds']:,} worlds x {row['steps']:,} steps, a goal every {row['goal_period']} steps{engine}{ground}"
 
 
 def _per_part(rows: list[dict]) -> list[tuple[str, list[str]]]:

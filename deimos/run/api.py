@@ -134,7 +134,8 @@ def _path(name: Path | str | None) -> Path | None:
 def evaluate(
     run: Path | str, *, worlds: int | None = None, steps: int | None = None, seed: int | None = None,
     attackers: tuple[str, ...] | None = None, goal_period: int | None = None, engine: str | None = None,
-    iteration: int | None = None, device: str = "auto", progress: bool | None = None, **changes: Any,
+    terrain_seed: int | None = None, iteration: int | None = None, device: str = "auto", progress: bool | None = None,
+    **changes: Any,
 ) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run against uniform goals (Naive) and against attackers, as ``deimos evaluate`` does.
 
@@ -146,6 +147,8 @@ def evaluate(
         attackers: Attackers of the policy, by name; ``()`` for uniform goals alone.
         goal_period: T: steps that a goal is active; ``None`` for that of training.
         engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for the one of training.
+        terrain_seed: Seed of the ground of legged robots; ``None`` for that of training. Another one draws random tiles
+            that they have not met.
         iteration: Use the policy that ``save_every`` kept after this iteration; ``None`` for the last one.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Whether to show progress on stderr; ``None`` shows it on a terminal and in a notebook.
@@ -160,15 +163,17 @@ def evaluate(
     folder = RunFolder.open(Path(run))
     usual = {"worlds": worlds, "steps": steps, "seed": seed, "attackers": attackers}
     changes |= {name: value for name, value in usual.items() if value is not None}
-    env_config, eval_config = configure_evaluation(training.read_config(folder), goal_period, changes, engine)
+    config = training.read_config(folder)
+    env_config, eval_config = configure_evaluation(config, goal_period, changes, engine, terrain_seed)
     found = training.resolve_device(device)
     with one_stream(found), shown("evaluating", progress) as report:
         return evaluate_run(folder, env_config, eval_config, found, report, iteration=iteration)
 
 
 def configure_evaluation(
-    config: TrainConfig, goal_period: int | None, changes: dict[str, Any], engine: str | None = None
-) -> tuple[EnvConfig, EvalConfig]:
+    config: TrainConfig, goal_period: int | None, changes: dict[str, Any], engine: str | None = None,
+    terrain_seed: int | None = None,
+) -> tuple[EnvConfig, EvalConfig]:  # fmt: skip
     """Environment and settings of an evaluation that may differ from those of the run.
 
     Raises:
@@ -179,8 +184,9 @@ def configure_evaluation(
         env_config = with_plain_numbers(config.env.for_evaluation().with_goal_period(period))  # no episode limits T
         eval_config = with_plain_numbers(replace(config.eval, **changes))
         require_readable(eval_config)
-        if engine is not None:
-            env_config = from_dict(EnvConfig, to_dict(env_config) | {"engine": engine})
+        settings = {"engine": engine, "terrain_seed": terrain_seed}
+        if given := {name: value for name, value in settings.items() if value is not None}:
+            env_config = from_dict(EnvConfig, to_dict(env_config) | given)
         if eval_config.steps < 2 * period:
             raise ValueError(f"steps must be at least 2 T = {2 * period}, got {eval_config.steps}.")
     except (TypeError, ValueError) as error:

@@ -40,6 +40,9 @@ _ROW: dict[str, Any] = {
 }  # fmt: skip
 """What every row of it has, and of what type."""
 
+SETTINGS = ("engine", "terrain_seed")
+"""Fields of an environment that rows have as they are; ``environment`` is a hash of the others."""
+
 Progress = Callable[[str, float], None]
 """Called now and then with the stage's name and the share of it that is done."""
 
@@ -111,10 +114,10 @@ def evaluate_run(
 ) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
 
-    There they replace the rows of the same evaluation of the same weights. One with another T, size, seed or engine, or
-    with an Adversary that was trained differently, is another evaluation, and is kept. Rows that the folder has are
-    made ``again`` or returned as they are. The policy is the last one, or the one kept after an ``iteration``; for the
-    other arguments see ``evaluate``.
+    There they replace the rows of the same evaluation of the same weights. One with another T, size, seed, engine or
+    ground, or with an Adversary that was trained differently, is another evaluation, and is kept. Rows that the folder
+    has are made ``again`` or returned as they are. The policy is the last one, or the one kept after an ``iteration``;
+    for the other arguments see ``evaluate``.
 
     Returns:
         The rows of this evaluation, those of ``evaluate`` with the policy's ``weights_hash``.
@@ -157,6 +160,7 @@ def read_evaluation(folder: RunFolder) -> list[dict]:
                 raise RunError(
                     f"{folder.path / EVALUATION}, row {number}: {name} must be {words}, got {row.get(name)!r:.80}."
                 )
+        row |= {"terrain_seed": row.get("terrain_seed", 0)} if "engine" in row else {}  # rows of 0.1 lack it
     return rows
 
 
@@ -180,28 +184,25 @@ def require_pool(config: EvalConfig) -> None:
 
 
 def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
-    """Rows of the folder that differ from these of an evaluation only in the engine."""
+    """Rows of the folder that differ from these of an evaluation only in ``SETTINGS``."""
+    keys = ("goals", "goal_period", "seed", "worlds", "steps", "environment", "adversary_setting", "weights")
 
-    def identity(row: dict) -> list:
-        keys = ("goals", "goal_period", "seed", "worlds", "steps", "environment", "adversary_setting", "weights")
-        return [row.get(key) for key in keys]
+    def said(row: dict, names: Sequence[str]) -> list:
+        return [row.get(name) for name in names]
 
-    here = {row.get("engine") for row in rows}
-    same = [identity(row) for row in rows]
-    known = read_evaluation(folder)
-    return [row for row in known if row.get("engine") not in here and identity(row) in same]
+    here, same = ([said(row, names) for row in rows] for names in (SETTINGS, keys))
+    return [row for row in read_evaluation(folder) if said(row, SETTINGS) not in here and said(row, keys) in same]
 
 
 def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
     """What each row of an evaluation says of how it was made, which distinguishes it from those of others."""
     shared = {name: value for name, value in to_dict(config).items() if name in ("worlds", "seed", "fear")}
     environment = _environment(env_config)
-    engine = {"engine": env_config.engine} if hasattr(env_config, "engine") else {}
+    settings = {name: getattr(env_config, name) for name in SETTINGS if hasattr(env_config, name)}
     return [
         {"goals": goals, "goal_period": env_config.goal_period, "seed": config.seed,
          "worlds": config.worlds_against(goals), "steps": config.steps, "environment": environment}
-        | engine
-        | ({} if goals == "naive" else {"adversary_setting": _setting(shared, config, goals)})
+        | settings | ({} if goals == "naive" else {"adversary_setting": _setting(shared, config, goals)})
         for goals in ("naive", *config.attackers)
     ]  # fmt: skip
 
@@ -213,7 +214,7 @@ def _environment(env_config: EnvConfig) -> str:
     except OSError as error:
         raise RunError(f"{error.filename} cannot be read ({error.strerror}).") from error
     task = asdict(env_config.for_evaluation()) | files
-    return _digest({name: value for name, value in task.items() if name not in ("goal_period", "engine")})
+    return _digest({name: value for name, value in task.items() if name not in ("goal_period", *SETTINGS)})
 
 
 def _digest(data: dict) -> str:

@@ -66,7 +66,7 @@ def _invalid(rollout: Rollout) -> list[dict[str, Any]]:
 
 
 def _parts(trainer: Trainer) -> dict[str, Any]:
-    return {"ppo": trainer.ppo, "env": trainer.env, "goals": trainer.loop.core}
+    return {"ppo": trainer.ppo, "env": trainer.env, "goals": trainer.loop.core, "episodes": trainer.episodes}
 
 
 def _places(bad: Tensor, worlds: int | None = None) -> list[int]:

@@ -46,7 +46,7 @@ class SavedRun:
             if terrain is not None:
                 if not isinstance(env, LocomotionConfig):
                     raise RunError(f"terrain is for legged robots; {path} is a run of another environment.")
-                env = replace(env, terrain=terrain)
+                env = replace(env, terrain=terrain, terrain_seed=0)
         except ValueError as error:
             raise RunError(str(error)) from error
         return cls(folder, replace(config, env=env, evaluation=False))  # its steps are for the training's T

@@ -33,6 +33,7 @@ from deimos.nn.host import own_settings
 from deimos.nn.layout import seen_by
 from deimos.nn.threads import tf32_products, torch_on_one
 from deimos.run.config import from_dict, kind, to_dict
+from deimos.run.episodes import Episodes
 from deimos.run.evaluation import EvalConfig
 from deimos.run.logs import LOGS
 from deimos.run.loop import GoalLoop, spaces
@@ -162,6 +163,7 @@ class Trainer:
             actor_sees=actor_sees, critic_sees=critic_sees, record=record,
         )  # fmt: skip
         self.rollout = self.ppo.new_rollout()
+        self.episodes = Episodes(num_envs, device)
         clones = Clones(lambda count: config.env.build(count, device, config.seed), self.ppo.actor)
         for part in with_parts(self.loop.selector):
             if isinstance(part, SeesWorlds):
@@ -274,12 +276,14 @@ class Trainer:
             "crashes": crashes,
             "crashes_per_1000": 1000 * crashes / transitions,
             "selected_fraction": ranks.mean_over_ranks(self.loop.interactions.active.float().mean()).item(),
+            **self.episodes.add(rollout, penalty),
         }
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs."""
         made_for, ppo, loop = _identity(self.config), self.ppo.state_dict(), self.loop.state_dict()
-        return {"iteration": self.iteration, "made_for": made_for, "ppo": ppo, "loop": loop}
+        episodes = self.episodes.state_dict()
+        return {"iteration": self.iteration, "made_for": made_for, "ppo": ppo, "loop": loop, "episodes": episodes}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from ``state_dict()``.
@@ -293,6 +297,7 @@ class Trainer:
                 raise ValueError(f"it was made for {made_for}, this run is {_identity(self.config)}.")
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
+            self.episodes.load_state_dict(state.get("episodes"))
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             text = "The checkpoint belongs to another environment or network size: "
             raise RunError(text + one_line(error)) from error

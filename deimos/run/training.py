@@ -209,6 +209,7 @@ def _take_over(trainer: Trainer, origin: RunFolder) -> None:
         check_branch(trainer.config, read_config(origin))
         trainer.ppo.load_learnt(state["ppo"])
         trainer.env.take_worlds(state["loop"]["env"])
+        trainer.episodes.load_state_dict(state.get("episodes"))
     except (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
         raise RunError(f"A run cannot branch off {origin.path}: {one_line(error)}") from error
 

@@ -16,7 +16,7 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.legged import engines, robot_file, robots
 from deimos.sim.legged.engines import PhysicsConfig
 from deimos.sim.legged.robots import Robot
-from deimos.terrain import Terrain, importing
+from deimos.terrain import Grid, Terrain, importing, presets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,11 @@ class LocomotionConfig(EnvConfig):
     robot: str = "go1"
     """Which robot walks: a name of ``deimos.sim.legged.robots``, or the path of a robot file (.toml)."""
     terrain: str = "flat"
-    """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a terrain file (.npz)."""
+    """What the robots walk on: flat, a preset of ``deimos terrain`` (go1, that is rough: slopes, stairs, rectangles; or
+    legged-gym), or the path of a terrain file (.npz) or of a grid (.toml)."""
+    terrain_seed: int = 0
+    """Added to the seed of the grid, at least 0: another one draws other rough slopes and rectangles. Stairs and smooth
+    slopes are the same for every seed."""
     engine: engines.Name = field(default="auto", metadata={"before": "warp"})
     """The simulator: warp (mujoco-warp), or native, MuJoCo's own C code on all cores of a CPU; auto takes warp on CUDA
     and native on a CPU."""
@@ -72,6 +76,7 @@ class LocomotionConfig(EnvConfig):
         super().__post_init__()
         check_at_least("episode_steps", self.episode_steps, 0)
         check_at_least("start_levels", self.start_levels, 1)
+        self._check_terrain()
         if 0 < self.episode_steps < self.goal_period:
             raise ValueError(
                 f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
@@ -95,7 +100,7 @@ class LocomotionConfig(EnvConfig):
     @property
     def files(self) -> dict[str, Path]:
         """See ``EnvConfig.files``: terrain and robot, unless they have names."""
-        terrain_file = {} if self.terrain in ("flat", "rough") else {"terrain": Path(self.terrain).expanduser()}
+        terrain_file = {} if self._terrain_name else {"terrain": Path(self.terrain).expanduser()}
         return terrain_file | ({"robot": Path(self.robot).expanduser()} if self._has_robot_file else {})
 
     def read_file(self, name: str) -> tuple[bytes, str]:
@@ -130,6 +135,26 @@ class LocomotionConfig(EnvConfig):
         with robot_file.opened(self.files["robot"]) as (robot, folder):
             return robot.build(folder, **self._gains())
 
+    def _check_terrain(self) -> None:
+        """Raise ``ValueError`` for an object in place of a path, and for a seed of ground that is not drawn."""
+        if not isinstance(self.terrain, str | Path):
+            raise ValueError(
+                f"terrain must be a name or the path of a file, got a {type(self.terrain).__name__}; save a Terrain by "
+                "ground.save('ground.npz'), a Grid by terrain.build(grid).save('ground.npz'), and give that path."
+            )
+        check_at_least("terrain_seed", self.terrain_seed, 0)
+        if self.terrain_seed and (self.terrain == "flat" or Path(self.terrain).suffix.lower() == ".npz"):
+            raise ValueError(
+                f"terrain_seed must be 0 on {self.terrain}, where nothing is drawn, got {self.terrain_seed}; it is for "
+                "presets and grids (.toml)."
+            )
+
+    @property
+    def _terrain_name(self) -> str | None:
+        """The terrain as a name: flat, or a preset of the terrain tool; ``None`` for a file."""
+        name = "go1" if self.terrain == "rough" else self.terrain
+        return name if name in ("flat", *presets.preset_names()) else None
+
     @property
     def _has_robot_file(self) -> bool:
         return Path(self.robot).suffix.lower() in robot_file.ENDINGS
@@ -145,24 +170,29 @@ class LocomotionConfig(EnvConfig):
         Raises:
             ValueError: If there is no terrain of this name, or the file is not a terrain file.
         """
-        if self.terrain == "flat":
+        if self._terrain_name == "flat":
             return None
-        if self.terrain == "rough":
-            return _rough()
+        if self._terrain_name:
+            return _build(self._seeded(terrain.preset(self._terrain_name)))
         path = self.files["terrain"]
-        makers = dict.fromkeys(importing.OPTIONS.keys() - {".npz"}, "import") | {".toml": "grid --file"}
-        if maker := makers.get(path.suffix.lower()):
-            advice = f"deimos terrain {maker} {path} --out {path.with_suffix('.npz')}"
-            raise ValueError(f"terrain must be flat, rough or a terrain file, got '{path}'; convert it with: {advice}")
+        if path.suffix.lower() in importing.OPTIONS.keys() - {".npz"}:
+            advice = f"deimos terrain import {path} --out {path.with_suffix('.npz')}"
+            raise ValueError(f"terrain must be a name or a terrain file, got '{path}'; convert it with: {advice}")
         if not path.is_file():
-            raise ValueError(f"terrain must be flat, rough or the path of a terrain file, got '{self.terrain}'.")
+            names = ", ".join(("flat", "rough", *presets.preset_names()))
+            raise ValueError(f"terrain must be one of {names} or the path of a terrain file, got '{self.terrain}'.")
+        if path.suffix.lower() == ".toml":
+            return _build(self._seeded(terrain.read_grid(path)))
         return terrain.load(path)
 
+    def _seeded(self, grid: Grid) -> Grid:
+        return replace(grid, seed=grid.seed + self.terrain_seed)
 
-@lru_cache(maxsize=1)
-def _rough() -> Terrain:
-    """The terrain ``rough``: the same in every environment; it takes two seconds. Its arrays are read-only."""
-    ground = terrain.rough()
+
+@lru_cache(maxsize=2)
+def _build(grid: Grid) -> Terrain:
+    """The ground of a grid: the same in every environment; it takes two seconds. Its arrays are read-only."""
+    ground = terrain.build(grid)
     for array in (ground.heights, ground.origins):
         array.flags.writeable = False
     return ground
