@@ -45,7 +45,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
     Observations are what the policy sees. What is privileged is not in them: ``loop.env.obs`` holds all of it.
     ``loop`` leads to the environment, the selector and the interactions; every ``reset`` with a seed makes another one,
-    whose selector has learnt nothing.
+    whose selector has learnt nothing. Weights of losses and crash penalties are left to you, as in ``RslRlVecEnv``.
     On CUDA make it and call it within ``deimos.sim.shared.one_stream(device)``; outside, it is refused.
 
     Args:
