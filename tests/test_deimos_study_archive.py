@@ -201,7 +201,7 @@ def test_study_file_may_name_further_attackers(file, tmp_path):
         study.add_rounds(rounds(description))
     assert [(each.attackers, each.seeds) for each in study.rounds()] == [(("search",), (0,)), (("search",), ())]
     for table, message in (
-        ({"attackers": ["nobody"]}, "There is no attacker 'nobody'"),
+        ({"attackers": ["nobody"]}, "Unknown attacker 'nobody'"),
         ({"attackers": []}, "attackers must be one or more names, got none"),
         ({"attackers": ["search"], "seeds": "x"}, "seeds must be a number of seeds"),
         ({"who": ["search"]}, r"An \[\[attack\]\] has no who; it has: attackers, seeds"),
@@ -281,7 +281,7 @@ def test_foreign_archive_is_refused(tmp_path, name):
     """An archive that would write anything but the files of cells is refused, and nothing of it is written."""
     with zipfile.ZipFile(tmp_path / "policies.zip", "w") as archive:
         archive.writestr(name, "x")
-    with pytest.raises(RunError, match=r"policies\.zip is no archive of policies, or it is broken"):
+    with pytest.raises(RunError, match=r"policies\.zip is not an archive of policies, or it is broken"):
         cli.UnpackOptions(folder=tmp_path).run()
     assert [path.name for path in tmp_path.iterdir()] == ["policies.zip"]
 
@@ -332,7 +332,7 @@ def test_run_that_lost_its_configuration_is_made_again(whole, tmp_path, capsys):
     run.mkdir()
     (run / "checkpoint.pt").write_text("whatever")
     assert worker.main([str(study.path), cell.name]) == 0
-    assert capsys.readouterr().err == f"{run} holds no config.json; the cell is made again.\n"
+    assert capsys.readouterr().err == f"{run} holds no config.json; the cell starts again.\n"
     assert table(study, WORST) == [row for row in table(whole, WORST) if row["hash"] == repr(cell.digest)]
 
 

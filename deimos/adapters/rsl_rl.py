@@ -17,7 +17,7 @@ from deimos.sim.env import Env
 
 
 class RslRlVecEnv(VecEnv):
-    """An environment as rsl_rl 5 wants it: goals are issued and worlds that are done begin anew within ``step``.
+    """An environment as rsl_rl 5 wants it: ``step`` also issues goals and resets worlds that are done.
 
     Everything that it returns is a copy that later steps leave alone. Of what a selector wants of the learner, two
     things are left to you: multiply losses by ``loop.weight`` (``weighted``), and subtract ``selector.crash_penalty``
@@ -26,8 +26,8 @@ class RslRlVecEnv(VecEnv):
 
     Args:
         env: The worlds, as they were built.
-        selector: Who chooses their goals; ``None`` for Uniform.
-        reward_scale: What rewards are multiplied with, positive.
+        selector: Chooses their goals; ``None`` for Uniform.
+        reward_scale: What rewards are multiplied by, positive.
         report_every: Steps between two reports, ``log`` of the extras, at least 1: making one waits for the device.
         learn_every: Steps between two updates of the selector, at least 1; the steps of a rollout are a good choice.
             ``None`` leaves it to you: call ``loop.learn()`` at least every T steps, or ``loop.learn(rollout)`` for
@@ -97,7 +97,7 @@ class RslRlVecEnv(VecEnv):
             selector's last update says.
 
         Raises:
-            SimulationError: If an action is not finite, or more worlds become invalid than may.
+            SimulationError: If an action is not finite, or too many worlds become invalid.
         """
         step = self.env.step(actions.detach())
         self.env.check()  # rsl_rl looks for NaN in what comes back, but a clipped NaN is a number
@@ -113,7 +113,7 @@ class RslRlVecEnv(VecEnv):
 
 
 def runner_config(ppo: PPOConfig, env: RslRlVecEnv) -> dict[str, Any]:
-    """The configuration of rsl_rl's ``OnPolicyRunner`` that says the same as ``ppo``, for the observations of ``env``.
+    """The configuration of rsl_rl's ``OnPolicyRunner`` that corresponds to ``ppo``, for the observations of ``env``.
 
     The reward scale is not in it: give it to the environment.
     """

@@ -12,7 +12,6 @@ from deimos.checks import check_at_least, check_choice, check_is, check_seed, on
 from deimos.goals import given
 from deimos.goals.given import Bound, Candidates, Inputs
 from deimos.goals.selector import SelectorConfig
-from deimos.nn.stateful import LARGEST, is_sound
 
 PLAIN = (bool, int, float, str, type(None))
 
@@ -61,12 +60,12 @@ def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **oth
     """What two Directors must have in common where one continues from the other's state: plain values by name.
 
     Args:
-        config: The selector's; its plain fields count, and those of the dataclasses in it.
+        config: The selector's configuration; its plain fields count, and those of the dataclasses in it.
         goal_box: Lowest and highest goal.
         **others: What else counts, plain.
 
     Raises:
-        ValueError: If the configuration is none, but a selector or its class.
+        ValueError: If ``config`` is not a configuration but, say, a selector or a class.
     """
     check_is("selector", config, SelectorConfig)
     box = None if goal_box is None else [_numbers(end) for end in goal_box]
@@ -99,7 +98,7 @@ def unpacked(state: Mapping[str, Any], own: Mapping[str, Any]) -> tuple[list[int
 
     Args:
         state: What ``GoalDirector.state_dict`` returned.
-        own: Settings of the Director that shall continue from it.
+        own: Settings of the Director that is to continue from it.
 
     Raises:
         ValueError: If something is missing, or it is of a Director with other settings, which are named.
@@ -118,32 +117,12 @@ def unpacked(state: Mapping[str, Any], own: Mapping[str, Any]) -> tuple[list[int
 
 
 def check_candidates(candidates: Candidates, count: int, inputs: Inputs, drawn: bool) -> None:
-    """Raise ``ValueError`` if candidates of ``count`` worlds do not fit, or there are none that could be ``drawn``.
+    """Raise ``ValueError`` if candidates of ``count`` worlds do not fit, or are missing and cannot be ``drawn``.
 
-    What a function makes, and the numbers themselves, are looked at where they are needed.
+    What a function makes, and the numbers themselves, are checked where they are needed.
     """
     inputs.check_candidates(candidates, count)
     if candidates is None and not drawn:
         raise ValueError("candidates must be given where GoalDirector was made without a goal_box, got None.")
     if isinstance(candidates, Tensor):
         given.tensor("candidates", candidates, inputs.device)
-
-
-def refuse_unsound(name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None) -> None:
-    """Raise ``ValueError`` where a number is not finite, or so large that what is learnt from it would not be.
-
-    Args:
-        name: What they are.
-        numbers: Shape (m, n), m and n at least 1.
-        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
-        but: Rows that do not matter, bool, shape (m,).
-    """
-    if bool(is_sound(torch.stack(numbers.aminmax())).all()):
-        return
-    given.refuse_not_finite(name, numbers, rows, but)
-    large = ~is_sound(numbers).all(1)
-    large = large if but is None else large & ~but
-    if bool(large.any()):
-        row = int(large.nonzero()[0])
-        world = row if rows is None else int(rows[row])
-        raise ValueError(f"{name} of world {world} must be at most {LARGEST:g} in size, got {numbers[row].tolist()}.")

@@ -18,11 +18,11 @@ class Config(SelectorConfig):
     """Goals by the weights of grid cells, which rise around every cell whose goals are tracked well."""
 
     bins: int = 8
-    """Cells along every component of a goal, at least 2. Every group of components has a grid of its own."""
+    """Cells along every component of a goal, at least 2. Every group of components has its own grid."""
     start: float = 0.5
-    """Share of the range whose cells have weight 1 at the start, in (0, 1]; the others have none."""
+    """Share of the range whose cells have weight 1 at the start, in (0, 1]; the others have weight 0."""
     growth: float = 0.2
-    """What a well-tracked goal adds to the weights of its cell and its neighbours, which end at 1. In (0, 1]."""
+    """What a well-tracked goal adds to the weights of its cell and its neighbours, up to 1. In (0, 1]."""
     reach: float = 1.0
     """How far a neighbour may be along every component [cells], positive."""
     threshold: float = 0.8
@@ -48,7 +48,7 @@ class Config(SelectorConfig):
 class Grid(GoalSelector):
     """See ``Config``. Until it has learnt once, and so knows how far goals reach, it is uniform.
 
-    Cells reach as far as goals do from the middle of their range; who gives no ``goal_box`` has goals around 0.
+    Cells reach as far as goals do from the middle of their range; without a ``goal_box``, the middle is 0.
 
     Raises:
         ValueError: If a group's grid would have more than 2^20 cells.
@@ -118,8 +118,8 @@ class Grid(GoalSelector):
         """Raise the weights around the cells of goals that were tracked well."""
         done = interactions.resolved(self._learnt_at)
         self._learnt_at = interactions.now
-        if bool((max_over_ranks(self._seen) > 0).all()):
-            self._half.copy_(self._seen)
+        if bool((max_over_ranks(self._seen) > 0).any()):
+            self._half.copy_(self._seen.masked_fill(self._seen == 0, 1.0))  # what never varies is always in one cell
             self.fitted = True
         row = {}
         for i, group in enumerate(self._groups):

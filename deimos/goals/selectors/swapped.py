@@ -29,10 +29,10 @@ class Config(director.Config):
 
 
 class Swapped(director.Director):
-    """See ``Config``. The other state is one of the last decisions, any of as many as there are worlds.
+    """See ``Config``. The other state is from one of the last decisions, of which as many count as there are worlds.
 
     So a goal is as likely as under the Director, whatever the state that it is issued in. Candidates stay the world's
-    own, for what is valid may depend on the state.
+    own, since what is valid may depend on the state.
     """
 
     saved = (*director.Director.saved, "_state", "_goal", "_count")
@@ -48,7 +48,8 @@ class Swapped(director.Director):
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
         """See ``FearSelector.ranking``."""
         other = picks.uniformly(draws[:, 3], self._count.clamp(max=len(self._state)))
-        return self.score(self._state[other], self._goal[other], candidates)
+        swapped = self.score(self._state[other], self._goal[other], candidates)
+        return super().ranking(state, goal, candidates, swapped, draws)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``."""
