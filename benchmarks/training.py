@@ -129,7 +129,7 @@ def _rsl_rl(config: TrainConfig, device: torch.device) -> Callable[[int], None] 
 
     env = RslRlVecEnv(config.env.build(config.num_envs, device, config.seed), reward_scale=config.ppo.reward_scale)
     with contextlib.redirect_stdout(io.StringIO()):
-        runner = OnPolicyRunner(env, runner_config(config.ppo), log_dir=None, device=str(device))
+        runner = OnPolicyRunner(env, runner_config(config.ppo, env), log_dir=None, device=str(device))
 
     def learn(iterations: int) -> None:
         with contextlib.redirect_stdout(io.StringIO()):

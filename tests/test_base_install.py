@@ -69,7 +69,7 @@ def test_trained_policy_loads_and_acts():
 import deimos, torch
 policy = deimos.load_policy({str(HOME / "docs" / "results" / "quad_flat")!r})
 size = sum(field.size for field in policy.layout)
-assert policy(torch.zeros(2, size)).shape == (2, 12)
+assert policy.physical(torch.zeros(2, size)).shape == (2, 12)
 """
     done = run(code)
     assert done.returncode == 0, done.stderr

@@ -16,6 +16,7 @@ from deimos import plugins
 from deimos.adapters.gymnasium import ENVIRONMENTS, VERSION, GymnasiumEnv, GymnasiumVectorEnv
 from deimos.checks import SimulationError
 from deimos.goals.selectors import director
+from deimos.nn.layout import seen_by
 from deimos.sim import envs as sim_envs
 from deimos.sim.envs import particle, quad
 
@@ -322,6 +323,48 @@ def test_selector_chooses_the_goals():
     envs.reset(seed=1)
     assert envs.loop.selector is not selector
     assert envs.loop.selector.num_candidates == 7
+
+
+def test_the_privileged_is_not_shown():
+    """Observations, last ones too, have what the layout shows the policy; the environment has all."""
+    config = quad.Config(engine="native", privileged=("linear_velocity", "heights"))
+    envs = GymnasiumVectorEnv(config, 2, seed=0)
+    seen = seen_by("actor", envs.loop.env.layout, torch.device("cpu")).numpy()
+    obs, _ = envs.reset()
+    assert envs.single_observation_space.shape == (45,)
+    assert envs.observation_space.contains(obs)
+    np.testing.assert_array_equal(obs, envs.loop.env.obs.numpy()[:, seen])
+    envs.loop.env.tensors["qvel"][1, 0] = 99.0
+    obs, *_, infos = envs.step(np.zeros((2, 12), np.float32))
+    np.testing.assert_array_equal(obs, envs.loop.env.obs.numpy()[:, seen])
+    assert infos["final_obs"][1].shape == (45,)
+
+
+def test_a_goal_dict_hides_the_privileged_too(monkeypatch):
+    """``observation`` is without it; where what is achieved is privileged, ``achieved_goal`` would tell it."""
+    build = particle.Config.build
+
+    def hiding(name):
+        def built(self, *arguments, **options):
+            env = build(self, *arguments, **options)
+            env.layout = tuple(
+                replace(field, seen_by="critic") if field.name == name else field for field in env.layout
+            )
+            return env
+
+        monkeypatch.setattr(particle.Config, "build", built)
+
+    config = replace(CONFIG, variant="directional")
+    hiding("position")
+    envs = GymnasiumVectorEnv(config, 4, 0, goal_dict=True)
+    obs = play(envs, random_actions(3, 4))[-1][0]
+    assert envs.observation_space.contains(obs)
+    every = envs.loop.env.obs.numpy()
+    np.testing.assert_array_equal(obs["observation"], every[:, [0, 1, 2, 6, 7, 8]])
+    np.testing.assert_array_equal(obs["achieved_goal"], every[:, :3])
+    hiding("velocity")
+    with pytest.raises(ValueError, match=r"since achieved_goal would show privileged entries: velocity"):
+        GymnasiumVectorEnv(config, 4, 0, goal_dict=True)
 
 
 @pytest.mark.parametrize("bound", [1.0, 100.0, float("inf")])

@@ -6,11 +6,11 @@ import torch
 from bare_loop import CONFIG, CPU, TIME_LIMIT, Bare, random_actions
 from rsl_rl.runners import OnPolicyRunner
 
-from deimos.adapters.rsl_rl import RslRlVecEnv
+from deimos.adapters.rsl_rl import RslRlVecEnv, runner_config
 from deimos.checks import SimulationError
-from deimos.goals.fear import FearConfig
-from deimos.goals.selectors import director
-from deimos.run.loop import spaces
+from deimos.learn.ppo import PPOConfig
+from deimos.nn.layout import seen_by
+from deimos.nn.networks import Actor
 from deimos.sim.envs import particle, quad
 
 
@@ -109,21 +109,30 @@ def test_without_a_time_limit():
     assert env.step(torch.zeros(4, 3))[3]["time_outs"].sum() == 0
 
 
-def test_director_learns_from_rsl_rl(torch_device):
-    """Interactions that rsl_rl's loop collected, in inference mode, fit a fear network outside of it."""
-    torch.manual_seed(0)
-    env = CONFIG.build(64, torch_device, 0)
-    config = director.Config(percentile=75.0, candidates=20, fear=FearConfig(min_per_class=4))
-    env = RslRlVecEnv(env, config.build(spaces(env), seed=0))
-    runner, _ = rsl_rl_runner(env, num_steps=12)
-    selector, interactions = env.loop.selector, env.loop.interactions
-    runner.learn(num_learning_iterations=1)
-    assert not selector.fear.fitted
-    assert np.isfinite(selector.fear.fit(interactions.resolved()))
-    runner.learn(num_learning_iterations=1)
-    resolved = interactions.resolved()
-    assert resolved.score[resolved.issued > 12].isfinite().all()
-    assert np.isfinite(selector.fear.fit(resolved))
+def test_the_actor_does_not_see_what_is_privileged():
+    """``policy`` has what the layout shows the actor, in its order, and ``critic`` all; the runner's networks fit."""
+    config = quad.Config(engine="native", privileged=("linear_velocity", "heights"))
+    env = RslRlVecEnv(config.build(4, CPU, 0))
+    ppo = PPOConfig(hidden=(16,), activation="elu", num_steps=4, epochs=1, minibatches=1)
+    runner = OnPolicyRunner(env, runner_config(ppo, env), log_dir=None, device="cpu")
+    runner.learn(1)
+    obs, own = env.get_observations(), env.env
+    seen = seen_by("actor", own.layout, CPU)
+    assert {name: part.shape for name, part in obs.items()} == {"policy": (4, 45), "critic": (4, 235)}
+    assert torch.equal(obs["policy"], own.obs[:, seen])
+    assert torch.equal(obs["critic"], own.obs)
+    theirs = runner.alg.get_policy()
+    actor = Actor(own.obs_dim, (16,), own.action_dim, "elu", 1.0, seen=seen)  # ours, for all of an observation
+    actor.mean.load_state_dict(theirs.mlp.state_dict())
+    with torch.no_grad():
+        torch.testing.assert_close(actor(own.obs), theirs(obs))
+
+
+def test_without_privileges_there_is_one_group():
+    """Actor and critic see the same then, which is stored once."""
+    env = RslRlVecEnv(CONFIG.build(4, CPU, 0))
+    assert set(env.get_observations().keys()) == {"policy"}
+    assert runner_config(PPOConfig(), env)["obs_groups"] == {"actor": ["policy"], "critic": ["policy"]}
 
 
 def test_refuses_what_is_not_finite(torch_device):

@@ -63,7 +63,7 @@ def test_a_program_trains_evaluates_and_acts(run):
     ]  # fmt: skip
     assert len(RunFolder(run).read_json("evaluation.json")) == 6
     policy = deimos.load_policy(run)
-    assert policy(torch.zeros(5, 12)).shape == (5, 3)
+    assert policy.physical(torch.zeros(5, 12)).shape == (5, 3)
 
 
 def test_the_same_evaluation_replaces_its_rows(run):
@@ -169,7 +169,7 @@ def test_policy_of_an_old_run_acts_and_is_evaluated(tmp_path):
     """A policy of 0.1.0 loads, and its run can be evaluated again."""
     path = tmp_path / "run"
     shutil.copytree(OLD, path)
-    assert deimos.load_policy(path)(torch.zeros(2, 12)).shape == (2, 3)
+    assert deimos.load_policy(path).physical(torch.zeros(2, 12)).shape == (2, 3)
     rows = deimos.evaluate(path, worlds=8)
     assert [row["worlds"] for row in rows] == [8, 8, 8]
     assert [row["goals"] for row in RunFolder(path).read_json("evaluation.json")] == [

@@ -95,7 +95,7 @@ def test_a_policy_gives_the_same_actions(activation, normalize, bound, batch):
     policy = make_policy(activation, normalize, bound)
     obs = torch.randn(batch, 9, generator=torch.Generator().manual_seed(1))
     (action,) = run_model(policy_model(policy, {}), observation=obs[:, 2:].contiguous())
-    torch.testing.assert_close(action, policy(obs), rtol=0, atol=1e-5)
+    torch.testing.assert_close(action, policy.physical(obs), rtol=0, atol=1e-5)
     assert (action.abs() <= bound).all()
 
 
@@ -310,7 +310,7 @@ def test_large_actions_are_compared_by_their_size(tmp_path):
     (tmp_path / "policy.onnx").write_bytes(data)
     deploy = {"policy": {"file": "policy.onnx", "sha256": hashlib.sha256(data).hexdigest()}, "fear": None}
     obs = torch.randn(4096, 9, generator=torch.Generator().manual_seed(1))
-    action = policy(obs).numpy()
+    action = policy.physical(obs).numpy()
     known = {"policy.observation": obs[:, policy.actor.seen].numpy(), "policy.action": action}
     assert np.abs(action).max() > 3000.0
     assert export_controller.compare_networks(tmp_path, deploy, known)

@@ -85,7 +85,8 @@ def test_a_host_changes_no_number_of_a_folder(host, tmp_path):
             trainer, folder = training.start(CONFIG, tmp_path / name)
             training.train(trainer, folder)
             evaluate_run(folder, CONFIG.env, CONFIG.eval, CPU)
-            actions = load_policy(folder.path)(torch.linspace(-1, 1, 24, dtype=torch.float64, device="cpu").view(2, 12))
+            obs = torch.linspace(-1, 1, 24, dtype=torch.float64, device="cpu").view(2, 12)
+            actions = load_policy(folder.path).physical(obs)
             assert training.resume(folder.path)[0].iteration == CONFIG.iterations
         found.append([(folder.path / each).read_bytes() for each in names] + [actions.tolist(), actions.dtype])
     assert found[0] == found[1]

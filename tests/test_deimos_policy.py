@@ -37,7 +37,7 @@ def test_policy_acts_as_the_actor_in_physical_units(tmp_path, variant, obs_scale
     assert (mean != expected).any()  # some are cut
     assert (mean == expected).any()  # and some are not
     # Scaling back and forth costs a rounding or two of numbers up to 2250, seen through two layers.
-    torch.testing.assert_close(policy(physical), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(policy.physical(physical), expected, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(policy.scaled(env.obs), expected, rtol=0, atol=1e-6)
     assert policy.goal_slice == env.goal_slice
     assert policy.layout == env.layout
@@ -51,6 +51,17 @@ def test_policy_acts_as_the_actor_in_physical_units(tmp_path, variant, obs_scale
     assert policy.action_bound == 0.3
 
 
+def test_a_policy_does_not_guess_the_units(tmp_path):
+    """Called without a word on units, a policy names both ways: scaled twice, observations give plausible actions."""
+    trainer = training.Trainer(CONFIG, torch.device("cpu"))
+    training.save(trainer, RunFolder.create(tmp_path / "run"))
+    policy, obs = deimos.load_policy(tmp_path / "run"), trainer.env.obs
+    with pytest.raises(TypeError, match=r"policy\.scaled\(env\.obs\).* or policy\.physical\(obs\)"):
+        policy(obs)
+    assert torch.equal(policy.physical(obs), policy.scaled(obs * policy.scale))
+    assert not torch.allclose(policy.physical(obs), policy.scaled(obs))
+
+
 def test_policy_without_a_bound_is_not_cut(tmp_path):
     """A policy trained without a bound on the force loads, and its actions are the actor's own."""
     config = replace(CONFIG, env=replace(CONFIG.env, max_force=float("inf")))
@@ -58,7 +69,7 @@ def test_policy_without_a_bound_is_not_cut(tmp_path):
     trainer.ppo.actor.mean[-1].bias.data += 1e6
     training.save(trainer, RunFolder.create(tmp_path / "run"))
     policy = deimos.load_policy(tmp_path / "run" / "policy.pt")
-    assert (policy(torch.zeros(2, 12)) > 1e5).all()
+    assert (policy.physical(torch.zeros(2, 12)) > 1e5).all()
 
 
 def test_missing_or_foreign_policy_is_refused(tmp_path):

@@ -19,9 +19,10 @@ from deimos import plugins
 from deimos.checks import check_at_least
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import uniform
+from deimos.nn.layout import count, seen_by
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim import envs
-from deimos.sim.env import EnvConfig
+from deimos.sim.env import Env, EnvConfig
 
 Observation = np.ndarray | dict[str, np.ndarray]
 """An array, or one under each of ``observation``, ``achieved_goal`` and ``desired_goal``."""
@@ -42,7 +43,9 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """Many worlds, with NumPy arrays in and copies out; goals are issued within ``step``.
 
-    ``loop`` leads to the environment, the selector and the interactions; every ``reset`` with a seed makes a new one.
+    Observations are what the policy sees. What is privileged is not in them: ``loop.env.obs`` holds all of it.
+    ``loop`` leads to the environment, the selector and the interactions; every ``reset`` with a seed makes a new one,
+    whose selector has learnt nothing. Weights of losses and crash penalties are left to you, as in ``RslRlVecEnv``.
     On CUDA make it and call it within ``deimos.sim.shared.one_stream(device)``; outside, it is refused.
 
     Args:
@@ -50,7 +53,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         num_envs: Number of worlds, at least 1.
         seed: Seed of every draw, in [0, 2^32); ``None`` for a random one. ``reset`` may set another.
         device: Where they are simulated.
-        selector: Chooses their goals; ``None`` for Uniform. Nothing here lets it learn.
+        selector: Chooses their goals; ``None`` for Uniform.
         env_offset: Global number of world 0; see ``EnvConfig.build``.
         autoreset_mode: What becomes of worlds that are done. ``SAME_STEP``: they are reset at once, the observation is
             the new episode's first, and ``infos["final_obs"]`` holds the last one of the old. ``NEXT_STEP``: the
@@ -58,16 +61,21 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             ``DISABLED``: ``reset(options={"reset_mask": ...})`` must come before the next step.
         goal_dict: Whether an observation is a dictionary in the shape of gymnasium-robotics' goal environments:
             ``observation`` without the goal, ``achieved_goal`` and ``desired_goal``; see ``compute_reward``.
+        learn_every: Steps between two updates of the selector, at least 1. ``None`` leaves it to you: call
+            ``loop.learn()`` at least every T steps, or ``loop.learn(rollout)`` for selectors that learn from the
+            learner's rollout (``vds``, ``plr``).
 
     Raises:
-        ValueError: If ``num_envs`` or ``seed`` is out of range, or there is a ``goal_dict`` where rewards depend on
-            more than what was achieved and the goal, or on a ``crash_penalty``.
+        ValueError: If a number is out of range, a selector that needs a rollout is to learn every so many steps, or
+            there is a ``goal_dict`` where rewards depend on more than what was achieved and the goal or on a
+            ``crash_penalty``, or where what is achieved is privileged.
     """
 
     def __init__(
         self, config: EnvConfig, num_envs: int, seed: int | None = None, device: torch.device | str = "cpu",
         selector: SelectorConfig | None = None, env_offset: int = 0,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, goal_dict: bool = False,
+        learn_every: int | None = 24,
     ) -> None:  # fmt: skip
         check_at_least("num_envs", num_envs, 1)
         self.num_envs = num_envs
@@ -77,15 +85,18 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
         self._build = partial(config.build, num_envs, torch.device(device), env_offset=env_offset)
-        self._selector = selector or uniform.Config()
+        self._selector, self._learn_every = selector or uniform.Config(), learn_every
         self._begin(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
         env = self.loop.env
         self._goal_dict = goal_dict
-        if goal_dict and (env.achieved(env.obs) is None or config.crash_penalty):
-            raise ValueError(f"goal_dict must be False, since rewards depend on more than goals here; got {config}.")
-        sizes = {"observation": env.state_dim, "achieved_goal": env.goal_dim, "desired_goal": env.goal_dim}
+        if goal_dict:
+            _check_goals(env)
+        parts = [field for field in env.layout if not (goal_dict and field.name == "goal")]
+        self._sees = seen_by("actor", parts, env.device)
+        seen = count(self._sees, sum(field.size for field in parts))
+        sizes = {"observation": seen, "achieved_goal": env.goal_dim, "desired_goal": env.goal_dim}
         boxes = {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in sizes.items()}
-        flat = Box(-np.inf, np.inf, (env.obs_dim,), np.float32)
+        flat = Box(-np.inf, np.inf, (seen,), np.float32)
         self.single_observation_space = Dict(boxes) if goal_dict else flat
         low, high = env.action_range
         self.single_action_space = Box(low.numpy(), high.numpy(), dtype=np.float32)
@@ -96,7 +107,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if not isinstance(seed, Integral) or not 0 <= seed < 2**32:
             raise ValueError(f"seed must be a whole number in [0, 2^32), one for all worlds, got {seed}.")
         env = self._build(seed=int(seed))
-        self.loop = GoalLoop(env, self._selector.build(spaces(env), int(seed)))
+        self.loop = GoalLoop(env, self._selector.build(spaces(env), int(seed)), learn_every=self._learn_every)
         everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=env.device)
         self._fresh, self._over = everywhere, ~everywhere
 
@@ -108,7 +119,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             options: Empty, or ``reset_mask``: where to begin, bool, shape (num_envs,), instead of everywhere.
 
         Returns:
-            What to act on first, float32, shape (num_envs, obs_dim), and an empty dictionary.
+            What to act on first, float32, shape (num_envs, components that the policy sees), and an empty dictionary.
 
         Raises:
             ValueError: If the seed is out of range, there are other options, or both a seed and a mask.
@@ -137,9 +148,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             actions: Actions, shape (num_envs, action_dim); the environment clips them.
 
         Returns:
-            What to act on next, float32, shape (num_envs, obs_dim); rewards, float64, terminated and truncated,
-            bool, shape (num_envs,); and in ``SAME_STEP``, where a world is done, ``final_obs`` and ``final_info`` as
-            gymnasium has them.
+            What to act on next, as ``reset`` gives it; rewards, float64, terminated and truncated, bool, shape
+            (num_envs,); and in ``SAME_STEP``, where a world is done, ``final_obs`` and ``final_info`` as gymnasium has
+            them.
 
         Raises:
             ValueError: If the actions have another shape.
@@ -170,6 +181,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if begins.any():
             self.loop.begin(begins)
         self._fresh, self._over = begins, done & ~begins
+        self.loop.learn_if_due()
         infos: dict = {}
         for world in np.flatnonzero(done.cpu()) if same_step else ():
             infos = self._add_info(infos, {"final_obs": _world(final_obs, int(world)), "final_info": {}}, world)
@@ -201,10 +213,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Copies of the current observations."""
         env = self.loop.env
         if not self._goal_dict:
-            return _copy(env.obs)
+            return _copy(env.obs[:, self._sees])
         achieved = cast(torch.Tensor, env.achieved(env.obs))  # the constructor has refused environments that give None
         return {
-            "observation": _copy(env.state(env.obs)), "achieved_goal": _copy(achieved),
+            "observation": _copy(env.state(env.obs)[:, self._sees]), "achieved_goal": _copy(achieved),
             "desired_goal": _copy(env.obs[:, env.goal_slice]),
         }  # fmt: skip
 
@@ -217,15 +229,16 @@ class GymnasiumEnv(gymnasium.Env):
     def __init__(
         self, config: EnvConfig, seed: int | None = None, device: torch.device | str = "cpu",
         selector: SelectorConfig | None = None, env_offset: int = 0, goal_dict: bool = False,
+        learn_every: int | None = 24,
     ) -> None:  # fmt: skip
-        disabled = AutoresetMode.DISABLED
-        self.worlds = GymnasiumVectorEnv(config, 1, seed, device, selector, env_offset, disabled, goal_dict)
+        modes = AutoresetMode.DISABLED, goal_dict, learn_every
+        self.worlds = GymnasiumVectorEnv(config, 1, seed, device, selector, env_offset, *modes)
         self.observation_space = self.worlds.single_observation_space
         self.action_space = self.worlds.single_action_space
         self._running = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Observation, dict]:
-        """See ``GymnasiumVectorEnv.reset``; observations have the shape (obs_dim,)."""
+        """See ``GymnasiumVectorEnv.reset``; observations are those of one world."""
         obs, info = self.worlds.reset(seed=seed, options=options)
         super().reset(seed=None if seed is None else int(seed))
         self._running = True
@@ -273,6 +286,22 @@ def _config(environment: str, render_mode: None, options: dict[str, Any]) -> Env
         raise TypeError(f"render_mode must be None, got '{render_mode}'; `deimos play` draws runs.")
     kind = plugins.load(envs, environment).Config
     return kind(**{name: options.pop(name) for name in kind.__dataclass_fields__ if name in options})
+
+
+def _check_goals(env: Env) -> None:
+    """Raise ``ValueError`` where goals cannot be handed out in hindsight, or would tell the policy what is privileged.
+
+    What the policy does not see is NaN here, and so is whatever depends on it.
+    """
+    sees = seen_by("actor", env.layout, env.device)
+    shown = torch.full_like(env.obs, torch.nan)
+    shown[:, sees] = env.obs[:, sees]
+    achieved = env.achieved(shown)
+    if achieved is None or env.config.crash_penalty:
+        raise ValueError(f"goal_dict must be False, since rewards depend on more than goals here; got {env.config}.")
+    if not bool(achieved.isfinite().all()):
+        hidden = ", ".join(field.name for field in env.layout if field.seen_by == "critic")
+        raise ValueError(f"goal_dict must be False, since achieved_goal would show privileged entries: {hidden}.")
 
 
 def _world(obs: Observation, world: int) -> Observation:

@@ -11,6 +11,7 @@ from deimos.checks import check_at_least, check_positive
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
+from deimos.nn.layout import seen_by
 from deimos.run.loop import GoalLoop, spaces
 from deimos.sim.env import Env
 
@@ -18,9 +19,9 @@ from deimos.sim.env import Env
 class RslRlVecEnv(VecEnv):
     """An environment as rsl_rl 5 wants it: ``step`` also issues goals and resets worlds that are done.
 
-    Everything that it returns is a copy that later steps leave alone. rsl_rl asks a selector for goals but
-    does not let it learn: a Director stays uniform until its owner calls, say after every iteration,
-    ``loop.selector.learn(loop.interactions, None)``. On CUDA make it and call it within
+    Everything that it returns is a copy that later steps leave alone. Of what a selector wants of the learner, two
+    things are left to you: multiply losses by ``loop.weight`` (``weighted``), and subtract ``selector.crash_penalty``
+    times the environment's ``largest_reward`` at a crash (``penalty``). On CUDA make it and call it within
     ``deimos.sim.shared.one_stream(device)``; outside, it is refused.
 
     Args:
@@ -28,21 +29,34 @@ class RslRlVecEnv(VecEnv):
         selector: Chooses their goals; ``None`` for Uniform.
         reward_scale: What rewards are multiplied by, positive.
         report_every: Steps between two reports, ``log`` of the extras, at least 1: making one waits for the device.
+        learn_every: Steps between two updates of the selector, at least 1; the steps of a rollout are a good choice.
+            ``None`` leaves it to you: call ``loop.learn()`` at least every T steps, or ``loop.learn(rollout)`` for
+            selectors that learn from the learner's rollout (``vds``, ``plr``).
 
     Attributes:
         loop: The worlds, their selector and their interactions.
+        obs_groups: Which groups of observations rsl_rl's actor and critic see; see ``get_observations``.
+
+    Raises:
+        ValueError: If a number is out of range, or a selector that needs a rollout is to learn every so many steps.
     """
 
     def __init__(
-        self, env: Env, selector: GoalSelector | None = None, reward_scale: float = 1.0, report_every: int = 24
-    ) -> None:
+        self, env: Env, selector: GoalSelector | None = None, reward_scale: float = 1.0, report_every: int = 24,
+        learn_every: int | None = 24,
+    ) -> None:  # fmt: skip
         check_positive("reward_scale", reward_scale, finite=True)
         check_at_least("report_every", report_every, 1)
         self._report_every, self._steps = report_every, 0
         self.env = env
         self.reward_scale = reward_scale
         self.cfg = spaces(env)
-        self.loop = GoalLoop(env, selector or uniform.Config().build(self.cfg, seed=0))
+        self.loop = GoalLoop(env, selector or uniform.Config().build(self.cfg, seed=0), learn_every=learn_every)
+        self._sees = {"policy": seen_by("actor", env.layout, env.device)}
+        self.obs_groups = {"actor": ["policy"], "critic": ["policy"]}
+        if any(field.seen_by != "both" for field in env.layout):
+            self._sees["critic"] = seen_by("critic", env.layout, env.device)
+            self.obs_groups["critic"] = ["critic"]
         self.num_envs = env.num_envs
         self.num_actions = env.action_dim
         self.device = env.device
@@ -62,8 +76,12 @@ class RslRlVecEnv(VecEnv):
         self.env.episode_step.copy_(steps)
 
     def get_observations(self) -> TensorDict:
-        """What to act on next: ``policy``, float32, shape (num_envs, obs_dim)."""
-        return TensorDict({"policy": self.env.obs.clone()}, batch_size=[self.num_envs], device=self.device)
+        """What to act on next, float32: ``policy``, what the actor sees, shape (num_envs, components that it sees).
+
+        Where the layout hides something from one of the two (``privileged``), also ``critic``, what the critic sees.
+        """
+        groups = {name: self.env.obs[:, sees].clone() for name, sees in self._sees.items()}
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Simulate one step of every world, issue the goals that are due and reset the worlds that are done.
@@ -74,8 +92,9 @@ class RslRlVecEnv(VecEnv):
         Returns:
             What to act on next; scaled rewards, shape (num_envs,); worlds that crashed or were truncated,
             bool, shape (num_envs,); and ``time_outs``: 1 where a world was truncated, else 0, shape (num_envs,). At a
-            report, where the environment has something to say, ``log`` too: means of the steps since the last one, such
-            as the terms of the reward (``reward/NAME``, not scaled), which rsl_rl logs; see ``Env.report``.
+            report, where there is something to say, ``log`` too, which rsl_rl logs: means of the steps since the last
+            one, such as the terms of the reward (``reward/NAME``, not scaled; see ``Env.report``), and what the
+            selector's last update says.
 
         Raises:
             SimulationError: If an action is not finite, or too many worlds become invalid.
@@ -86,14 +105,15 @@ class RslRlVecEnv(VecEnv):
         dones = step.terminated | step.truncated
         extras: dict[str, Any] = {"time_outs": step.truncated.float()}
         self.loop.advance(step)
+        self.loop.learn_if_due()
         self._steps += 1
-        if self._steps % self._report_every == 0 and (report := self.env.report()):
+        if self._steps % self._report_every == 0 and (report := self.env.report() | self.loop.metrics):
             extras["log"] = report
         return self.get_observations(), rewards, dones, extras
 
 
-def runner_config(ppo: PPOConfig) -> dict[str, Any]:
-    """The configuration of rsl_rl's ``OnPolicyRunner`` that corresponds to ``ppo``.
+def runner_config(ppo: PPOConfig, env: RslRlVecEnv) -> dict[str, Any]:
+    """The configuration of rsl_rl's ``OnPolicyRunner`` that corresponds to ``ppo``, for the observations of ``env``.
 
     The reward scale is not in it: give it to the environment.
     """
@@ -105,7 +125,7 @@ def runner_config(ppo: PPOConfig) -> dict[str, Any]:
     return {
         "num_steps_per_env": ppo.num_steps,
         "save_interval": 2**31,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "obs_groups": {name: list(groups) for name, groups in env.obs_groups.items()},
         "actor": network | {"distribution_cfg": spread},
         "critic": dict(network),
         "algorithm": {

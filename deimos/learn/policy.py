@@ -17,7 +17,10 @@ SCHEMA = 1
 
 
 class Policy(nn.Module):
-    """Maps physical observations to the trained policy's deterministic (mean) actions.
+    """The deterministic (mean) actions of the trained policy.
+
+    Call it by the units of the observations: ``scaled(env.obs)`` in an environment, ``physical(obs)`` for measurements.
+    ``policy(obs)`` raises ``TypeError``, since either would return plausible actions for the other's observations.
 
     Attributes:
         layout: Fields of the observation, with units.
@@ -43,8 +46,15 @@ class Policy(nn.Module):
         self.register_buffer("scale", torch.cat(scale))
         self.goal_slice = goal_slice(self.layout)
 
+    def forward(self, *args: object) -> Tensor:
+        """Refuse to guess the units; see the class."""
+        raise TypeError(
+            "policy(obs) does not say in which units obs is: call policy.scaled(env.obs) for the observations of an "
+            "environment, which are scaled, or policy.physical(obs) for those in the units of policy.layout."
+        )
+
     @torch.no_grad()
-    def forward(self, obs: Tensor) -> Tensor:
+    def physical(self, obs: Tensor) -> Tensor:
         """Actions, float32, shape (n, action_dim), for observations in physical units, shape (n, obs_dim)."""
         return self.scaled(obs.float() * self.scale)
 

@@ -5,9 +5,12 @@ from collections.abc import Callable, Hashable
 import torch
 from torch import Tensor
 
-from deimos.goals.core import Changes, GoalCore
+from deimos.checks import check_at_least
+from deimos.goals.core import Changes, GoalCore, window_between
+from deimos.goals.given import lacking
 from deimos.goals.interactions import Resolved
-from deimos.goals.selector import GoalSelector, Spaces
+from deimos.goals.selector import GoalSelector, Spaces, Transitions
+from deimos.nn.host import own_settings
 from deimos.sim.env import Env, Step
 
 AS_ON_GPU = False
@@ -32,15 +35,31 @@ class GoalLoop:
     Args:
         env: The worlds.
         selector: Chooses their goals.
-        window: Steps that resolved interactions are kept for; ``None`` for 2 T.
+        window: Steps that resolved interactions are kept for; ``None`` for 2 T or, if more, ``learn_every + T``.
         guard: Has the last word on the selector's goals; ``None`` for none. Interactions, which selectors and
             attackers learn from, hold the goals that the selector asked for.
+        learn_every: Steps between two updates of the selector by ``learn_if_due``, at least 1; ``None`` if the owner
+            calls ``learn``, or if it does not learn.
+
+    Raises:
+        ValueError: If ``learn_every`` is less than 1, or is given to a selector that learns from a rollout.
     """
 
     def __init__(
-        self, env: Env, selector: GoalSelector, window: int | None = None, guard: GoalGuard | None = None
-    ) -> None:
-        self.env, self._guard = env, guard
+        self, env: Env, selector: GoalSelector, window: int | None = None, guard: GoalGuard | None = None,
+        learn_every: int | None = None,
+    ) -> None:  # fmt: skip
+        if learn_every is not None:
+            check_at_least("learn_every", learn_every, 1)
+            window = window or window_between(env.goal_period, learn_every)
+            for lack in lacking(selector, taught=False, tracked=True):
+                raise ValueError(
+                    f"{lack} A loop that keeps no rollout must have learn_every=None, got {learn_every}, and its owner "
+                    "call loop.learn(rollout); see docs/director.md."
+                )
+        self.env, self._guard, self._learn_every = env, guard, learn_every
+        self.metrics: dict[str, float] = {}
+        """Numbers for the log, from the selector's last update."""
         self.core = GoalCore(selector, spaces(env), window)
         self.selector, self.interactions, self.weight = selector, self.core.interactions, self.core.weight
         if selector.first_goals_scaled:  # those that the environment was built with are not
@@ -127,6 +146,32 @@ class GoalLoop:
         """Begin an episode where ``mask``, bool, shape (num_envs,), is true; nothing may be pending there."""
         self.env.reset(mask, self.selector.goal_range() if self.selector.first_goals_scaled else None)
         self.weight.masked_fill_(mask, 1.0)
+
+    @own_settings()
+    @torch.inference_mode(False)  # what is learnt in a loop without gradients can also be used outside it
+    @torch.no_grad()
+    def learn(self, rollout: Transitions | None = None) -> dict[str, float]:
+        """Let the selector learn from the outcomes, after a step and once per rollout.
+
+        Args:
+            rollout: The learner's transitions since the last call, for selectors that learn from them; their
+                observations are all of ``env.obs``.
+
+        Returns:
+            ``metrics``; see ``GoalCore.learn``.
+
+        Raises:
+            ValueError: If the selector needs a rollout and gets none.
+            SimulationError: If a weight of a network is not finite afterwards.
+        """
+        self.metrics = self.core.learn(rollout)
+        self.selector.check()
+        return self.metrics
+
+    def learn_if_due(self) -> None:
+        """Learn after every ``learn_every`` steps; call it once per step, when the step's goals are chosen."""
+        if self._learn_every and self.interactions.now % self._learn_every == 0:
+            self.learn()
 
     def outcomes(self) -> Resolved:
         """Interactions that were issued at least T steps ago: of later ones only the crashes are known so far."""

@@ -254,8 +254,7 @@ class Trainer:
             )  # fmt: skip
             self.ppo.check()
             clock.lap("update")
-            selector = self.loop.core.learn(self.rollout)
-            self.loop.selector.check()
+            selector = self.loop.learn(self.rollout)
             clock.lap("selector")
         except SimulationError as error:
             raise SimulationError(f"Iteration {self.iteration}: {error}", error.rank) from error
