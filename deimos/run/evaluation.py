@@ -160,7 +160,7 @@ def read_evaluation(folder: RunFolder) -> list[dict]:
                 raise RunError(
                     f"{folder.path / EVALUATION}, row {number}: {name} must be {words}, got {row.get(name)!r:.80}."
                 )
-        row |= {"terrain_seed": row.get("terrain_seed", 0)} if "engine" in row else {}  # rows of 0.1 lack it
+        row |= {"terrain_seed": row.get("terrain_seed", 0)} if "engine" in row else {}  # older rows lack it
     return rows
 
 
