@@ -18,7 +18,7 @@ _OFFERED = {
     "load_policy": "deimos.learn.policy",
     "train": "deimos.run.api",
 }
-"""What the package offers, and the module that holds it."""
+"""The public names, and the module that each is in."""
 
 __all__ = ["__version__", *_OFFERED]
 
@@ -26,7 +26,7 @@ _HOME = Path(__file__).resolve().parent
 
 
 class _Beside:
-    """Finds ``deimos.kernels`` and ``deimos.terrain`` beside this package, and nothing else that lies there."""
+    """Finds ``deimos.kernels`` and ``deimos.terrain`` next to this package, and nothing else there."""
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
@@ -43,7 +43,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    """Import what the package offers when it is first asked for; importing ``deimos`` alone stays light."""
+    """Import a public name on first use; ``import deimos`` alone stays light."""
     if name not in _OFFERED:
         raise AttributeError(f"module 'deimos' has no attribute '{name}'")
     try:

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 class RunError(Exception):
     """A run cannot continue for a reason outside the program: a folder, a file, a disk, a device.
 
-    It quotes what stands in files, and says as escapes what no terminal should be sent.
+    Messages may quote files; characters that should not reach a terminal are escaped.
     """
 
     def __str__(self) -> str:
@@ -17,7 +17,7 @@ class RunError(Exception):
 
 
 class SimulationError(RuntimeError):
-    """The simulation or the learner has left the realm of finite numbers; the run must stop."""
+    """The simulation or the learner has produced invalid numbers; the run must stop."""
 
     def __init__(self, message: str, rank: int = 0) -> None:
         super().__init__(message)
@@ -26,7 +26,7 @@ class SimulationError(RuntimeError):
 
 
 def one_line(error: BaseException) -> str:
-    """What an error says, in one line."""
+    """The message of an error in one line."""
     return " ".join(str(error).split())
 
 
@@ -64,7 +64,7 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 
 def check_seed(seed: int, spare: int = 0) -> None:
-    """Raise ``ValueError`` unless a seed is a whole number in [0, 2^32), the last ``spare`` of them left out."""
+    """Raise ``ValueError`` unless a seed is a whole number in [0, 2^32 - ``spare``)."""
     check_whole("seed", seed)
     if not 0 <= seed < 2**32 - spare:
         raise ValueError(f"seed must be in [0, 2^32{f' - {spare}' if spare else ''}), got {seed}.")
@@ -84,7 +84,7 @@ def check_device(name: str, value: str) -> None:
 
 
 def check_names(name: str, value: Iterable[str]) -> None:
-    """Raise ``ValueError`` unless ``value`` is several names: one text would be taken for as many as it has letters."""
+    """Raise ``ValueError`` unless ``value`` is a collection of names; one string would be read letter by letter."""
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise ValueError(f"{name} must be a tuple of names, got {value!r}.")
 

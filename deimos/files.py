@@ -1,4 +1,4 @@
-"""Files that survive a kill at any moment: each is written atomically; what is no file is neither read nor written."""
+"""Files that survive a kill at any moment: writes are atomic, and only regular files are read or written."""
 
 import contextlib
 import errno
@@ -28,19 +28,19 @@ UNREADABLE = (
     OSError, RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError, MemoryError, ArithmeticError,
     SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile, pickle.UnpicklingError,
 )  # fmt: skip
-"""What reading damaged and foreign archives was seen to raise."""
-PARTIAL = ".partial"  # ending of a file that is not whole yet
+"""What reading damaged and foreign archives has been seen to raise."""
+PARTIAL = ".partial"  # suffix of a file that is not complete yet
 LONGEST_NAME = 100  # letters
 DEFLATED = 1032  # bytes that one byte of an archive stands for at most (RFC 1951)
 
 
 def open_file(path: Path, mode: str = "rb", **text: Any) -> Any:
-    """Open a file as ``open`` does, but nothing else: no pipe, which might keep us waiting, and no device.
+    """Open a regular file as ``open`` does, but nothing else: no pipe, which might block, and no device.
 
-    What is written must not be a link either: the file that it leads to may be somebody else's.
+    A file to write must not be a link either: its target may be somebody else's.
 
     Raises:
-        OSError: If it cannot be opened, or is no such file.
+        OSError: If it cannot be opened, or is not such a file.
     """
     more = getattr(os, "O_NONBLOCK", 0) | (0 if mode[0] == "r" else getattr(os, "O_NOFOLLOW", 0))
 
@@ -57,15 +57,15 @@ def open_file(path: Path, mode: str = "rb", **text: Any) -> Any:
 
 
 def read_bytes(path: Path) -> bytes:
-    """What a file holds; raises as ``open_file`` does."""
+    """Read a file; raises as ``open_file`` does."""
     with open_file(path) as file:
         return file.read()
 
 
 def require_place(path: Path) -> None:
-    """Refuse a place where no file can be written: for those who would find out after long work.
+    """Refuse a path that cannot be written, before long work instead of after it.
 
-    A file that is there already can be replaced.
+    An existing file can be replaced.
 
     Raises:
         RunError: If its folder is missing or cannot be written to, or it is a folder itself.
@@ -90,7 +90,7 @@ def save_tensors(path: Path, data: dict) -> None:
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write a new file beside the old one, to the disk, and only then rename it.
+    """Write a new file next to the old one, flush it to the disk, and only then rename it.
 
     Raises:
         RunError: If it cannot be written; the previous file is untouched.
@@ -106,18 +106,18 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
         temporary.replace(path)
     except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
         raise RunError(f"{path} could not be written ({first_line(error)}); what was there is untouched.") from error
-    finally:  # an interrupt too must not leave half a file
+    finally:  # an interrupt must not leave half a file either
         with contextlib.suppress(OSError):  # nothing can be deleted on a read-only disk
             temporary.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """``write_whole`` for what is there already."""
+    """``write_whole`` for bytes."""
     write_whole(path, lambda file: file.write(data))
 
 
 def remove_partial(path: Path) -> None:
-    """Delete what kills have left of attempts to write a file; nobody may be writing it now."""
+    """Delete what killed attempts to write a file have left; nobody may be writing it now."""
     for left in path.parent.glob(f"{glob.escape(path.name)}.*{PARTIAL}"):
         left.unlink(missing_ok=True)
 
@@ -129,7 +129,7 @@ def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = Non
         path: The file.
         what: What it is, for the message.
         schema: The schema that it must have.
-        oldest: An older schema that is read too; ``None`` for none.
+        oldest: The oldest schema that is read too; ``None`` for ``schema`` alone.
 
     Raises:
         RunError: If it is missing, broken, foreign or of another version.
@@ -138,16 +138,16 @@ def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = Non
 
     try:
         with open_file(path) as file:
-            with zipfile.ZipFile(file) as archive:  # torch reads on over damaged bytes; the archive's checksums tell
+            with zipfile.ZipFile(file) as archive:  # torch misses damaged bytes; the archive's checksums do not
                 if damaged := archive.testzip():
                     raise ValueError(f"{damaged} is damaged")
             file.seek(0)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # what torch says of a foreign file; it is refused all the same
+                warnings.simplefilter("ignore")  # torch's warnings about a foreign file, which is refused anyway
                 data = torch.load(file, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise RunError(f"There is no {what} at {path}.") from error
-    except UNREADABLE as error:  # torch's own words on foreign objects advise to run them
+    except UNREADABLE as error:  # torch's own message on foreign objects advises to run them
         reason = "it holds more than tensors" if isinstance(error, pickle.UnpicklingError) else first_line(error)
         raise RunError(f"{path} is not a {what}, or it is broken ({reason}).") from error
     found = data.get("schema") if isinstance(data, dict) else None
@@ -159,11 +159,11 @@ def load_tensors(path: Path, what: str, schema: int, *, oldest: int | None = Non
 def load_arrays(path: Path) -> "dict[str, np.ndarray]":
     """Read a NumPy file, an ``.npz`` or an ``.npy``, whose one array then has the name "".
 
-    Nothing is allocated before every array's size was found to be what the file has room for.
+    No array is allocated before its size has been checked against what the file has room for.
 
     Raises:
         OSError: If it cannot be opened.
-        ValueError: If it is no such file, or it is broken.
+        ValueError: If it is not such a file, or is broken.
     """
     import numpy as np
 
@@ -196,7 +196,7 @@ def _members(archive: zipfile.ZipFile) -> "Iterator[tuple[str, np.ndarray]]":
 
 
 def _check_array(file: IO[bytes], size: int) -> None:
-    """Raise ``ValueError`` unless what the header of an array promises is what follows it in ``size`` bytes."""
+    """Raise ``ValueError`` unless ``size`` bytes hold an array's header and exactly the data that it promises."""
     from numpy.lib import format as npy
 
     version = npy.read_magic(file)
@@ -208,15 +208,15 @@ def _check_array(file: IO[bytes], size: int) -> None:
 
 
 def file_name(text: str) -> str:
-    """A text as the name of a file: as it is where it can be one anywhere, otherwise without what cannot."""
+    """A text as a file name: unchanged if it is valid everywhere, otherwise without what is not."""
     clean = re.sub(r"[^\w.+-]", "-", text, flags=re.ASCII).lstrip(".-")[:LONGEST_NAME]
-    return clean if clean == text else f"{clean}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"  # told apart by that
+    return clean if clean == text else f"{clean}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"  # distinct
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says in its first line, without the full stop; the name of its class where it says nothing.
+    """The first line of an error's message, without the full stop; the name of its class if it has none.
 
-    Of one of the system, its words alone, without number and file.
+    Of an error of the operating system, its text alone, without number and file.
     """
     if isinstance(error, OSError) and error.strerror:
         return error.strerror

@@ -1,4 +1,4 @@
-"""Locks on files that end with the process that holds them, however it ends: the operating system drops them."""
+"""File locks that end with the process that holds them, however it ends: the operating system releases them."""
 
 import contextlib
 import json
@@ -14,13 +14,13 @@ from deimos.checks import RunError
 from deimos.files import open_file
 
 POLL_SECONDS = 0.1
-NAME_POLLS = 10  # for the name of one that has just taken a lock
+NAME_POLLS = 10  # for the name of a process that has just taken a lock
 
 if sys.platform == "win32":
     import msvcrt
 
     def _lock(file: IO[str]) -> None:
-        file.seek(2**30)  # a locked byte cannot be read, and what the file says is for others to read
+        file.seek(2**30)  # a locked byte cannot be read, but others must read the name in the file
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
 else:
     import fcntl
@@ -72,13 +72,13 @@ def _is_taken(file: IO[str]) -> bool:
     """Take the lock of a file unless another process has it; returns whether it was taken."""
     try:
         _lock(file)
-    except (BlockingIOError, PermissionError):  # of POSIX and of Windows
+    except (BlockingIOError, PermissionError):  # on POSIX and on Windows
         return False
     return True
 
 
 def _name_of_holder(file: IO[str]) -> str:
-    """Who has taken the lock of a file, in words; waits for one that has only just taken it to write its name."""
+    """Describe the holder of a file's lock; waits for one that has only just taken it to write its name."""
     for _ in range(NAME_POLLS):
         machine, holder = _holder(file)
         if machine:
@@ -88,7 +88,7 @@ def _name_of_holder(file: IO[str]) -> str:
 
 
 def _holder(file: IO[str]) -> tuple[str, str]:
-    """Machine that a lock file names, and machine and process in words; an empty machine if it names none."""
+    """The machine that a lock file names, and machine and process in words; an empty machine if it names none."""
     file.seek(0)
     try:
         found = json.loads(file.read())

@@ -1,7 +1,7 @@
 """The file name is the registration: a module in a package of plug-ins *is* the plug-in of that name.
 
 Packages outside this tree register a module through an entry-point group, one of ``HOLDS``; a module that is not
-installed does it itself, when it is imported, by ``register``.
+installed registers itself, when it is imported, with ``register``.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ HOLDS = {
     "deimos.attackers": ("dataclass", "Config"),
     "deimos.robots": ("function", "build"), "deimos.shapes": ("dataclass", "Shape"),
 }  # fmt: skip
-"""What every plug-in of a group holds, and its name."""
+"""What every plug-in of a group defines, and the name of that."""
 
 _registered: dict[str, dict[str, str]] = {}  # by group: names of plug-ins and modules, in this process
 
@@ -57,19 +57,19 @@ def _group(package: ModuleType) -> str:
 
 
 def _exists(module: str) -> bool:
-    """Whether a module is there; imports nothing but the packages that it lies in."""
+    """Whether a module exists; imports nothing but the packages that contain it."""
     if module in sys.modules:
         return True
     try:
         return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):  # no such package, or no name of a module
+    except (ImportError, ValueError):  # no such package, or not a module name
         return False
 
 
 def _known(package: ModuleType) -> Iterator[tuple[str, str, Callable[[], ModuleType]]]:
     """Name, module and importer of every plug-in of ``package``, each name once.
 
-    Its own come first, and entry points last: they take long to read, and who has found a name reads no further.
+    Its own come first, and entry points last: they take long to read, and a search stops at the name it wants.
     """
     own = {
         module.name: f"{package.__name__}.{module.name}"
@@ -97,13 +97,13 @@ def load(package: ModuleType, name: str, use: Callable[[ModuleType], Any] = lamb
     Args:
         package: Where it is.
         name: Its name.
-        use: What the caller makes of the module: an error in it is the plug-in's too.
+        use: What the caller does with the module: an error in it counts as the plug-in's too.
 
     Returns:
-        What ``use`` has made of it; by default the module.
+        The result of ``use``; by default the module.
 
     Raises:
-        ValueError: If there is none; the message lists those that there are.
+        ValueError: If there is none; the message lists those that exist.
         RunError: If it is broken.
     """
     plugin = _found(package, name)
@@ -123,7 +123,7 @@ def load(package: ModuleType, name: str, use: Callable[[ModuleType], Any] = lamb
 
 
 def load_all(package: ModuleType, use: Callable[[ModuleType], Any] = lambda module: module) -> dict[str, Any]:
-    """``load`` for every plug-in of ``package``, by its name; warns of each that is broken, and leaves it out."""
+    """``load`` for every plug-in of ``package``, by name; warns about each that is broken, and leaves it out."""
     found = {}
     for name in names(package):
         try:
@@ -134,5 +134,5 @@ def load_all(package: ModuleType, use: Callable[[ModuleType], Any] = lambda modu
 
 
 def name_of(package: ModuleType, module: str) -> str | None:
-    """Name of the plug-in of ``package`` that a module is, by its full name; ``None`` if of none. Imports nothing."""
+    """Name of the plug-in that a module, by its full name, is in ``package``; ``None`` if not one. Imports nothing."""
     return next((name for name, known, _ in _known(package) if known == module), None)

@@ -283,7 +283,7 @@ def test_compute_reward_is_that_of_the_step(variant, reward):
 def test_goal_dict_is_refused_where_rewards_are_not_of_goals_alone():
     """A way from elsewhere is no goal from here, robots are rewarded for more, and a crash may cost something."""
     for config in (replace(CONFIG, variant="relative"), quad.Config(), replace(CONFIG, crash_penalty=1.0)):
-        with pytest.raises(ValueError, match="goal_dict must be False: rewards depend on more than goals here"):
+        with pytest.raises(ValueError, match="goal_dict must be False, since rewards depend on more than goals here"):
             GymnasiumVectorEnv(config, 1, goal_dict=True)
     with pytest.raises(ValueError, match="The rewards of Locomotion depend on more than what was achieved"):
         GymnasiumVectorEnv(quad.Config(), 1).compute_reward(np.zeros(3), np.zeros(3))
@@ -351,12 +351,12 @@ def test_refuses_what_it_cannot_take():
     envs.reset()
     with pytest.raises(ValueError, match=r"actions must have shape \(4, 3\), got \(3,\)"):
         envs.step(np.zeros(3))
-    with pytest.raises(ValueError, match=r"options may hold reset_mask alone, got .*'goal'"):
+    with pytest.raises(ValueError, match=r"options may hold only reset_mask, got .*'goal'"):
         envs.reset(options={"goal": 1})
     for mask in (np.ones(3, bool), np.ones(4)):
         with pytest.raises(ValueError, match=r"reset_mask must be bool and have shape \(4,\), got"):
             envs.reset(options={"reset_mask": mask})
-    with pytest.raises(ValueError, match="seed must be None where there is a reset_mask, got 3"):
+    with pytest.raises(ValueError, match="seed must be None if there is a reset_mask, got 3"):
         envs.reset(seed=3, options={"reset_mask": np.ones(4, bool)})
     for seed in (2**32, -1, [1, 2, 3, 4], 1.5):
         with pytest.raises(ValueError, match=r"seed must be a whole number in \[0, 2\^32\), one for all worlds"):

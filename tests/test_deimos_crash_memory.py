@@ -304,7 +304,7 @@ def test_names_tell_what_fear_learns_from():
     assert method("p33-threshold") == director.Config(percentile=33, memory=0, fear=FearConfig(min_per_class=32))
     assert method("antagonist-literal") == director.Config(rule="argmax", memory=0)
     for name in ("uniform-literal", "p101-literal", "p75-", "-literal", "p75-literal-literal-x"):
-        with pytest.raises(ValueError, match=f"no method '{name}'"):
+        with pytest.raises(ValueError, match=f"Unknown method '{name}'"):
             method(name)
     with pytest.raises(ValueError, match="memory must be at least 0, got -1"):
         director.Config(memory=-1)

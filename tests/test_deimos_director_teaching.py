@@ -24,7 +24,7 @@ def test_candidates_stay_within_the_announced_range():
     assert 4.7 < drawn.max() <= 5.0
     for value in (2.5, 5.5):
         with pytest.raises(
-            ValueError, match=rf"candidates must lie between \[3\.0\] and \[5\.0\], got \[{value}\] for world 4"
+            ValueError, match=rf"candidates must be between \[3\.0\] and \[5\.0\], got \[{value}\] for world 4"
         ):
             goals.propose([4], np.zeros((1, 1)), np.zeros((1, 1)), np.full((1, 2, 1), value))
     goals.propose([4], np.zeros((1, 1)), np.zeros((1, 1)), np.full((1, 2, 1), 4.9))

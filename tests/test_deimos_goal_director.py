@@ -319,7 +319,7 @@ def test_worlds_may_not_change():
         ({"goal_period": 0}, "goal_period must be at least 1, got 0"),
         ({"learn_every": 0}, "learn_every must be at least 1, got 0"),
         ({"total_steps": -1}, "total_steps must be at least 0, got -1"),
-        ({"selector": "p333"}, "no method 'p333'; there are: uniform"),
+        ({"selector": "p333"}, "Unknown method 'p333'; choose from: uniform"),
     ],
 )
 def test_options_are_checked(options, message):

@@ -51,9 +51,9 @@ from deimos.goals.selectors import boltzmann, cl, director, grid, learnability, 
         (plr.Config, "capacity", 2**24, r"capacity must be below 2\^24, got 16777216"),
         (schedule.Config, "at", 1.0, r"at must be in \(0, 1\), or the schedule never switches; got 1.0"),
         (schedule.Config, "at", 0.0, r"at must be in \(0, 1\), or the schedule never switches; got 0.0"),
-        (schedule.Config, "second", "p333", "no method 'p333'"),
+        (schedule.Config, "second", "p333", "Unknown method 'p333'"),
         (mix.Config, "share", -0.1, r"share must be in \[0, 1\], got -0.1"),
-        (mix.Config, "base", "best", "no method 'best'"),
+        (mix.Config, "base", "best", "Unknown method 'best'"),
     ],
 )
 def test_config_rejects(config, field, value, message):
@@ -66,7 +66,7 @@ def test_config_rejects(config, field, value, message):
 def test_an_unknown_method_lists_the_known_ones():
     """The message lists every method."""
     for name in ("p101", "p1e1", "p07", "p-1", "p", "nope", "", "penalty-NN", "uniform-literal", "p75-"):
-        with pytest.raises(ValueError, match=f"no method '{name}'; there are: uniform, coop, p10") as caught:
+        with pytest.raises(ValueError, match=f"Unknown method '{name}'; choose from: uniform, coop, p10") as caught:
             method(name)
         assert all(known in str(caught.value) for known in [*METHODS, "pNN", "boltzmann", "schedule"])
 
@@ -82,7 +82,7 @@ def test_every_percentile_is_a_method(name, percentile):
 def test_a_fear_has_one_kind_of_data(name):
     """A second suffix would quietly win over the first one, so there is no such method."""
     assert method(name.rpartition("-")[0]).memory == 0
-    with pytest.raises(ValueError, match=f"no method '{name}'"):
+    with pytest.raises(ValueError, match=f"Unknown method '{name}'"):
         method(name)
 
 

@@ -151,7 +151,7 @@ def test_goals_of_other_sizes_are_refused():
 
 def test_no_shield_is_said():
     """The entry of an export without a shield is refused with the way to one."""
-    with pytest.raises(ValueError, match="There is no shield: make one by deimos shield, and export the run after"):
+    with pytest.raises(ValueError, match="There is no shield: make one with deimos shield, then export the run again"):
         Shield.from_dict(None)
 
 

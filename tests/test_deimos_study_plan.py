@@ -158,7 +158,7 @@ def test_cell_survives_its_file(tmp_path):
 
 ERRORS = {
     # what is said in the file, and the one line that refuses it
-    TOML.replace('"uniform", "p25"', '"uniform", "q33"'): "There is no method 'q33'; there are: uniform, coop",
+    TOML.replace('"uniform", "p25"', '"uniform", "q33"'): "Unknown method 'q33'; choose from: uniform, coop",
     TOML.replace('"uniform", "p25"', '"uniform", "uniform"'): "Every method must be given once; doubled: uniform",
     TOML.replace("[3, 5]", "[3, 3]"): "Every seed must be given once; doubled: 3",
     TOML.replace("[3, 5]", "0"): "seeds must be a number of seeds, .* or a list like 0,3,5, got 0",

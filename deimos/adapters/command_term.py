@@ -10,19 +10,19 @@ from deimos.goals.given import Rows
 
 
 class DirectedCommand(abc.ABC):
-    """Mix it in before the class of a command term, such as either's ``UniformVelocityCommand``.
+    """A mix-in to put before the class of a command term, such as either's ``UniformVelocityCommand``.
 
     The term resamples as before, by its own timers and at resets, and draws its modes (headings, standing robots); the
     commands come from the Director, which learns from what the modes made of them. A reset between two steps, as after
-    the Director or the environment has loaded a state, drops what is pending and is no outcome.
+    the Director or the environment has loaded a state, drops what is pending and is not an outcome.
     """
 
     director: GoalDirector
-    """Who chooses the commands, on the term's clock; it must have a ``goal_box``. Set it after ``super().__init__``."""
+    """Chooses the commands, on the term's clock; it must have a ``goal_box``. Set it after ``super().__init__``."""
     command: Tensor
     """The term's commands, shape (num_envs, goal_dim)."""
     _env: Any
-    _observed = 0  # step of the environment that the Director has heard of
+    _observed = 0  # last step of the environment that was reported to the Director
 
     @abc.abstractmethod
     def state(self) -> Tensor:
@@ -45,10 +45,10 @@ class DirectedCommand(abc.ABC):
         self.command[env_ids] = self.director.propose(env_ids, self.state()[env_ids], before)
 
     def _observe(self) -> None:
-        """Tell the Director how the last step ended; in a step, worlds are reset before commands are computed."""
+        """Report to the Director how the last step ended; in a step, worlds are reset before commands are computed."""
         env = self._env
         if env.common_step_counter == self._observed:
             return
         self._observed = env.common_step_counter
-        if hasattr(env, "reset_terminated"):  # or the counter is a checkpoint's, and nothing has been stepped yet
+        if hasattr(env, "reset_terminated"):  # else the counter is a checkpoint's, and nothing has been stepped yet
             self.director.observe(env.reset_terminated, env.reset_time_outs, executed=self.command)

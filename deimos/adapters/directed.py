@@ -1,4 +1,4 @@
-"""A Director in gymnasium's training loops, and what wrappers of other libraries have in common with that one."""
+"""A Director in gymnasium's training loops, and what wrappers for other libraries have in common with it."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,19 +14,19 @@ from deimos.goals.director import GoalDirector
 Observation = np.ndarray | dict[str, np.ndarray]
 """Observations of all worlds: shape (num_envs, obs_dim), or arrays by key, worlds along the first axis."""
 Reward = Callable[[Observation, np.ndarray], np.ndarray]
-"""Rewards, shape (num_envs,), of steps from the observations that they ended in, which hold the goals that were in
-force, and from the rewards of the environment."""
+"""Gives the rewards, shape (num_envs,), of steps from the observations that they ended in, which hold the goals that
+were in force, and the rewards of the environment."""
 
 
 class GoalSlot:
     """The place of the goal in every observation, and the Director that fills it.
 
     Args:
-        director: Who chooses the goals, on its own clock; it must have a ``goal_box``.
+        director: Chooses the goals, on its own clock; it must have a ``goal_box``.
         space: Observation space of one world: a ``Box`` of one axis, or a ``Dict``.
         num_envs: Number of worlds.
-        where: The goal's components of a ``Box``, or its key in a ``Dict``, of a type that holds fractions.
-        next_step: Whether a world that is done is reset in a step of its own.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``, of a floating-point type.
+        next_step: Whether a world that is done is reset in a separate step.
 
     Raises:
         ValueError: If the space has no such place, or holds whole numbers there.
@@ -48,7 +48,7 @@ class GoalSlot:
         """The goals in force, shape (num_envs, goal_dim); zeros before the first reset."""
 
     def begin(self, obs: Observation, where: np.ndarray | None = None) -> Observation:
-        """First goals in the observations of worlds that begin an episode; what is pending there is dropped.
+        """Write first goals into the observations of worlds that begin an episode; what is pending there is dropped.
 
         Args:
             obs: Observations of all worlds.
@@ -65,7 +65,7 @@ class GoalSlot:
 
         Args:
             obs: Observations after the step: those after the reset where a world has been reset in it.
-            last: By world that has, the observation that its episode ended in. Its goal is overwritten.
+            last: For each such world, the observation that its episode ended in. Its goal is overwritten.
         """
         if last:
             worlds = [last.get(world, own) for world, own in enumerate(iterate(self._spaces, obs))]
@@ -77,7 +77,7 @@ class GoalSlot:
         return obs
 
     def advance(self, obs: Observation, terminated: np.ndarray, truncated: np.ndarray) -> Observation:
-        """What the last step decided, and the goals that are due; returns the observations with the goals to pursue.
+        """Resolve the last step and choose the goals that are due; returns the observations with the goals to pursue.
 
         Args:
             obs: Observations to act on next.
@@ -95,7 +95,7 @@ class GoalSlot:
         return self.write(obs)
 
     def checked(self, reward: np.ndarray) -> np.ndarray:
-        """Rewards, if there is one for each world: others would be broadcast.
+        """The rewards, if there is one for each world: others would be broadcast.
 
         Raises:
             ValueError: If they have another shape.
@@ -112,7 +112,7 @@ class GoalSlot:
         return np.delete(obs, self.where, axis=1).astype(np.float32)
 
     def read(self, obs: Observation) -> np.ndarray:
-        """What stands in the place of the goal, shape (num_envs, goal_dim)."""
+        """What is in the place of the goal, shape (num_envs, goal_dim)."""
         return obs[self.where] if isinstance(obs, Mapping) else obs[:, self.where]
 
     def write(self, obs: Observation) -> Observation:
@@ -128,14 +128,13 @@ class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
     """Worlds whose goals a Director chooses: it overwrites the goal in every observation, and the reward follows it.
 
     Args:
-        env: The worlds, which begin anew by themselves. What terminates is a crash.
-        director: Who chooses the goals, on its own clock; it must have a ``goal_box`` and the worlds'
-            ``autoreset``.
+        env: The worlds, which reset themselves. A termination is a crash.
+        director: Chooses the goals, on its own clock; it must have a ``goal_box`` and the worlds' ``autoreset``.
         where: The goal's components of a ``Box``, or its key in a ``Dict``.
         reward: Rewards for the goals in force; see ``Reward``.
 
     Raises:
-        ValueError: If observations have no such place, or if nothing resets a world that is done, or does not say how.
+        ValueError: If observations have no such place, or ``env`` does not reset worlds that are done or say how.
     """
 
     def __init__(
@@ -156,13 +155,13 @@ class DirectedVectorEnv(gymnasium.vector.VectorWrapper):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """See ``VectorEnv.reset``; every world, or those of a ``reset_mask`` in the options, get a first goal."""
-        where = (options or {}).get("reset_mask")  # the worlds take it out
+        where = (options or {}).get("reset_mask")  # before the worlds remove it
         obs, infos = self.env.reset(seed=seed, options=options)
         self._over[slice(None) if where is None else where] = False
         return self.slot.begin(obs, where), infos
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """See ``VectorEnv.step``; what an episode ended in, and its reward, are of the goal that was in force.
+        """See ``VectorEnv.step``; what an episode ended in, and its reward, are for the goal that was in force.
 
         Raises:
             ValueError: If there are not as many rewards as worlds, or as in ``GoalDirector.step``.

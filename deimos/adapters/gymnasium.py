@@ -25,7 +25,7 @@ from deimos.sim.env import EnvConfig
 
 Observation = np.ndarray | dict[str, np.ndarray]
 """An array, or one under each of ``observation``, ``achieved_goal`` and ``desired_goal``."""
-VERSION = 1  # goes up when an episode under the same seed and actions becomes another one
+VERSION = 1  # grows when an episode under the same seed and actions changes
 ENVIRONMENTS: dict[str, dict[str, Any]] = {
     **{
         f"Particle-{variant.title()}": {"environment": "particle", "variant": variant, "time_limit": 1000}
@@ -42,19 +42,19 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """Many worlds, with NumPy arrays in and copies out; goals are issued within ``step``.
 
-    ``loop`` leads to the environment, the selector and the interactions; every ``reset`` with a seed makes another one.
+    ``loop`` leads to the environment, the selector and the interactions; every ``reset`` with a seed makes a new one.
     On CUDA make it and call it within ``deimos.sim.shared.one_stream(device)``; outside, it is refused.
 
     Args:
         config: The environment.
         num_envs: Number of worlds, at least 1.
-        seed: Seed of every draw, in [0, 2^32); ``None`` for one that nobody knows. ``reset`` may set another.
+        seed: Seed of every draw, in [0, 2^32); ``None`` for a random one. ``reset`` may set another.
         device: Where they are simulated.
-        selector: Who chooses their goals; ``None`` for Uniform. Nothing here lets it learn.
+        selector: Chooses their goals; ``None`` for Uniform. Nothing here lets it learn.
         env_offset: Global number of world 0; see ``EnvConfig.build``.
-        autoreset_mode: What becomes of worlds that are done. ``SAME_STEP``: they begin anew at once, the observation is
+        autoreset_mode: What becomes of worlds that are done. ``SAME_STEP``: they are reset at once, the observation is
             the new episode's first, and ``infos["final_obs"]`` holds the last one of the old. ``NEXT_STEP``: the
-            observation is the last one, and the next step begins anew there, whatever the action, with reward 0.
+            observation is the last one, and the next step resets such a world, whatever the action, with reward 0.
             ``DISABLED``: ``reset(options={"reset_mask": ...})`` must come before the next step.
         goal_dict: Whether an observation is a dictionary in the shape of gymnasium-robotics' goal environments:
             ``observation`` without the goal, ``achieved_goal`` and ``desired_goal``; see ``compute_reward``.
@@ -72,7 +72,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         check_at_least("num_envs", num_envs, 1)
         self.num_envs = num_envs
         self.loop: GoalLoop
-        self._fresh: torch.Tensor  # where a world stands as an episode begins
+        self._fresh: torch.Tensor  # where a world is at the beginning of an episode
         self._over: torch.Tensor  # where an episode has ended and no new one has begun
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
@@ -82,7 +82,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         env = self.loop.env
         self._goal_dict = goal_dict
         if goal_dict and (env.achieved(env.obs) is None or config.crash_penalty):
-            raise ValueError(f"goal_dict must be False: rewards depend on more than goals here; got {config}.")
+            raise ValueError(f"goal_dict must be False, since rewards depend on more than goals here; got {config}.")
         sizes = {"observation": env.state_dim, "achieved_goal": env.goal_dim, "desired_goal": env.goal_dim}
         boxes = {name: Box(-np.inf, np.inf, (size,), np.float32) for name, size in sizes.items()}
         flat = Box(-np.inf, np.inf, (env.obs_dim,), np.float32)
@@ -104,23 +104,23 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Begin an episode.
 
         Args:
-            seed: In [0, 2^32), to build the worlds and the selector anew, so that equal seeds give equal episodes.
+            seed: In [0, 2^32), to rebuild the worlds and the selector, so that equal seeds give equal episodes.
             options: Empty, or ``reset_mask``: where to begin, bool, shape (num_envs,), instead of everywhere.
 
         Returns:
             What to act on first, float32, shape (num_envs, obs_dim), and an empty dictionary.
 
         Raises:
-            ValueError: If the seed is out of range, the options are others, or there are a seed and a mask.
+            ValueError: If the seed is out of range, there are other options, or both a seed and a mask.
         """
         options = dict(options or {})
         mask = options.pop("reset_mask", None)
         if options:
-            raise ValueError(f"options may hold reset_mask alone, got {options}.")
+            raise ValueError(f"options may hold only reset_mask, got {options}.")
         if mask is not None and (np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool):
             raise ValueError(f"reset_mask must be bool and have shape ({self.num_envs},), got {mask}.")
         if mask is not None and seed is not None:
-            raise ValueError(f"seed must be None where there is a reset_mask, got {seed}: it is of all worlds.")
+            raise ValueError(f"seed must be None if there is a reset_mask, got {seed}: it is for all worlds.")
         if seed is not None:
             self._begin(seed)
         super().reset(seed=None if seed is None else int(seed))
@@ -143,8 +143,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             ValueError: If the actions have another shape.
-            ResetNeeded: If nobody has begun an episode where one has ended, and nothing here does.
-            SimulationError: If an action is not finite, or more worlds become invalid than may.
+            ResetNeeded: If an episode has ended in a world that was not reset, and nothing here does that.
+            SimulationError: If an action is not finite, or too many worlds become invalid.
         """
         env = self.loop.env
         action = np.array(actions, dtype=np.float32)
@@ -176,14 +176,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return self._seen(), reward, terminated, truncated, infos
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> np.ndarray:
-        """Rewards of steps that achieved one thing and whose goal was another, as in gymnasium-robotics.
+        """Rewards of steps that achieved one thing while their goal was another, as in gymnasium-robotics.
 
-        They are those of ``step`` but for rounding, where the goal of the observation was in force during the step: not
+        Up to rounding, they are those of ``step`` where the goal of the observation was in force during the step: not
         where a new one was issued after it.
 
         Args:
             achieved_goal: As observations hold it, shape (..., goal_dim).
-            desired_goal: The same of goals.
+            desired_goal: Goals, of the same shape.
             info: Ignored: no reward depends on it.
 
         Returns:
@@ -202,7 +202,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         env = self.loop.env
         if not self._goal_dict:
             return _copy(env.obs)
-        achieved = cast(torch.Tensor, env.achieved(env.obs))  # the constructor has refused what gives None
+        achieved = cast(torch.Tensor, env.achieved(env.obs))  # the constructor has refused environments that give None
         return {
             "observation": _copy(env.state(env.obs)), "achieved_goal": _copy(achieved),
             "desired_goal": _copy(env.obs[:, env.goal_slice]),
@@ -254,7 +254,7 @@ def make(environment: str, render_mode: None = None, **options: Any) -> Gymnasiu
 
     Raises:
         ValueError: If there is no such environment or a value is not valid.
-        TypeError: If there is no such option, or a ``render_mode``.
+        TypeError: If there is no such option, or if a ``render_mode`` is given.
     """
     config = _config(environment, render_mode, options)
     return GymnasiumEnv(config, **options)
@@ -269,7 +269,7 @@ def make_vec(environment: str, num_envs: int, render_mode: None = None, **option
 def _config(environment: str, render_mode: None, options: dict[str, Any]) -> EnvConfig:
     """The environment's configuration, whose fields are taken out of ``options``."""
     if render_mode is not None:
-        # The error of an option that there is not: Stable-Baselines3 asks for 'rgb_array' and goes on without.
+        # The error of an unknown option: Stable-Baselines3 asks for 'rgb_array' and continues without it.
         raise TypeError(f"render_mode must be None, got '{render_mode}'; `deimos play` draws runs.")
     kind = plugins.load(envs, environment).Config
     return kind(**{name: options.pop(name) for name in kind.__dataclass_fields__ if name in options})

@@ -16,7 +16,7 @@ from deimos.sim.env import Env
 
 
 class RslRlVecEnv(VecEnv):
-    """An environment as rsl_rl 5 wants it: goals are issued and worlds that are done begin anew within ``step``.
+    """An environment as rsl_rl 5 wants it: ``step`` also issues goals and resets worlds that are done.
 
     Everything that it returns is a copy that later steps leave alone. rsl_rl asks a selector for goals but
     does not let it learn: a Director stays uniform until its owner calls, say after every iteration,
@@ -25,8 +25,8 @@ class RslRlVecEnv(VecEnv):
 
     Args:
         env: The worlds, as they were built.
-        selector: Who chooses their goals; ``None`` for Uniform.
-        reward_scale: What rewards are multiplied with, positive.
+        selector: Chooses their goals; ``None`` for Uniform.
+        reward_scale: What rewards are multiplied by, positive.
         report_every: Steps between two reports, ``log`` of the extras, at least 1: making one waits for the device.
 
     Attributes:
@@ -78,7 +78,7 @@ class RslRlVecEnv(VecEnv):
             as the terms of the reward (``reward/NAME``, not scaled), which rsl_rl logs; see ``Env.report``.
 
         Raises:
-            SimulationError: If an action is not finite, or more worlds become invalid than may.
+            SimulationError: If an action is not finite, or too many worlds become invalid.
         """
         step = self.env.step(actions.detach())
         self.env.check()  # rsl_rl looks for NaN in what comes back, but a clipped NaN is a number
@@ -93,7 +93,7 @@ class RslRlVecEnv(VecEnv):
 
 
 def runner_config(ppo: PPOConfig) -> dict[str, Any]:
-    """The configuration of rsl_rl's ``OnPolicyRunner`` that says the same as ``ppo``.
+    """The configuration of rsl_rl's ``OnPolicyRunner`` that corresponds to ``ppo``.
 
     The reward scale is not in it: give it to the environment.
     """

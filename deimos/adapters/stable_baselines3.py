@@ -12,12 +12,12 @@ from deimos.goals.director import GoalDirector
 class DirectedVecEnv(VecEnvWrapper):
     """Worlds whose goals a Director chooses: it overwrites the goal in every observation, and the reward follows it.
 
-    A ``Monitor`` within reports the worlds' own rewards: put a ``VecMonitor`` around it.
+    A ``Monitor`` inside reports the worlds' own rewards: put a ``VecMonitor`` around it.
 
     Args:
-        venv: The worlds. What terminates is a crash; ``TimeLimit.truncated`` in an info is not.
-        director: Who chooses the goals, on its own clock; it must have a ``goal_box``.
-        where: The goal's components of a ``Box``, or its key in a ``Dict``, of a type that holds fractions.
+        venv: The worlds. A termination is a crash; ``TimeLimit.truncated`` in an info is not.
+        director: Chooses the goals, on its own clock; it must have a ``goal_box``.
+        where: The goal's components of a ``Box``, or its key in a ``Dict``, of a floating-point type.
         reward: Rewards for the goals in force; see ``Reward``. ``None`` asks the worlds' own ``compute_reward``, which
             takes achieved goals, desired goals and infos, as in gymnasium-robotics.
 

@@ -1,4 +1,4 @@
-"""From a fear network's logits to probabilities, and how good probabilities are."""
+"""From a fear network's logits to probabilities, and how good these are."""
 
 import math
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ BINS = 15
 class Calibration(Stateful):
     """Turns logits of a class-balanced classifier into probabilities.
 
-    Where crashes and survivals weigh 1/2 together each, the odds that a classifier learns are (1 - pi) / pi times the
-    true ones, with pi the share of crashes; adding log(pi / (1 - pi)) to the logit takes that back exactly [1]_. What
-    is left is a matter of over- and underconfidence, which one temperature on held-out data corrects [2]_.
+    Where crashes and survivals each have a total weight of 1/2, the odds that a classifier learns are (1 - pi) / pi
+    times the true ones, with pi the share of crashes; adding log(pi / (1 - pi)) to the logit undoes that exactly [1]_.
+    What remains is over- or underconfidence, which one temperature on held-out data corrects [2]_.
 
     Args:
         device: Where the logits are.
@@ -55,7 +55,7 @@ class Calibration(Stateful):
         self.prior = math.log(share / (1.0 - share))
 
     def fit(self, log_odds: Tensor, crashed: Tensor, steps: int = 3) -> None:
-        """Move the temperature towards the least log-loss on interactions that the network has not learnt from.
+        """Move the temperature towards the lowest log-loss on interactions that the network has not learnt from.
 
         The loss is convex in 1 / temperature, so Newton's method from the last one tracks it.
 
@@ -91,12 +91,12 @@ class Reliability:
 def reliability(probability: Tensor, crashed: Tensor, bins: int = BINS) -> Reliability:
     """Predicted against observed crash rates.
 
-    Equal-mass bins: where crashes are rare nearly all predictions share one of the bins of equal width.
+    Bins have equal mass: where crashes are rare, nearly all predictions would share one bin of equal width.
 
     Args:
         probability: Predictions in [0, 1], shape (n,), n at least 1.
         crashed: Their outcomes, True for a crash, bool, shape (n,).
-        bins: Bins; fewer where there are fewer predictions.
+        bins: Number of bins; fewer where there are fewer predictions.
     """
     n = len(probability)
     bins = min(bins, n)
@@ -135,7 +135,7 @@ def evaluate(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     scalars = torch.stack([
         y.mean(), (p - y).square().mean(), nn.functional.binary_cross_entropy(p, y), p[top].mean() - y[top].mean()
     ])  # fmt: skip
-    # The rest is a few numbers: one transfer, and no operation of the device for each.
+    # The rest is a few numbers: one transfer instead of an operation of the device for each.
     parts = [scalars, curve.predicted, curve.observed, curve.count.double() / len(p)]
     (rate, brier, loss, gap), *bins = (
         part.tolist() for part in torch.cat(parts).cpu().split([len(part) for part in parts])

@@ -1,4 +1,4 @@
-"""When goals are due in other people's loops, by our clock or by theirs; tensors only, one per world."""
+"""When goals are due in other people's loops, by our clock or by theirs; tensors only, one entry per world."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from deimos.nn.stateful import Stateful
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a step of all worlds has ended."""
+    """What ended in a step of all worlds."""
 
     terminated: Tensor
     """True where the world crashed, bool, shape (num_envs,)."""
@@ -27,16 +27,16 @@ class Outcome:
 
 
 class GoalClocks(Stateful):
-    """The goal core of somebody else's worlds, and what tells it when a goal ends.
+    """The goal core of worlds in another loop, and what tells it when a goal ends.
 
-    Whoever owns the worlds calls ``outcome`` and ``advance`` after every step, and ``propose`` where a goal is due.
+    Their owner calls ``outcome`` and ``advance`` after every step, and ``propose`` where a goal is due.
 
     Args:
-        core: Who chooses, and the interactions.
+        core: The selector and the interactions.
         spaces: The worlds.
         seed: Seed of every choice, in [0, 2^32).
         choose_first: Whether first goals are chosen, and so are interactions.
-        next_step: Whether a world that is done is reset in a step of its own, after that of its end.
+        next_step: Whether a world that is done is reset in a separate step, after the one that ended it.
     """
 
     saved = ("core", "_age", "_count", "asked", "_first", "_over", "_open_ended", "_given", "_goal")
@@ -48,25 +48,25 @@ class GoalClocks(Stateful):
         # Steps of the active goal, and goals that were chosen for the world: its draws' addresses.
         self._age, self._count, self.asked = torch.zeros(3, count, dtype=torch.int64, device=device)
         """Goals that every world was given, first ones included, int64, shape (num_envs,)."""
-        # A first goal is next; done but not reset yet; nobody said how long the goal is to last; the goal was chosen.
+        # A first goal is next; done but not reset yet; the goal has no announced horizon; the goal was chosen.
         self._first, self._over, self._open_ended, self._given = torch.zeros(4, count, dtype=torch.bool, device=device)
         self._first.fill_(True)
         self._goal = torch.zeros(count, spaces.goal_dim, dtype=torch.float32, device=device)
         groups = () if spaces.groups == (slice(None),) else (len(spaces.groups),)
         self._untracked = torch.zeros(count, *groups, dtype=torch.float32, device=device)
         self.tracked = False
-        """Whether anybody has told how well goals are met."""
+        """Whether tracking has ever been given."""
         self._draws: Tensor | None = None  # for the next decision of every world, until the step _drawn_until
         self._drawn_until = 0
 
     def outcome(self, terminated: Tensor, truncated: Tensor, own: bool) -> Outcome:
-        """What the last step has ended; nothing is counted yet, so whoever fails now may call again.
+        """What the last step has ended; nothing is counted yet, so a caller that fails now may call again.
 
         Args:
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where its episode was cut off without a crash, bool, shape (num_envs,).
             own: Whether goals are due after T steps. If not, they last until the next proposal, and an interaction
-                at most for its horizon.
+                lasts for its horizon at most.
         """
         interactions = self.core.interactions
         if own:
@@ -81,13 +81,13 @@ class GoalClocks(Stateful):
         """Count a step of all worlds and resolve what it decided.
 
         Args:
-            step: What ``outcome`` says of it.
+            step: What ``outcome`` returned for it.
             tracking: How well a goal is met, in [0, 1], shape (num_envs,) for the whole of it or (num_envs, groups);
                 ``None`` for 0.
             executed: Goals that were pursued, shape (num_envs, goal_dim); ``None`` for those that were given.
         """
         interactions, done = self.core.interactions, step.changes.ended
-        if executed is not None:  # what a goal turned into at once: its first step tells
+        if executed is not None:  # what a goal turned into at once: its first step shows it
             begun = (interactions.active & (interactions.issued_at == interactions.now)).nonzero().squeeze(1)
             interactions.execute(begun, executed[begun])
             self._given.zero_()
@@ -120,8 +120,8 @@ class GoalClocks(Stateful):
     def end(self, rows: Tensor) -> None:
         """End what is pending in the listed worlds, int64, shape (m,), before its time.
 
-        Where nobody had said how long the goal was to last, the world has survived it, and its horizon is what it has
-        lasted; of others the outcome is not known, and they are dropped.
+        Where no horizon was announced, the world has survived the goal, and the horizon is the time that it has lasted;
+        elsewhere the outcome is not known, and the interaction is dropped.
         """
         interactions = self.core.interactions
         lasted = interactions.now - interactions.issued_at[rows]
@@ -141,8 +141,8 @@ class GoalClocks(Stateful):
             goal: Their active goals, shape (m, goal_dim).
             candidates: Independent uniform goals, shape (m, N, goal_dim).
             horizon: Steps that each goal is to last, int64, shape (m,); ``None`` for T.
-            open_ended: Whether nobody knows, and ``horizon`` is the most that it can be.
-            own: Whether no world gets a goal of ours twice within T steps.
+            open_ended: Whether that is not known, and ``horizon`` is the maximum.
+            own: Whether no world gets two goals from us within T steps.
 
         Returns:
             Goals, shape (m, goal_dim). First goals are the first candidates, unless they are chosen.
@@ -170,7 +170,7 @@ class GoalClocks(Stateful):
     def _drawn(self, rows: Tensor, own: bool) -> Tensor:
         """Uniform numbers that belong to the next decision of the listed worlds, shape (m, 4).
 
-        Many worlds at once cost what one does, and as long as nobody can have used his own they stay good.
+        Drawing for all worlds costs as much as for one, and the numbers stay valid until a world can have used its own.
         """
         if not own or self._choose_first:
             self._drawn_until = 0
@@ -182,7 +182,7 @@ class GoalClocks(Stateful):
         return self._draws[rows]
 
     def refuse_other_goals(self, goal: Tensor, rows: Tensor | None = None) -> None:
-        """Raise ``ValueError`` if a chosen goal has changed without a proposal, beyond a rounding to 8 bits.
+        """Raise ``ValueError`` if a chosen goal has changed without a proposal, by more than rounding to 8 bits.
 
         Args:
             goal: Active goals, shape (m, goal_dim).

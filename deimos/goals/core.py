@@ -1,4 +1,4 @@
-"""Goals between two steps, in Deimos' own loop as in other people's: outcomes first, then choices."""
+"""Goals between two steps, in Deimos' own loop and in other people's: outcomes first, then choices."""
 
 import math
 from dataclasses import dataclass
@@ -12,24 +12,24 @@ from deimos.nn.ranks import mean_over_ranks
 from deimos.nn.stateful import Stateful
 
 RING = 32 * 2**20  # bytes for resolved interactions where a world may have any number of them,
-SPARE = 8  # but at least so many of each world
+SPARE = 8  # but at least this many of each world
 
 
 def window_between(goal_period: int, steps: int) -> int:
-    """Steps that outcomes are kept for, so that each is learnt from where a selector learns every ``steps`` steps.
+    """Steps that outcomes are kept for, so that each is learnt from if a selector learns every ``steps`` steps.
 
-    The method learns from the last 2 T. The crash memory takes over what was issued T steps ago, once all of that time
-    is known: what was resolved up to T steps before the last update must still be there.
+    The method learns from the last 2 T. The crash memory takes over what was issued T steps ago, once all outcomes of
+    that time are known: what was resolved up to T steps before the last update must still be there.
     """
     return max(2 * goal_period, steps + goal_period)
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Where a step calls for a new goal; in dense form all worlds are listed, since nobody has counted them."""
+    """Where a step calls for a new goal; in dense form all worlds are listed, since they were not counted."""
 
     due: Tensor
-    """Worlds that live and whose goal's time is up, int64, shape (m,)."""
+    """Worlds that are not done and whose goal's time is up, int64, shape (m,)."""
     done: Tensor
     """Worlds whose episode has ended, int64, shape (m,): they begin with a first goal."""
     cut_off: Tensor
@@ -43,16 +43,16 @@ class Changes:
 class GoalCore(Stateful):
     """Joins a selector and the interactions of its goals.
 
-    It sees tensors only. Whoever owns the worlds calls ``advance`` after every step, and ``choose`` for the worlds
+    It sees tensors only. The owner of the worlds calls ``advance`` after every step, and ``choose`` for the worlds
     that are due.
 
     Args:
-        selector: Who chooses.
+        selector: The selector.
         spaces: The worlds.
         window: Steps that resolved interactions are kept for; ``None`` for 2 T.
-        any_number: Whether a world may resolve one in every step: where goals last fewer than T steps, or first ones
-            are chosen. Of those the newest are kept that fit into ``RING``, and ``SPARE`` of each world in any case:
-            where that forgets crashes, the calibration counts too few.
+        any_number: Whether a world may resolve one in every step, as where goals last fewer than T steps or first ones
+            are chosen. Then the newest that fit into ``RING`` are kept, and ``SPARE`` of each world in any case: where
+            that forgets crashes, the calibration counts too few.
     """
 
     saved = ("selector", "interactions", "weight", "percentile", "_delivered", "_steps")
@@ -78,7 +78,7 @@ class GoalCore(Stateful):
         """Weight of the transitions under the active goal in everything learnt, at least 0, shape (num_envs,)."""
         self.percentile = torch.full_like(self.weight, 50.0)
         """Percentile of the active goal's fear among the candidates that it was chosen from, in [0, 100], shape
-        (num_envs,): 50 for first goals and whatever else is uniform, NaN where the selector has no fear to rank by."""
+        (num_envs,): 50 for first goals and all other uniform ones, NaN where the selector has no fear to rank by."""
         self._delivered, self._steps = torch.zeros_like(self.weight), 0  # its sum since the last call of learn
         self._everybody = torch.arange(spaces.num_envs, dtype=torch.int64, device=spaces.device)
         self._nobody = self._everybody[:0]
@@ -87,7 +87,7 @@ class GoalCore(Stateful):
         """What ``advance`` will return for a step; nothing is counted yet."""
         done = terminated | truncated
         masks = torch.stack([due & ~done, done, truncated])
-        # A known count spares the device another wait.
+        # A known count saves another wait for the device.
         due_rows, done_rows, cut_off = (
             torch.nonzero_static(mask, size=count).squeeze(1) if count else self._nobody
             for mask, count in zip(masks, masks.sum(1).tolist(), strict=True)
@@ -108,10 +108,10 @@ class GoalCore(Stateful):
             due: True where the goal's time is up, bool, shape (num_envs,).
             reward: Rewards, shape (num_envs,).
             tracking: How well each group of goal components is met, in [0, 1], shape (num_envs, groups); ``None``
-                where there is one group and the reward says it.
-            dense: Whether the changes shall be in dense form, which reads nothing from the device. Otherwise three
+                where there is one group and the reward is its tracking.
+            dense: Whether to return the changes in dense form, which reads nothing from the device. Otherwise three
                 counts are read at once, and what follows is done for those worlds alone.
-            changes: What ``changes`` has said of this step; ``None`` to find it out.
+            changes: What ``changes`` returned for this step; ``None`` to compute it.
         """
         self.interactions.advance(reward, terminated, tracking)
         self._delivered += self.percentile
@@ -163,8 +163,8 @@ class GoalCore(Stateful):
         """Let the selector learn, once per rollout; see ``GoalSelector.learn``.
 
         Returns:
-            What it has to say, and ``goal_percentile``: the mean of ``percentile`` over all worlds and steps since the
-            last call, which is the dose of fear that was delivered.
+            Its numbers for the log, and ``goal_percentile``: the mean of ``percentile`` over all worlds and steps since
+            the last call, which is the dose of fear that was delivered.
         """
         mean = mean_over_ranks(self._delivered.mean()).item() / self._steps if self._steps else math.nan
         self._delivered.zero_()

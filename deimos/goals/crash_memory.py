@@ -1,8 +1,8 @@
 """Crashes of the past, each with survivals of the same time.
 
 A policy that becomes safe stops crashing, and a network that learns from the last 2 T steps alone stops learning with
-it. Old crashes beside young survivals would teach something else: to tell *when* a state was met. So every crash is
-kept together with survivals of the same time, and both fade alike.
+it. Old crashes next to recent survivals would teach something else: *when* a state was met. So every crash is kept
+together with survivals of the same time, and both fade alike.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
 PARTNERS = 16  # survivals that are kept with every crash,
-DRAWN = 4  # and those of them that take part in a fit: another draw each time, since the few would be learnt by heart
+DRAWN = 4  # and those of them that enter a fit: another draw each time, since so few would be memorised
 HALF_LIFE = 1.5  # periods of T steps after which a crash and its partners weigh half
 PRESENT = 0.1  # share of a class that present rows weigh at most: the AUROC of age stays within PRESENT of 0.5
 YOUNGEST = 1024  # survivals of the window that are drawn for a fit
@@ -45,8 +45,8 @@ class CrashMemory(Stateful):
         self._partners = torch.zeros(capacity, PARTNERS, width, dtype=torch.float32, device=device)
         self._issued = torch.zeros(capacity, dtype=torch.int64, device=device)
         self.stored = 0
-        """Crashes stored so far, those that have made way included."""
-        self._upto = -1  # step that interactions have been looked at up to
+        """Crashes stored so far, including those that have made way."""
+        self._upto = -1  # step up to which interactions have been looked at
         self.generator = generator(seed, "crash memory", device)
 
     def must_be_sound(self) -> Mapping[str, Any]:
@@ -58,11 +58,11 @@ class CrashMemory(Stateful):
     def store(self, rows: Tensor, window: Resolved, now: int, kept_since: int = 0) -> None:
         """Take over the new crashes among what was issued at least T steps ago, each with survivals of that time.
 
-        Of what was issued later only the crashes are known yet. Crashes of a time without survivals wait for some.
+        Of what was issued later, only the crashes are known yet. Crashes of a time without survivals wait for some.
         Partners are the survivals that were issued next to a crash, before or after it.
 
-        Where outcomes of goals that were issued later than T steps ago have made way, so that nothing would come of
-        waiting, it takes over what has resolved since the last time instead.
+        Where outcomes of goals that were issued later than T steps ago have made way, so that waiting is of no use, it
+        takes over what has resolved since the last call instead.
 
         Args:
             rows: What to keep of every interaction of the window, shape (n, width).
@@ -100,10 +100,10 @@ class CrashMemory(Stateful):
         first = begin + (spare.clamp(min=0) * draw + spare.clamp(max=0) * 0.5).floor().long()
         first = first.clamp(0, max(0, len(survived) - PARTNERS))
         place = first.unsqueeze(1) + torch.arange(PARTNERS, device=issued.device)
-        return survived[order[place % len(survived)]]  # of few, some several times
+        return survived[order[place % len(survived)]]  # if there are few, some several times
 
     def sample(self, rows: Tensor, window: Resolved) -> tuple[Tensor, Tensor, Tensor]:
-        """What to learn from.
+        """The rows to learn from.
 
         Args:
             rows: Rows of the window, shape (n, width): the present. The crashes among them that are not stored yet, and
@@ -132,7 +132,7 @@ class CrashMemory(Stateful):
 
 
 def _with_present(remembered: Tensor, present: int) -> Tensor:
-    """Weights of a class, as much as the remembered ones together: those, and then its ``present`` rows.
+    """Weights of a class, with the same total as the remembered ones: those, and then its ``present`` rows.
 
     A present row weighs as much as the newest remembered one, but all of them at most ``PRESENT`` of the whole.
     """

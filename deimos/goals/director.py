@@ -29,10 +29,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Assignment(Generic[A]):
-    """What every world pursues next; arrays or tensors, as the goals of the step were."""
+    """What every world pursues next; arrays or tensors, as the goals given to the step."""
 
     goal: A
-    """Goals, shape (num_envs, goal_dim): the given ones but where ``changed``."""
+    """Goals, shape (num_envs, goal_dim): the given ones except where ``changed``."""
     changed: A
     """True where the goal is a new one, bool, shape (num_envs,)."""
     weight: A
@@ -53,28 +53,28 @@ class GoalDirector:
     in float32, and keeps copies without gradients.
 
     Args:
-        selector: Who chooses: a selector's ``Config``, or the name of a method such as ``p25``.
-        goal_period: T: steps that a goal is active, at least 1; ``None`` on a clock of yours whose periods vary.
+        selector: A selector's ``Config``, or the name of a method such as ``p25``.
+        goal_period: T: steps that a goal is active, at least 1; ``None`` on your own clock if periods vary.
         num_envs: Worlds, at least 1. This and the two sizes may be left to the first call.
         state_dim: Components of a state, at least 1.
         goal_dim: Components of a goal, at least 1.
-        device: Where its tensors lie, and yours; ``None`` for that of the first call, the CPU for arrays.
+        device: Device of its tensors and of yours; ``None`` for that of the first call, the CPU for arrays.
         max_horizon: The most steps that a goal lasts, where ``goal_period`` is ``None``.
         horizon_input: Whether the fear network sees how long a goal is to last: a component ``horizon / max_horizon``
-            behind the state, in ``interactions`` too.
+            after the state, in ``interactions`` too.
         first_goals: ``uniform``, or ``chosen`` from the start state and a null goal of zeros; only chosen ones are
-            interactions. ``state`` must then be that after the reset.
-        goal_box: Lowest and highest goal, shape (goal_dim,) each. Candidates must then lie within, and need not be
+            interactions. ``state`` must then be the one after the reset.
+        goal_box: Lowest and highest goal, shape (goal_dim,) each. Candidates must then be inside it, and need not be
             given: they are drawn uniformly.
         groups: Components of a goal that are met or missed together, as slices, for ``tracking`` by group.
         autoreset: gymnasium's ``AutoresetMode`` or its value: ``SameStep``, also for loops that reset before the next
-            step by hand (``Disabled``), or ``NextStep``, where a step of its own resets a world after its end.
+            step by hand (``Disabled``), or ``NextStep``, where a separate step resets a world after its end.
         learn_every: Steps between two updates of the selector, at least 1; a rollout of the learner is a good choice.
-            Selectors that learn from transitions (``vds``, ``plr``) are updated by ``learn`` alone: say how often.
+            Selectors that learn from transitions (``vds``, ``plr``) are updated by ``learn`` alone: give its period.
             Outcomes are kept for 2 T steps or, if more, ``learn_every + T``: ``4 (state_dim + 2 goal_dim + 12)`` bytes
             per world for every T; where goals may be shorter, the newest, up to 32 MiB in all or 8 per world.
-        total_steps: Steps of the whole training, for selectors that change over it; 0 where nobody knows.
-        seed: Of the selector's networks and of every choice, in [0, 2^32); two Directors of one seed choose alike.
+        total_steps: Steps of the whole training, for selectors that change over it; 0 if unknown.
+        seed: Of the selector's networks and of every choice, in [0, 2^32); Directors with the same seed choose alike.
 
     Raises:
         ValueError: If an option is not valid, here or at the first call where sizes are left to it.
@@ -96,7 +96,7 @@ class GoalDirector:
         self.goal_period, self.learn_every, seed = periods["goal_period"], int(learn_every), int(seed)
         self.max_horizon: int = self.goal_period or periods["max_horizon"]  # type: ignore[assignment]  # one is given
         self.metrics: dict[str, float] = {}
-        """What the selector's last update had to say."""
+        """Numbers for the log, from the selector's last update."""
         self._config = method(selector) if isinstance(selector, str) else selector
         self._choose_first, self._next_step = first_goals == "chosen", mode == "NextStep"
         self._horizons, self._goal_box = Horizons(self.goal_period, self.max_horizon, horizon_input), goal_box
@@ -109,7 +109,7 @@ class GoalDirector:
         self._start_anew()
 
     def _start_anew(self) -> None:
-        """Know what the constructor was told and have learnt nothing."""
+        """Return to what the constructor was told, with nothing learnt."""
         self._sizes, self._device = self._told
         self._clocks: GoalClocks | None = None
         self._box: GoalBox | None = None
@@ -119,7 +119,7 @@ class GoalDirector:
 
     @property
     def selector(self) -> GoalSelector:
-        """Who chooses.
+        """The selector.
 
         Raises:
             RuntimeError: Before the first call, where sizes and device are left to it.
@@ -128,7 +128,7 @@ class GoalDirector:
 
     @property
     def interactions(self) -> Interactions:
-        """The outcomes of its goals; see ``selector`` for when it is known."""
+        """The outcomes of its goals; see ``selector`` for when they are known."""
         return self._known.core.interactions
 
     @property
@@ -164,8 +164,8 @@ class GoalDirector:
         Worlds that are done get a first goal; under ``NextStep`` after the step that reset them.
 
         Args:
-            state: Observations without the goal, shape (num_envs, state_dim). Where a world is done it may be that from
-                before or after its reset, unless first goals are chosen.
+            state: Observations without the goal, shape (num_envs, state_dim). Where a world is done, it may be the one
+                from before or after its reset, unless first goals are chosen.
             goal: Goals that were active during the step, shape (num_envs, goal_dim): those that were given last.
             terminated: True where the world crashed, shape (num_envs,): bool, or 0 and 1.
             truncated: True where its episode was cut off without a crash, shape (num_envs,): bool, or 0 and 1.
@@ -175,12 +175,12 @@ class GoalDirector:
             tracking: How well the goal is met, in [0, 1], for curricula: shape (num_envs,), or (num_envs, groups);
                 ``None`` for 0.
             executed: What the worlds really pursued where that was not ``goal`` (headings, standing, limits), shape
-                (num_envs, goal_dim): fear is learnt of what a goal became in its first step. ``None`` for ``goal``.
+                (num_envs, goal_dim): fear is learnt for what a goal became in its first step. ``None`` for ``goal``.
 
         Raises:
-            ValueError: If a shape, a device or a number does not fit, or a goal is another one than was given. Nothing
+            ValueError: If a shape, a device or a number does not fit, or a goal is not the one that was given. Nothing
                 is counted then.
-            SimulationError: If a network is not finite after an update.
+            SimulationError: If a weight of a network is not finite after an update.
         """
         if self.goal_period is None:
             raise ValueError(
@@ -229,8 +229,8 @@ class GoalDirector:
     def reset(self, rows: Rows = None) -> None:
         """Begin episodes in worlds that were reset by hand; then ``propose`` first goals for them.
 
-        What is pending there is dropped; what was learnt stays, and no step is counted. Call it for all worlds after
-        ``load_state_dict`` unless they go on where they were, too. Before the first call it changes nothing.
+        What is pending there is dropped; what was learnt stays, and no step is counted. Also call it for all worlds
+        after ``load_state_dict``, unless they continue where they were. Before the first call it changes nothing.
 
         Args:
             rows: Worlds: indices, each once, a mask, a slice, or ``None`` for all.
@@ -246,14 +246,14 @@ class GoalDirector:
     def propose(
         self, rows: Rows, state: Array, goal: A, candidates: Candidates = None, horizon: Array | int | None = None
     ) -> A:
-        """Give the listed worlds their next goals, on your clock or, to begin with, on its own.
+        """Give the listed worlds their next goals, on your clock or, for the first goals, on its own.
 
         What was pending there ends: survived where the horizon was not announced, dropped where it was longer. Worlds
         that have begun an episode, or never lived through a step, get a first goal.
 
         Args:
             rows: Worlds: indices, each once, a mask, a slice, or ``None`` for all.
-            state: Their states, shape (m, state_dim); whatever they are where a first goal is not chosen.
+            state: Their states, shape (m, state_dim); ignored where a first goal is not chosen.
             goal: Their active goals, shape (m, goal_dim).
             candidates: As in ``step``, for these worlds: shape (m, N, goal_dim), a function or ``None``.
             horizon: Steps that each goal is to last, at least 1 and at most ``max_horizon``, one number or shape (m,);
@@ -289,18 +289,18 @@ class GoalDirector:
     @own_settings()
     @torch.no_grad()
     def learn(self, rollout: Transitions | None = None) -> dict[str, float]:
-        """Update the selector now, besides every ``learn_every`` steps.
+        """Update the selector now, in addition to every ``learn_every`` steps.
 
         Args:
-            rollout: The learner's transitions since the last call, the observations being the state and behind it the
-                goal, for selectors that learn from them (``vds``, ``plr``).
+            rollout: The learner's transitions since the last call, with the state followed by the goal as observations,
+                for selectors that learn from them (``vds``, ``plr``).
 
         Returns:
             ``metrics``.
 
         Raises:
-            ValueError: If the selector needs a rollout and gets none, or not that of all steps since the last call.
-            SimulationError: If a network is not finite any more.
+            ValueError: If the selector needs a rollout and gets none, or one without all steps since the last call.
+            SimulationError: If a weight of a network is no longer finite.
         """
         core = self._known.core
         given.check_transitions(rollout, core, self._learnt_at)
@@ -317,7 +317,7 @@ class GoalDirector:
             state: States, shape (B, state_dim).
             goal: Active goals, shape (B, goal_dim).
             new_goal: Goals to evaluate, shape (B, goal_dim).
-            horizon: Steps that they are to last, where that is an input; ``None`` for the most.
+            horizon: Steps that they are to last, where that is an input; ``None`` for ``max_horizon``.
 
         Returns:
             Tensors, whatever the arguments are.
@@ -373,10 +373,10 @@ class GoalDirector:
 
         Args:
             state: What it returned, for a GoalDirector that was made with the same options; ``learn_every``,
-                ``total_steps`` and the device may be others.
+                ``total_steps`` and the device may differ.
 
         Raises:
-            ValueError: If it belongs to a Director with other options or to worlds of another number or size. Nothing
+            ValueError: If it belongs to a Director with other options, or to another number or size of worlds. Nothing
                 is changed then.
         """
         sizes, goals, learnt_at = unpacked(state, self._made_with)
@@ -387,19 +387,19 @@ class GoalDirector:
             raise ValueError(f"state must be that of {[*self._sizes]} worlds and components, got {sizes}.")
         try:
             inputs = self._expected(goals["goal"], *sizes)
-            copy.copy(self)._begin(inputs).load_state_dict(goals)  # what does not fit shows in another one
+            copy.copy(self)._begin(inputs).load_state_dict(goals)  # tried on a copy first
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise ValueError(f"state must be what state_dict() of this version returned, got {error!r}.") from error
         (self._clocks or self._begin(inputs)).load_state_dict(goals)
         self._learnt_at = learnt_at
 
     def _expected(self, sample: Array, num_envs: int | None, state_dim: int | None, goal_dim: int | None) -> Inputs:
-        """What arguments must be like: as is known, or else as the call itself tells; ``sample`` is one of them."""
+        """What arguments must be like: as already known, or else as the call shows; ``sample`` is one of them."""
         told = zip(self._sizes, (num_envs, state_dim, goal_dim), strict=True)
         worlds, states, goals = (theirs if ours is None else ours for ours, theirs in told)
         if worlds is None or states is None or goals is None:
             raise ValueError(
-                "num_envs, state_dim and goal_dim must be given to GoalDirector where its first call does not tell "
+                "num_envs, state_dim and goal_dim must be given to GoalDirector if its first call does not show "
                 f"them all, got {worlds}, {states} and {goals}."
             )
         for name, value in (("num_envs", worlds), ("state_dim", states), ("goal_dim", goals)):
@@ -409,7 +409,7 @@ class GoalDirector:
         return Inputs(worlds, states, goals, device, columns)
 
     @own_settings()
-    @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
+    @torch.inference_mode(False)  # what is made in a loop without gradients must also work outside it
     def _begin(self, inputs: Inputs) -> GoalClocks:
         box = self._box = None if self._goal_box is None else GoalBox(*self._goal_box, inputs.goal_dim, inputs.device)
         spaces = Spaces(
@@ -424,7 +424,7 @@ class GoalDirector:
         return self._clocks
 
     def _candidates(self, candidates: Candidates, rows: Tensor, model: A) -> Tensor:
-        """Candidates of the listed worlds, shape (m, N, goal_dim): the given ones, made or drawn."""
+        """Candidates of the listed worlds, shape (m, N, goal_dim): given, made by a function, or drawn."""
         clocks, share = self._known, self.goal_range
         if candidates is None:
             box: GoalBox = self._box  # type: ignore[assignment]  # or ``check_candidates`` has refused
@@ -438,7 +438,7 @@ class GoalDirector:
         return offered
 
     def _learn_if_due(self) -> None:
-        """The update of every ``learn_every`` steps, once."""
+        """Update every ``learn_every`` steps, once each."""
         core, tracked = self._known.core, self._known.tracked
         now = core.interactions.now
         if now % self.learn_every or now == self._learnt_at:

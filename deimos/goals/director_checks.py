@@ -61,12 +61,12 @@ def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **oth
     """What two Directors must have in common where one continues from the other's state: plain values by name.
 
     Args:
-        config: The selector's; its plain fields count, and those of the dataclasses in it.
+        config: The selector's configuration; its plain fields count, and those of the dataclasses in it.
         goal_box: Lowest and highest goal.
         **others: What else counts, plain.
 
     Raises:
-        ValueError: If the configuration is none, but a selector or its class.
+        ValueError: If ``config`` is not a configuration but, say, a selector or a class.
     """
     check_is("selector", config, SelectorConfig)
     box = None if goal_box is None else [_numbers(end) for end in goal_box]
@@ -99,7 +99,7 @@ def unpacked(state: Mapping[str, Any], own: Mapping[str, Any]) -> tuple[list[int
 
     Args:
         state: What ``GoalDirector.state_dict`` returned.
-        own: Settings of the Director that shall continue from it.
+        own: Settings of the Director that is to continue from it.
 
     Raises:
         ValueError: If something is missing, or it is of a Director with other settings, which are named.
@@ -118,9 +118,9 @@ def unpacked(state: Mapping[str, Any], own: Mapping[str, Any]) -> tuple[list[int
 
 
 def check_candidates(candidates: Candidates, count: int, inputs: Inputs, drawn: bool) -> None:
-    """Raise ``ValueError`` if candidates of ``count`` worlds do not fit, or there are none that could be ``drawn``.
+    """Raise ``ValueError`` if candidates of ``count`` worlds do not fit, or are missing and cannot be ``drawn``.
 
-    What a function makes, and the numbers themselves, are looked at where they are needed.
+    What a function makes, and the numbers themselves, are checked where they are needed.
     """
     inputs.check_candidates(candidates, count)
     if candidates is None and not drawn:

@@ -50,7 +50,7 @@ class Fear(Stateful):
         config: Its sizes and how it learns.
         state_dim: Components of a state.
         goal_dim: Components of a goal.
-        device: Where it lives.
+        device: Device of its weights.
         seed: Seed of its weights and of the order that it learns in.
     """
 
@@ -65,10 +65,10 @@ class Fear(Stateful):
         self.optimizer = Adam(self._nets.parameters, self._nets.grad, rate)
         self.generator = generator(seed, "fear minibatches", device)
         self.fitted = False
-        """Whether it has learnt anything yet; before, its ranking of goals would be an arbitrary bias."""
+        """Whether it has learnt anything yet; before that, its ranking of goals would be an arbitrary bias."""
 
     def fit(self, data: Resolved, epochs: int | None = None) -> float:
-        """Learn from interactions that all weigh alike within their class; see ``fit_rows``."""
+        """Learn from interactions with equal weights within their class; see ``fit_rows``."""
         inputs = torch.cat([data.state, data.goal, data.next_goal], dim=1)
         return self.fit_rows(inputs, data.crashed, torch.ones_like(inputs[:, 0]), epochs=epochs)
 
@@ -78,8 +78,8 @@ class Fear(Stateful):
     ) -> float:
         """Learn by class-balanced binary cross-entropy on logits.
 
-        Crashes and survivals weigh 1/2 together each, over all rows and not over those of a minibatch, so that the
-        shift this causes is known exactly.
+        Crashes and survivals each have a total weight of 1/2, over all rows and not over those of a minibatch, so that
+        the shift this causes is known exactly.
 
         Args:
             inputs: State, goal and next goal, shape (n, state_dim + 2 goal_dim).
@@ -104,7 +104,7 @@ class Fear(Stateful):
             x, y, w = inputs[order], target[order], weight[order]
             loss.zero_()
             for part in zip(x.split(size), y.split(size), w.split(size), strict=True):
-                scale = len(inputs) / len(part[0])  # makes the gradient one of a mean
+                scale = len(inputs) / len(part[0])  # makes the gradient that of a mean
                 loss += self._learn(part[0], part[1], part[2] * scale) / scale
         self.fitted = True
         return loss.item()

@@ -27,7 +27,7 @@ from deimos.goals.selector import (
 )
 from deimos.nn.ranks import largest
 
-LEAST = 32  # crashes and survivals that tell a temperature
+LEAST = 32  # crashes and survivals that a temperature is fitted to
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class FearSelectorConfig(SelectorConfig):
     fear: FearConfig = field(default_factory=FearConfig)
     """The fear network."""
     former: ClassVar[dict[str, Any]] = {"gate": False}
-    """Fields that earlier versions had, with the value that is the only one today."""
+    """Fields of earlier versions, with the only value that is still supported."""
 
     def __post_init__(self) -> None:
         check_at_least("candidates", self.candidates, 1)
@@ -61,16 +61,16 @@ class FearSelectorConfig(SelectorConfig):
 
 @dataclass(frozen=True)
 class FearEstimate:
-    """What a fear network thinks of some goals, and how far it can be trusted."""
+    """How much a fear network fears some goals, and how far it can be trusted."""
 
     probability: Tensor
     """Calibrated probability that the policy crashes within T steps, in (0, 1), shape (B,); of a selector that is not
     ``is_calibrated``, its fear on that scale."""
     auroc: float
-    """How often it ranked a crash of the last 2 T steps above a survival before it knew, in [0, 1]; 0.5 is chance,
-    NaN where a class is empty."""
+    """How often it ranked a crash of the last 2 T steps above a survival when they were issued, in [0, 1]; 0.5 is
+    chance, NaN where a class is empty."""
     age: int
-    """Rollouts since it has learnt last; 0 where it learns all the time."""
+    """Rollouts since it last learnt; 0 if it learns in every one."""
 
 
 class FearSelector(GoalSelector):
@@ -81,7 +81,7 @@ class FearSelector(GoalSelector):
     inputs_per_row: ClassVar[int] = 1
     """Inputs of the network in a row of ``rows``."""
     is_calibrated: ClassVar[bool] = True
-    """Whether ``calibration`` makes of a score the probability of a crash within T steps."""
+    """Whether ``calibration`` turns a score into the probability of a crash within T steps."""
     saved: ClassVar[tuple[str, ...]] = (
         "fear", "memory", "calibration", "_learnt_at", "_age", "_auroc", "_issued",
     )  # fmt: skip
@@ -94,7 +94,7 @@ class FearSelector(GoalSelector):
         self.fear = Fear(config.fear, spaces.state_dim, spaces.goal_dim, spaces.device, seed)
         self.calibration = Calibration(spaces.device)
         self.memory: CrashMemory | None = None
-        """Where the crashes are kept that fear is learnt from; ``None`` for the last 2 T steps alone."""
+        """The crashes that fear is learnt from; ``None`` for those of the last 2 T steps alone."""
         if config.memory:
             inputs = spaces.state_dim + 2 * spaces.goal_dim
             extra = (self.inputs_per_row - 1) * inputs
@@ -103,7 +103,7 @@ class FearSelector(GoalSelector):
         self._auroc = math.nan  # on the outcomes of the last 2 T steps, by the scores at issue
         # Goals since the last call of learn.
         self._issued = torch.zeros((), dtype=torch.int64, device=spaces.device)
-        self._said = False  # that there is no fear yet
+        self._said = False  # whether the log says that there is no fear yet
 
     def graph_key(self) -> Hashable:
         """See ``GoalSelector.graph_key``."""
@@ -143,7 +143,7 @@ class FearSelector(GoalSelector):
         self._issued += len(rows) if where is None else where.sum()
 
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
-        """What ``choose`` goes by, shape (B, N): the logits of fear, ``score``, unless somebody knows better.
+        """What ``choose`` goes by, shape (B, N): the logits of fear, ``score``, unless a subclass has something better.
 
         The other arguments are those of ``propose``.
         """
@@ -154,7 +154,7 @@ class FearSelector(GoalSelector):
         return self.fear.score(self._seen(state), goal, candidates)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
-        """Fit the fear network to the window; what has resolved since the last time evaluates it first."""
+        """Fit the fear network to the window, after evaluating it on what has resolved since the last call."""
         (issued,) = largest(int(self._issued))
         self._issued.zero_()
         chosen = float(self.fear.fitted) if issued else math.nan  # it has not changed since the last time
@@ -210,7 +210,7 @@ class FearSelector(GoalSelector):
         return self.fear.fit_rows(rows, crashed, weight)
 
     def _say_why(self, window: Resolved) -> None:
-        """Say once why goals are uniform yet."""
+        """Log once why goals are still uniform."""
         if self._said:
             return
         self._said = True
@@ -221,7 +221,7 @@ class FearSelector(GoalSelector):
         )  # fmt: skip
 
     def estimate(self, state: Tensor, goal: Tensor, new_goal: Tensor) -> FearEstimate:
-        """What it thinks of given goals, and how far that can be trusted.
+        """The fear of given goals, and how far it can be trusted.
 
         Args:
             state: States, shape (B, state_dim).
@@ -245,7 +245,7 @@ class FearSelector(GoalSelector):
 
 
 def fear_selector(selector: GoalSelector) -> FearSelector | None:
-    """The selector with a fear network in ``selector``: itself, or who chooses in it, or the first of its parts."""
+    """The selector with a fear network in ``selector``: itself, or its current part, or the first of its parts."""
     if isinstance(selector, FearSelector):
         return selector
     chooser = (selector.current,) if isinstance(selector, Delegate) else ()
@@ -256,7 +256,7 @@ def fear_selector(selector: GoalSelector) -> FearSelector | None:
 def _rolled(score: Tensor, draw: Tensor) -> Tensor:
     """Every row rolled by 0 to N - 1 places at random: whatever place is picked, any candidate may be there.
 
-    With one place less, the most frightening candidate would never be the one that is picked for it.
+    Without the roll by 0 places, the most frightening candidate would never be picked for its own score.
     """
     count = score.shape[1]
     shift = picks.uniformly(draw, count)

@@ -1,4 +1,4 @@
-"""What other people's loops hand over, as tensors of ours: checked, without gradients, floats as float32."""
+"""What other people's loops hand over, as tensors: checked, without gradients, floats as float32."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ def matrix(name: str, value: Array, components: str) -> tuple[int, int]:
     """Rows and ``components`` of an array.
 
     Raises:
-        ValueError: If it has not two axes.
+        ValueError: If it does not have two axes.
     """
     shape = tuple(np.shape(value))
     if len(shape) != 2:
@@ -35,7 +35,7 @@ def tensor(name: str, value: Bound | int, device: torch.device) -> Tensor:
     """An array or a tensor as a tensor on ``device``, without gradients.
 
     Raises:
-        ValueError: If it is a tensor elsewhere, or holds no numbers.
+        ValueError: If it is a tensor on another device, or does not hold numbers.
     """
     if isinstance(value, Tensor):
         if value.device != device:
@@ -105,7 +105,7 @@ def worlds(rows: Rows, num_envs: int, device: torch.device) -> Tensor:
 def refuse_not_finite(
     name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None, what: str = "world"
 ) -> None:
-    """Raise ``ValueError`` that names the first row of ``numbers`` in which one is not finite.
+    """Raise a ``ValueError`` that names the first row of ``numbers`` with one that is not finite.
 
     Args:
         name: What they are.
@@ -114,7 +114,7 @@ def refuse_not_finite(
         but: Rows that do not matter, bool, shape (m,).
         what: What a row is.
     """
-    if bool(numbers.sum().isfinite()):  # a sum costs a tenth of a look at every number
+    if bool(numbers.sum().isfinite()):  # a sum costs a tenth of looking at every number
         return
     bad = ~numbers.flatten(1).isfinite().all(1) if numbers.dim() > 1 else ~numbers.isfinite()
     if but is not None:
@@ -126,7 +126,7 @@ def refuse_not_finite(
 
 
 def refuse_outside_0_and_1(name: str, numbers: Tensor) -> None:
-    """Raise ``ValueError`` that names the first world in which a number lies outside, but for rounding.
+    """Raise a ``ValueError`` that names the first world with a number outside [0, 1] by more than rounding.
 
     Args:
         name: What they are.
@@ -147,7 +147,7 @@ def like(values: Tensor, model: A) -> A:
 
 
 def taken(values: Candidates, rows: Tensor) -> Candidates:
-    """Those of some worlds, int64, shape (m,), if they are there yet."""
+    """The candidates of some worlds, int64, shape (m,), if they exist already."""
     if values is None or callable(values):
         return values
     return values[rows] if isinstance(values, Tensor) else np.asarray(values)[rows.cpu().numpy()]
@@ -176,7 +176,7 @@ class Inputs:
     goal_dim: int
     """Components of a goal."""
     device: torch.device
-    """Where tensors lie."""
+    """Device of tensors."""
     columns: tuple[int, ...]
     """Shape of the tracking of a world: () for the whole goal, (groups,) for each group of its components."""
 
@@ -207,7 +207,7 @@ class Inputs:
         return crashed, cut_off, met, pursued
 
     def check_candidates(self, value: Candidates, count: int) -> None:
-        """Raise ``ValueError`` if they are there, but not those of ``count`` worlds, shape (count, N, goal_dim)."""
+        """Raise ``ValueError`` if candidates are given, but not of ``count`` worlds, shape (count, N, goal_dim)."""
         if value is None or callable(value):
             return
         shape = tuple(np.shape(value))
@@ -231,7 +231,7 @@ class Inputs:
 
 
 def check_transitions(rollout: Transitions | None, core: GoalCore, since: int) -> None:
-    """Check what a selector learns from, if it is there.
+    """Check the rollout that a selector learns from, if there is one.
 
     Args:
         rollout: Transitions.
@@ -239,8 +239,8 @@ def check_transitions(rollout: Transitions | None, core: GoalCore, since: int) -
         since: Step of its last update.
 
     Raises:
-        ValueError: If something is missing; or if the selector needs it, and it is not of all worlds in all steps since
-            then, or holds what is not finite.
+        ValueError: If something is missing; or if the selector needs it, and it does not hold all worlds in all steps
+            since then, or holds a number that is not finite.
     """
     if rollout is None:
         return
@@ -269,12 +269,12 @@ def check_transitions(rollout: Transitions | None, core: GoalCore, since: int) -
 
 
 def lacking(selector: GoalSelector, taught: bool, tracked: bool) -> Iterator[str]:
-    """What a selector needs and nobody has told it, a sentence each.
+    """What a selector needs and has not been given, a sentence each.
 
     Args:
-        selector: Who chooses; what it is made of is asked too.
+        selector: The selector; what it is made of counts too.
         taught: Whether it has learnt yet.
-        tracked: Whether anybody has told how well goals are met.
+        tracked: Whether tracking has ever been given.
     """
     for part in with_parts(selector):
         who = type(part).__module__
@@ -285,23 +285,23 @@ def lacking(selector: GoalSelector, taught: bool, tracked: bool) -> Iterator[str
 
 
 class GoalBox:
-    """The range of goals, a box: candidates are drawn from it, or must lie in it.
+    """The range of goals, a box: candidates are drawn from it, or must be inside it.
 
     Args:
         low: Lowest goal, shape (goal_dim,).
         high: Highest goal, above ``low`` in every component, shape (goal_dim,).
         goal_dim: Components of a goal.
-        device: Where goals lie.
+        device: Device of goals.
 
     Raises:
-        ValueError: If they are no box, or not finite.
+        ValueError: If they are not a box, or not finite.
     """
 
     def __init__(self, low: Bound, high: Bound, goal_dim: int, device: torch.device) -> None:
         below, above = (floats("goal_box", end, (goal_dim,), device) for end in (low, high))
         self._middle, self._half = (below + above) / 2, (above - below) / 2
         self.middle: tuple[float, ...] = tuple(self._middle.tolist())
-        """Of every component."""
+        """Middle of every component."""
         if not bool(((self._half > 0) & self._half.isfinite()).all()):
             raise ValueError(
                 f"goal_box must be the lowest and the highest goal, finite, got {below.tolist()} and {above.tolist()}."
@@ -323,7 +323,7 @@ class GoalBox:
             rows: Worlds, int64, shape (m,).
             asked: How often each has drawn, int64, shape (m,).
             count: Goals for each.
-            share: Of the range, around its middle, shape (goal_dim,); ``None`` for all of it.
+            share: Share of the range to draw from, around its middle, shape (goal_dim,); ``None`` for all of it.
         """
         numbers = count * len(self)
         blocks = torch.arange(-(-numbers // 4), dtype=torch.int64, device=rows.device)
@@ -333,13 +333,13 @@ class GoalBox:
         return self._middle + self._half * (unit if share is None else unit * share)
 
     def check(self, candidates: Tensor, rows: Tensor, share: Tensor | None) -> None:
-        """Raise ``ValueError`` if a candidate, shape (m, N, goal_dim), lies outside, but for rounding."""
+        """Raise ``ValueError`` if a candidate, shape (m, N, goal_dim), is outside by more than rounding."""
         reach = self._half if share is None else self._half * share
         outside = ((candidates - self._middle).abs() > reach * 1.001).any(2)
         if bool(outside.any()):
             row, candidate = outside.nonzero()[0].tolist()
             low, high = (self._middle - reach).tolist(), (self._middle + reach).tolist()
             raise ValueError(
-                f"candidates must lie between {low} and {high}, got {candidates[row, candidate].tolist()} for world "
+                f"candidates must be between {low} and {high}, got {candidates[row, candidate].tolist()} for world "
                 f"{int(rows[row])}; see GoalDirector.goal_range."
             )

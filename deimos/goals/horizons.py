@@ -20,7 +20,7 @@ class Horizons:
     """Whether the fear network sees how long a goal is to last."""
 
     def steps(self, horizon: Array | int | None, count: int, inputs: Inputs) -> Tensor | None:
-        """Announced steps, int64, shape (count,); the most where nobody knows, ``None`` where it is always T.
+        """Announced steps, int64, shape (count,); the most if not announced, ``None`` where it is always T.
 
         Raises:
             ValueError: If they do not fit, are not T where it is always the same, or are missing where the fear network
@@ -41,7 +41,7 @@ class Horizons:
         return steps
 
     def behind(self, states: Tensor, steps: Tensor | None = None) -> Tensor:
-        """What the selector sees of states, shape (m, state_dim): behind them ``steps / most``, if it may; 1 for T."""
+        """What the selector sees of states, shape (m, state_dim): then ``steps / most``, if ``seen``; 1 for T."""
         if not self.seen:
             return states
         share = torch.ones_like(states[:, :1]) if steps is None else steps.unsqueeze(1) / self.most

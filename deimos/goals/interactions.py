@@ -3,7 +3,7 @@
 An interaction is (state, active goal, next goal) at the moment of the choice. It resolves as *crashed*
 when the world crashes within T steps (its horizon), on the step of the next goal change included, and as *survived*
 when the next goal is due and the world lives. Where the episode ends otherwise before that, it is
-dropped. First goals are no interactions unless somebody opens them.
+dropped. First goals are not interactions unless the caller opens them.
 """
 
 import copy
@@ -27,9 +27,9 @@ class Resolved:
     goal: Tensor
     """Goal that was active until then, shape (n, goal_dim)."""
     next_goal: Tensor
-    """Goal that was executed: as it was issued, unless ``execute`` told another, shape (n, goal_dim)."""
+    """Goal that was executed: as it was issued, unless ``execute`` named another, shape (n, goal_dim)."""
     score: Tensor
-    """What the selector thought of it then, NaN where it had no opinion, shape (n,)."""
+    """The selector's score of it then, NaN where it had none, shape (n,)."""
     reward: Tensor
     """Sum of the rewards until it resolved, without that of a crash, shape (n,)."""
     tracking: Tensor
@@ -61,10 +61,10 @@ def bytes_of(state_dim: int, goal_dim: int, groups: int = 0) -> int:
 
 
 def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | None = None) -> None:
-    """Write a value into rows without a wait for the device.
+    """Write a value into rows without waiting for the device.
 
-    ``tensor[rows] = number`` would copy the number from the host, and ``tensor[mask] = rows`` count what is in the
-    mask: a GPU waits for both.
+    ``tensor[rows] = number`` would copy the number from the host, and ``tensor[mask] = rows`` would count what is in
+    the mask: a GPU waits for both.
 
     Args:
         tensor: Written, shape (n, ...).
@@ -93,7 +93,7 @@ def taken(tensor: Tensor, rows: Tensor, where: Tensor | None) -> Tensor:
 class Interactions(Stateful):
     """One pending interaction per world, and the resolved ones of the last steps.
 
-    Each world has a small ring buffer of its own for what it resolved, so that nothing waits for a count and
+    Each world has its own small ring buffer for what it resolved, so that nothing waits for a count and
     the memory is bounded. What is stored is a copy and carries no gradient.
 
     Args:
@@ -103,7 +103,7 @@ class Interactions(Stateful):
         capacity: Resolved interactions that are kept per world, at least 1; the oldest makes way for a new one.
         window: Steps that a resolved interaction is kept for.
         device: Where they are kept.
-        groups: Columns of ``tracking`` in ``advance``; 0 where it is ``None`` and the reward says it.
+        groups: Columns of ``tracking`` in ``advance``; 0 where it is ``None`` and the reward stands for it.
     """
 
     saved = ("now", "active", "_pending", "issued_at", "_horizon", "_ring", "_marks", "_cursor")
@@ -124,7 +124,7 @@ class Interactions(Stateful):
         self._sizes = [state_dim, goal_dim, goal_dim, 1, 1, 1, 1, groups]
         self._next_goal = slice(state_dim + goal_dim, state_dim + 2 * goal_dim)
         width = sum(self._sizes)
-        # One row per interaction, not one tensor per field: a few decisions per step cost what their calls cost.
+        # One row per interaction, not one tensor per field: the cost of a few decisions per step is that of the calls.
         self._pending = torch.zeros(num_envs, width, dtype=torch.float32, device=device)
         self._gained = self._pending[:, -1 - groups :]  # reward and tracking: what grows with every step
         self._zeros = torch.zeros(num_envs, 1 + groups, dtype=torch.float32, device=device)
@@ -135,13 +135,13 @@ class Interactions(Stateful):
         """Crashed, issued, resolved, horizon; steps count from 1, so a resolved step of 0 marks a free slot."""
 
     def load_state_dict(self, state: dict) -> None:
-        """See ``Stateful.load_state_dict``; of a state that holds more or fewer per world, the newest are kept."""
+        """See ``Stateful.load_state_dict``; if a state holds more or fewer per world, the newest are kept."""
         resized = {name: _resized(state[name], state["cursor"], self._capacity) for name in ("ring", "marks")}
         super().load_state_dict(state | resized)
 
     @property
     def now(self) -> int:
-        """Steps so far. The device counts them too, for whoever sets a CUDA graph to replay them."""
+        """Steps so far. The device counts them too, for CUDA graphs that replay them."""
         return self._now
 
     @now.setter
@@ -166,12 +166,12 @@ class Interactions(Stateful):
 
     @torch.no_grad()
     def resolve(self, rows: Tensor, crashed: Tensor, survived: Tensor, where: Tensor | None = None) -> None:
-        """Close what this step has decided, and drop what it has cut off.
+        """Close the interactions that this step has decided, and drop those that it has cut off.
 
         Args:
             rows: The worlds whose interaction ends in any way, int64, shape (m,), each once.
             crashed: True where it ends in a crash, bool, shape (m,).
-            survived: True where its time was up, bool, shape (m,); a crash outweighs it. Where neither is true, the
+            survived: True where its time is up, bool, shape (m,); a crash takes precedence. Where neither is true, the
                 episode was cut off, and the interaction is dropped.
             where: Which of ``rows`` are meant; see ``assign``. The others neither crashed nor survived.
         """
@@ -209,7 +209,7 @@ class Interactions(Stateful):
 
     @torch.no_grad()
     def execute(self, rows: Tensor, goal: Tensor) -> None:
-        """Tell what the listed worlds pursue where that is not what was issued: it is what is learnt from.
+        """Report what the listed worlds pursue where that is not what was issued: it is what is learnt from.
 
         Args:
             rows: Worlds, int64, shape (m,), each once.
@@ -245,7 +245,7 @@ class Interactions(Stateful):
         return torch.cat([pending, env]), state, goal, next_goal
 
     def kept_since(self) -> int:
-        """Step after which no goal was issued whose outcome has made way for a newer one; 0 where none has."""
+        """Step after which no goal was issued whose outcome has made way for a newer one; 0 if none has."""
         slot = self._cursor % self._capacity  # of the oldest, where the ring is full
         oldest = self._marks[torch.arange(len(slot), device=slot.device), slot, 1]
         return int(oldest.masked_fill(self._cursor <= self._capacity, 0).max())
@@ -265,7 +265,7 @@ class Interactions(Stateful):
         return ~done.crashed & (self.issued_at[done.env] == done.resolved)
 
     def of_all_ranks(self) -> "Interactions":
-        """The interactions in the worlds of all ranks, which are known by their global numbers: what to learn from."""
+        """The interactions in the worlds of all ranks, by their global numbers: what to learn from."""
         view = copy.copy(self)
         vars(view).update({name: gather_rows(getattr(self, name)) for name in self.by_world})
         return view

@@ -45,14 +45,14 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "penalty-30": ("penalty", {"size": 30.0}),
     "penalty-100": ("penalty", {"size": 100.0}),
 }
-"""Methods with names of their own: the selector, and its options where they are not the defaults."""
+"""The methods that have names: the selector, and its options where they are not the defaults."""
 
 DATA: dict[str, dict[str, Any]] = {
     "literal": {"memory": 0},
     "threshold": {"memory": 0, "fear": FearConfig(min_per_class=32)},
 }
-"""What a Director's fear learns from, where it has no crash memory: the last 2 T steps as in the thesis, or, as in
-version 0.1.0, only where they hold 32 of each class."""
+"""What a Director's fear learns from if it has no crash memory: the last 2 T steps as in the thesis, or, as in
+version 0.1.0, only if they hold 32 of each class."""
 
 
 def method(name: str) -> SelectorConfig:
@@ -64,13 +64,13 @@ def method(name: str) -> SelectorConfig:
             selector, also one of another package, with its defaults.
 
     Raises:
-        ValueError: If there is no such method; the message lists those that there are.
+        ValueError: If there is no such method; the message lists the methods.
     """
     kind, options = _spelled_out(name)
     if not plugins.has(selectors, kind):
         others = ", ".join(other for other in plugins.names(selectors) if other not in METHODS)
         raise ValueError(
-            f"There is no method '{name}'; there are: {', '.join(METHODS)}; any pNN from p0 to p100; "
+            f"Unknown method '{name}'; choose from: {', '.join(METHODS)}; any pNN from p0 to p100; "
             f"a Director's with -{' or -'.join(DATA)}; {others}."
         )
     return plugins.load(selectors, kind).Config(**options)

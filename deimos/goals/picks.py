@@ -1,4 +1,4 @@
-"""Rules that pick one of many candidates by their scores; all chance comes from one uniform number per row."""
+"""Rules that pick one of many candidates by their scores; all randomness comes from one uniform number per row."""
 
 from typing import Literal
 
@@ -37,7 +37,7 @@ def kept_above(percentile: float, count: int) -> int:
 def above_percentile(score: Tensor, draw: Tensor, percentile: float) -> Tensor:
     """Any of the candidates above a percentile of the scores.
 
-    Exactly k = max(1, N - floor(p N / 100)) candidates are kept, also where scores tie at the edge.
+    Exactly k = max(1, N - floor(p N / 100)) candidates are kept, even where scores tie at the edge.
     So p = 0 keeps all, whatever the scores, and picks the very goal that Uniform picks.
 
     Args:
@@ -62,7 +62,7 @@ def percentile(score: Tensor, picked: Tensor) -> Tensor:
         score: Scores, shape (B, N).
         picked: The one of each row, shape (B,).
     """
-    # Above n of 100 and below m, it has 50 + (n - m) / 2. For few rows every operation costs what its call costs.
+    # Above n of 100 and below m, it has 50 + (n - m) / 2. For few rows, the cost of an operation is that of its call.
     above = (picked.unsqueeze(1) - score).sign_().sum(1)
     return above * (50.0 / score.shape[1]) + 50.0
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from deimos.goals.given import Array, GoalBox
 
-POINTS = 41  # values of a component, where nobody names them
+POINTS = 41  # values of a component by default
 
 
 @dataclass(frozen=True)

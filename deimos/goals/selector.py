@@ -18,7 +18,7 @@ class Spaces:
     """What a selector needs to know about the worlds that it serves."""
 
     num_envs: int
-    """Number of worlds; where several ranks share a run, of those of each."""
+    """Number of worlds; where several ranks share a run, that of each."""
     state_dim: int
     """Components of a state (the observation without its goal)."""
     goal_dim: int
@@ -26,13 +26,13 @@ class Spaces:
     goal_period: int
     """T: steps that a goal is active."""
     device: torch.device
-    """Where the tensors lie."""
+    """Device of the tensors."""
     groups: tuple[slice, ...] = (slice(None),)
     """Components of a goal that are met or missed together; ``Resolved.tracking`` has one column for each."""
     goal_start: int | None = None
-    """Where the goal begins in the observation, which is the state but for it; ``None`` for behind the state."""
+    """Where the goal begins in the observation, the rest of which is the state; ``None`` for after the state."""
     total_steps: int = 0
-    """Steps of the whole training; 0 where nobody knows."""
+    """Steps of the whole training; 0 if unknown."""
     goal_middle: tuple[float, ...] | None = None
     """Middle of the range of every component of a goal; ``None`` for 0, as in the policy's scale."""
 
@@ -46,20 +46,20 @@ class Spaces:
             )
 
     def state_then_goal(self, obs: Tensor) -> Tensor:
-        """Observations, shape (..., obs_dim), with the goal moved behind the state; no copy where it is there."""
+        """Observations, shape (..., obs_dim), with the goal moved after the state; no copy if it is there already."""
         if self.goal_start is None or self.goal_start == self.state_dim:
             return obs
         start, stop = self.goal_start, self.goal_start + self.goal_dim
         return torch.cat([obs[..., :start], obs[..., stop:], obs[..., start:stop]], dim=-1)
 
     def require_total_steps(self, who: str) -> int:
-        """``total_steps``, for those who cannot do without.
+        """``total_steps``, for selectors that need it.
 
         Raises:
-            ValueError: If nobody knows it; ``who`` names the selector.
+            ValueError: If it is unknown; ``who`` names the selector.
         """
         if self.total_steps < 1:
-            raise ValueError(f"{who} changes over the training, so Spaces.total_steps must be its steps, got 0.")
+            raise ValueError(f"{who} changes over the training, so Spaces.total_steps must be positive, got 0.")
         return self.total_steps
 
 
@@ -70,7 +70,7 @@ class Proposal:
     goal: Tensor
     """Shape (B, goal_dim)."""
     score: Tensor
-    """What the selector thinks of each, NaN where it has no opinion, shape (B,)."""
+    """The selector's score of each, NaN where it has none, shape (B,)."""
     weight: Tensor | None = None
     """Weight of what follows in everything learnt, at least 0, shape (B,); ``None`` for 1 everywhere."""
     probe: Tensor | None = None
@@ -78,11 +78,11 @@ class Proposal:
     note: Tensor | None = None
     """A whole number that comes back with the interaction, int64 below 2^24, shape (B,); ``None`` for 0."""
     percentile: Tensor | None = None
-    """Percentile of the goal's fear among the candidates, in [0, 100], shape (B,); ``None`` where nobody knows."""
+    """Percentile of the goal's fear among the candidates, in [0, 100], shape (B,); ``None`` if unknown."""
 
 
 def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
-    """Any of the candidates, without an opinion. Whatever is feared, its percentile is 50 on average.
+    """Any of the candidates, without a score. Whatever is feared, its percentile is 50 on average.
 
     Args:
         candidates: Shape (B, N, goal_dim).
@@ -94,10 +94,10 @@ def uniform_proposal(candidates: Tensor, draw: Tensor) -> Proposal:
 
 
 class Transitions(Protocol):
-    """What selectors may learn from the learner's transitions, of shape (num_steps, num_envs) but for ``obs``."""
+    """The learner's transitions that selectors may learn from, of shape (num_steps, num_envs) except ``obs``."""
 
     num_steps: int
-    obs: Tensor  # that the steps started from, and those after the last: (num_steps + 1, num_envs, obs_dim)
+    obs: Tensor  # what the steps started from, and those after the last: (num_steps + 1, num_envs, obs_dim)
     reward: Tensor  # as the environment gives them
     terminated: Tensor
     truncated: Tensor
@@ -135,22 +135,22 @@ class GoalSelector(Stateful, abc.ABC):
     needs_rollout: bool = False
     """Whether ``learn`` needs the learner's transitions."""
     needs_tracking: bool = False
-    """Whether ``learn`` follows how well goals are met, and does nothing where nobody tells."""
+    """Whether ``learn`` follows how well goals are met, and does nothing without tracking."""
     first_goals_scaled: bool = False
     """Whether ``goal_range`` bounds first goals too; true only for a curriculum of the range."""
     crash_penalty: float = 0.0
     """What a crash takes from the learner's reward, at least 0, in units of the largest reward of a step."""
     dense: bool = False
-    """Whether ``propose`` may be asked about all worlds at every step, as a GPU does, which would have to wait to learn
-    how many are due. It must then change nothing of the selector, since most of its answers are dropped; what was
-    issued is noted by ``issued``."""
+    """Whether ``propose`` may be called for all worlds at every step, as on a GPU, which would have to wait to find out
+    how many are due. It must then not change the selector, since most of its answers are dropped; ``issued`` notes what
+    was issued."""
 
     def graph_key(self) -> Hashable:
-        """What Python decides by in ``propose`` and ``issued``, such as whether a network has learnt yet.
+        """What Python branches on in ``propose`` and ``issued``, such as whether a network has learnt yet.
 
         A GPU records a whole rollout as a CUDA graph, and replays it as long as this stays the same. So everything else
-        that they depend on and that changes must be tensors, which others write in place; ``None`` where that is not
-        so. See ``deimos.nn.graphs``.
+        that they depend on and that changes must be in tensors that are written in place; ``None`` if that is not so.
+        See ``deimos.nn.graphs``.
         """
         return None
 
@@ -167,7 +167,7 @@ class GoalSelector(Stateful, abc.ABC):
             state: Their states, shape (B, state_dim).
             goal: Their active goals, shape (B, goal_dim).
             candidates: Independent uniform goals for each, shape (B, num_candidates, goal_dim).
-            draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All chance
+            draws: Uniform numbers in [0, 1) that belong to this decision, shape (B, 4). All randomness
                 in the choice comes from here, so that it is the same in any batch.
         """
 
@@ -177,12 +177,12 @@ class GoalSelector(Stateful, abc.ABC):
     ) -> None:  # fmt: skip
         """Take note of goals that were issued.
 
-        The first arguments are those of ``propose``, ``chosen`` is what it gave, and ``where`` says in which of the
-        rows, which are all worlds then, bool, shape (num_envs,); ``None`` for all of them.
+        The first arguments are those of ``propose``, and ``chosen`` is what it returned. In dense form the rows are all
+        worlds, and ``where`` says in which of them goals were issued, bool, shape (num_envs,); ``None`` for all rows.
         """
 
     def critic(self) -> Callable[[Tensor], Tensor] | None:
-        """The value function that the learner shall use instead of its own, if this selector supplies one.
+        """The value function for the learner to use instead of its own, if this selector supplies one.
 
         It takes observations of shape (..., obs_dim) and returns values in units of scaled rewards, shape (...).
         """
@@ -192,7 +192,7 @@ class GoalSelector(Stateful, abc.ABC):
         """Learn from what happened, once per rollout.
 
         Where several ranks share a run, each learns the same from the same interactions, those in the worlds of all.
-        What a selector keeps of its own worlds, or counts in them, it gathers by ``deimos.nn.ranks``.
+        What a selector keeps of its own worlds, or counts in them, it gathers with ``deimos.nn.ranks``.
 
         Args:
             interactions: The pending and the recently resolved ones; worlds by their global numbers.
@@ -209,21 +209,21 @@ class GoalSelector(Stateful, abc.ABC):
 
 
 def with_parts(selector: GoalSelector) -> Iterator[GoalSelector]:
-    """A selector, and all that it is made of."""
+    """A selector and everything that it is made of."""
     yield selector
     for part in selector.parts:
         yield from with_parts(part)
 
 
 class Delegate(GoalSelector):
-    """Leaves everything to one of its ``parts``, ``current``, but for what it overrides; saves all of them."""
+    """Leaves everything to one of its ``parts``, ``current``, except what it overrides; saves all of them."""
 
     saved: ClassVar[tuple[str, ...]] = ("parts",)
 
     @property
     @abc.abstractmethod
     def current(self) -> GoalSelector:
-        """Who chooses."""
+        """The part that chooses."""
 
     needs_rollout = property(lambda self: any(part.needs_rollout for part in self.parts))
     dense = property(lambda self: self.current.dense)

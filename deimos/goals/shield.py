@@ -1,4 +1,4 @@
-"""A shield: refuses goals that a fear network gives too much risk, at a threshold with a guarantee.
+"""A shield: refuses goals that a fear network considers too risky, at a threshold with a guarantee.
 
 The threshold is that of split conformal prediction [1]_. Take crashes that the network has not learnt from, one from
 each world; a *miss* is a goal that would crash the policy and is let through. With the k-th lowest score of n crashes
@@ -7,8 +7,8 @@ single calibration the miss rate is, where scores do not tie, distributed as Bet
 below alpha with a given confidence: the *training-conditional* guarantee [2]_.
 
 Both hold for goals that are exchangeable with those of the calibration, which are uniform, and for this policy in these
-worlds. Whoever chooses goals by what the shield does is no such source, and neither are states that only a shielded
-policy gets to. ``Shield.drift`` says when scores are not those of the calibration any more.
+worlds. Goals chosen by what the shield does are not, and neither are goals in states that only a shielded policy gets
+to. ``Shield.drift`` says when scores are no longer those of the calibration.
 
 References:
     .. [1] Vovk, Gammerman and Shafer, *Algorithmic Learning in a Random World*, 2005, chapter 4.
@@ -34,14 +34,14 @@ Guarantee = Literal["marginal", "conditional"]
 GUARANTEES: tuple[Guarantee, ...] = ("marginal", "conditional")
 CONFIDENCE = 0.95  # of the training-conditional guarantee
 SHRINKS = 10  # goals between the wanted one and the safe one, which is the last, that project looks at
-SCORES = 1001  # of the calibration that are kept to tell a drift by
-DRIFTED = 1e-3  # chance of a false word on drift, as if scores were independent, over all tests together
+SCORES = 1001  # of the calibration that are kept to detect a drift
+DRIFTED = 1e-3  # chance of a false warning of drift, as if scores were independent, over all tests together
 
 _log = logging.getLogger(__name__)
 
 
 def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
-    if value.shape != shape:  # broadcasting would make a goal of it all the same
+    if value.shape != shape:  # broadcasting would make a goal of it anyway
         raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}.")
 
 
@@ -94,7 +94,7 @@ def threshold(score: Tensor, alpha: float, guarantee: Guarantee, confidence: flo
 
 @dataclass(frozen=True)
 class Shielded:
-    """What a shield made of some goals."""
+    """What a shield did with some goals."""
 
     goal: Tensor
     """Goals to pursue, shape (B, goal_dim)."""
@@ -112,11 +112,10 @@ class Shield:
         mode: What becomes of them. ``ignore``: the active goal stays. ``stop``: the safe goal. ``project``: the nearest
             goal of acceptable fear among the candidates and those between the wanted goal and the safe one; where none
             is acceptable, the safe goal.
-        safe_goal: A goal that nobody has to fear, such as no speed, finite; ``None`` for components that stay as they
-            are.
+        safe_goal: A goal without risk, such as zero speed, finite; ``None`` for components that stay as they are.
         goal_range: Half side of the box of goals along every component: the unit of distances, finite and positive.
-        reference: Scores of the calibration's goals, in any order; empty for no word on drift.
-        window: Goals that a drift is told by, at least 1.
+        reference: Scores of the calibration's goals, in any order; empty to leave out the test for drift.
+        window: Goals that are tested for drift together, at least 1.
     """
 
     def __init__(
@@ -151,20 +150,18 @@ class Shield:
 
         Args:
             data: The entry ``shield`` of ``deploy.json``; ``None`` in that of a run without a shield.
-            mode: Another mode than the one that it was tried in.
-            guarantee: Another of its two thresholds than the one that it was tried with.
+            mode: A mode other than the one that it was tried in.
+            guarantee: The guarantee of a threshold other than the one that it was tried with.
 
         Raises:
             KeyError: If something is missing in it.
             ValueError: If there is no shield, or it was calibrated on too few crashes for the guarantee.
         """
         if data is None:
-            raise ValueError("There is no shield: make one by deimos shield, and export the run after that.")
+            raise ValueError("There is no shield: make one with deimos shield, then export the run again.")
         guarantee = guarantee or data["guarantee"]
         if data["threshold"][guarantee] is None:
-            raise ValueError(
-                f"guarantee must be another than {guarantee}: {data['crashes']} crashes are too few for it."
-            )
+            raise ValueError(f"guarantee must not be {guarantee}: {data['crashes']} crashes are too few for it.")
         return cls(
             data["threshold"][guarantee],
             mode or data["mode"],
@@ -177,7 +174,7 @@ class Shield:
     def choose(
         self, score: Callable[[Tensor], Tensor], goal: Tensor, wanted: Tensor, candidates: Tensor | None = None
     ) -> Shielded:
-        """Decide over the next goals.
+        """Decide on the next goals.
 
         Args:
             score: The fear network in the present states: gives logits, shape (B, N), of goals, shape (B, N, goal_dim).
@@ -187,7 +184,7 @@ class Shield:
                 the safe goal alone.
 
         Raises:
-            ValueError: If a shape is another one.
+            ValueError: If a shape does not fit.
         """
         count, dim = len(wanted), len(self._safe)
         _check_shape("wanted", wanted, (count, dim))
@@ -198,7 +195,7 @@ class Shield:
         _check_shape("score of (B, 1) goals", fear, (count, 1))
         fear = fear.squeeze(1)
         self._watch(fear)
-        refused = ~(fear < self.threshold)  # what is not a number is refused
+        refused = ~(fear < self.threshold)  # NaN is refused
         fixed, safe = self._fixed.to(goal.device), self._safe.to(goal)
         if self.mode == "ignore":
             other = goal
@@ -211,7 +208,7 @@ class Shield:
     def _nearest(
         self, score: Callable[[Tensor], Tensor], goal: Tensor, wanted: Tensor, candidates: Tensor | None
     ) -> Tensor:
-        """The acceptable goals that are nearest to the wanted ones, shape (B, goal_dim); safe goals where none is."""
+        """The acceptable goals that are nearest to the wanted ones, shape (B, goal_dim); safe goals if none is."""
         fixed, safe = self._fixed.to(goal.device), self._safe.to(goal)
         share = torch.linspace(1.0, 0.0, SHRINKS + 1, dtype=goal.dtype, device=goal.device)[1:, None]
         tried = torch.where(fixed, safe + share * (wanted.unsqueeze(1) - safe), wanted.unsqueeze(1))
@@ -223,7 +220,7 @@ class Shield:
         return torch.where(none, torch.where(fixed, safe, goal), picks.take(tried, away.argmin(1)))
 
     def _watch(self, fear: Tensor) -> None:
-        """Keep the last scores, test each ``window`` of them, and say once that they are not the calibration's."""
+        """Keep the last scores, test each ``window`` of them, and warn once if they are not the calibration's."""
         if not len(self._reference):
             return
         self._recent = torch.cat([self._recent, fear.double().cpu()])[-self.window :]
@@ -235,14 +232,14 @@ class Shield:
         if not self._warned and self.drift() < DRIFTED / (self._tests * (self._tests + 1)):
             self._warned = True
             _log.warning(
-                "The scores of the last %d goals are not those of the calibration (p = %.2g): what was promised of "
-                "crashes does not hold here; calibrate on such goals.", self.window, self.drift(),
+                "The scores of the last %d goals are not those of the calibration (p = %.2g): the guarantee does not "
+                "hold here; calibrate on such goals.", self.window, self.drift(),
             )  # fmt: skip
 
     def drift(self) -> float:
-        """p-value, in [0, 1], of the last ``window`` scores being drawn as the calibration's; 1 where none is known.
+        """p-value, in [0, 1], of the last ``window`` scores being drawn as the calibration's; 1 if none is known.
 
-        It is computed as if scores were independent, by the largest distance D of the two distribution functions:
+        It is computed as if scores were independent, from the largest distance D between the distribution functions:
         2 exp(-2 D^2 n m / (n + m)), the first term of Kolmogorov's series for two samples of n and m.
         """
         recent, reference = self._recent.sort().values, self._reference

@@ -20,9 +20,9 @@ class Config(SelectorConfig):
     bins: int = 8
     """Cells along every component of a goal, at least 2. Every group of components has a grid of its own."""
     start: float = 0.5
-    """Share of the range whose cells have weight 1 at the start, in (0, 1]; the others have none."""
+    """Share of the range whose cells have weight 1 at the start, in (0, 1]; the others have weight 0."""
     growth: float = 0.2
-    """What a well-tracked goal adds to the weights of its cell and its neighbours, which end at 1. In (0, 1]."""
+    """What a well-tracked goal adds to the weights of its cell and its neighbours, up to 1. In (0, 1]."""
     reach: float = 1.0
     """How far a neighbour may be along every component [cells], positive."""
     threshold: float = 0.8
@@ -48,7 +48,7 @@ class Config(SelectorConfig):
 class Grid(GoalSelector):
     """See ``Config``. Until it has learnt once, and so knows how far goals reach, it is uniform.
 
-    Cells reach as far as goals do from the middle of their range; who gives no ``goal_box`` has goals around 0.
+    Cells reach as far as goals do from the middle of their range; without a ``goal_box``, the middle is 0.
 
     Raises:
         ValueError: If a group's grid would have more than 2^20 cells.

@@ -21,8 +21,8 @@ class Config(FearSelectorConfig):
     """Goals in proportion to, or among the best by, p (1 - p), with p the calibrated probability of a crash."""
 
     rule: Literal["proportional", "percentile", "band"] = "proportional"
-    """Draw in proportion to p (1 - p), from above its percentile, or from among those whose p lies in the band
-    (Florensa et al. 2018, goals of intermediate difficulty; the nearest to it where none does)."""
+    """Draw in proportion to p (1 - p), from above its percentile, or from among those whose p is in the band
+    (Florensa et al. 2018, goals of intermediate difficulty; the nearest to it where none is)."""
     percentile: float = 90.0
     """Share of candidates that ``percentile`` discards, in [0, 100] [%]."""
     low: float = 0.1

@@ -50,9 +50,9 @@ class Novelty(FearSelector):
         super().__init__(config, spaces, seed)
         sizes = config.fear, spaces.state_dim, spaces.goal_dim, spaces.device
         self.heads = tuple(Fear(*sizes, derive(seed, f"fear head {k}")) for k in range(1, config.heads))
-        """The networks but for the first, which is ``fear``."""
+        """The networks after the first, which is ``fear``."""
         self.rnd = rnd.Config(candidates=config.candidates).build(spaces, seed)
-        """Who knows what is novel."""
+        """What measures novelty."""
 
     def graph_key(self) -> Hashable:
         """See ``GoalSelector.graph_key``."""

@@ -1,7 +1,7 @@
 """Prioritized level replay over goals (Jiang et al. 2021, arXiv:2010.03934; robust: arXiv:2110.02439).
 
-A level is a goal; the state that it was issued in cannot be brought back, so it is left out: against the
-Director this tests whether it matters. A level's score is its positive value loss, the mean over the
+A level is a goal; the state that it was issued in cannot be restored, so it is left out: compared with the
+Director, this tests whether it matters. A level's score is its positive value loss, the mean over the
 interaction of max(advantage, 0).
 """
 
@@ -71,7 +71,7 @@ class PLR(GoalSelector):
         self._level = zeros(config.capacity, spaces.goal_dim)
         self._score = zeros(config.capacity).fill_(-torch.inf)  # -inf marks a free place
         self._made, self._seen = torch.zeros(2, config.capacity, dtype=torch.int64, device=device)  # steps
-        self._upto = zeros(config.capacity)  # cumulated chance of being replayed
+        self._upto = zeros(config.capacity)  # cumulative chance of being replayed
         self._carry = zeros(spaces.num_envs)  # of the pending interaction, up to the last rollout
         self._learnt_at = 0  # step of the last call of learn
         self.replaying = False
@@ -90,7 +90,7 @@ class PLR(GoalSelector):
         if self.replaying:
             replayed = draws[:, 1] < self.config.replay
             place = torch.searchsorted(self._upto, draws[:, 2] * self._upto[-1], right=True)
-            # Rounding may put the number beyond the last level that there is.
+            # Rounding may put the number beyond the last level.
             place = torch.minimum(place, (self._upto < self._upto[-1]).sum())
             distance = (candidates - self._level[place].unsqueeze(1)).square().sum(2)
             pick = torch.where(replayed, distance.argmin(1), pick)
@@ -137,7 +137,7 @@ class PLR(GoalSelector):
         return loss
 
     def _refresh(self, done: Resolved, loss: Tensor) -> None:
-        """Write the new scores of replayed levels, unless another one has taken their place meanwhile.
+        """Write the new scores of replayed levels, unless another level has taken their place meanwhile.
 
         Many worlds replay the same level at once: its score is the mean over them.
         """
@@ -159,7 +159,7 @@ class PLR(GoalSelector):
         self._made[place] = self._seen[place] = now
 
     def _weigh(self, now: int) -> None:
-        """Cumulate the chances of being replayed: by rank of the score and by staleness."""
+        """Accumulate the chances of being replayed: by rank of the score and by staleness."""
         filled = self._score > -torch.inf
         self.replaying = int(filled.sum()) >= self.config.fill * self.config.capacity
         rank = self._score.argsort(descending=True, stable=True).argsort() + 1

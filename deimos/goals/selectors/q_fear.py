@@ -1,6 +1,6 @@
 """Q-fear: how likely is a crash now, or under the worst of the goals that may follow?
 
-Source: Q-learning's target (Watkins 1989) for the crashes of a policy under an adversary that goes on choosing.
+Source: Q-learning's target (Watkins 1989) for the crashes of a policy under an adversary that keeps choosing.
 Hypothesis: a Director that sees beyond T steps leads policies into states that a sequential attacker would find.
 """
 
@@ -39,13 +39,13 @@ class Config(director.Config):
 class QFear(director.Director):
     """See ``Config``.
 
-    The worst goal is the candidate of the next decision that was feared most; how much it is feared is asked anew in
-    every fit. ``fear`` is then no probability of crashing within T steps any more.
+    The worst goal is the candidate of the next decision that was feared most; how much it is feared is computed again
+    in every fit. ``fear`` is then no longer a probability of crashing within T steps.
     """
 
     config: Config
     is_calibrated = False
-    inputs_per_row: ClassVar[int] = 2  # an interaction, and the worst that could follow it: NaN where nobody knows
+    inputs_per_row: ClassVar[int] = 2  # an interaction, and the worst that could follow it: NaN if unknown
     saved = (*director.Director.saved, "_worst")
     unknown = (*director.Director.unknown, "_worst")
     by_world = ("_worst",)

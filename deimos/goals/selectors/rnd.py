@@ -44,7 +44,7 @@ class Config(SelectorConfig):
     learning_rate: float = 1e-3
     """Learning rate of Adam, positive."""
     epochs: int = 1
-    """Passes over the interactions that were issued since the last time, at least 1."""
+    """Passes over the interactions that were issued since the last update, at least 1."""
     minibatches: int = 4
     """Parts that they are split into, at least 1."""
 
@@ -106,7 +106,7 @@ class RND(GoalSelector):
         self._clip = CLIP if config.whiten else math.inf
         self._learnt_at = 0  # step of the last call of learn
         self.fitted = False
-        """Whether it has seen anything yet; before, nothing can be whitened."""
+        """Whether it has seen anything yet; before that, nothing can be whitened."""
 
     def graph_key(self) -> Hashable:
         """See ``GoalSelector.graph_key``."""
@@ -142,11 +142,11 @@ class RND(GoalSelector):
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
-        """Whiten by, and learn from, what was issued since the last time; no outcome is needed."""
+        """Whiten by, and learn from, what was issued since the last call; no outcome is needed."""
         env, state, goal, next_goal = interactions.issued(self._learnt_at)
         self._learnt_at = interactions.now
         uniform = gather_rows(self._uniform)[env]
-        known = uniform.isfinite().all(1)  # in a world whose goals somebody else chose so far, it has seen none
+        known = uniform.isfinite().all(1)  # in a world whose goals another selector chose so far, it has seen none
         state, goal, next_goal, uniform = state[known], goal[known], next_goal[known], uniform[known]
         if len(uniform) == 0:
             return {"rnd/surprise": float("nan"), "rnd/loss": float("nan")}

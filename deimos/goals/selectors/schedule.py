@@ -1,4 +1,4 @@
-"""One method first, another later (thesis: VDS, then Director p75 from half of the training on)."""
+"""One method first, another later (thesis: VDS, then Director p75 for the second half of the training)."""
 
 import math
 from collections.abc import Callable
@@ -14,14 +14,14 @@ from deimos.goals.selector import Delegate, GoalSelector, SelectorConfig, Spaces
 
 @dataclass(frozen=True, kw_only=True)
 class Config(SelectorConfig):
-    """The first method chooses the goals up to a share of the training, the second one from there on."""
+    """The first method chooses the goals up to a share of the training, the second one after that."""
 
     first: str = "vds"
-    """Name of the first method. It keeps learning as long as it chooses, and beyond where the learner has its baseline
-    from it."""
+    """Name of the first method. It keeps learning as long as it chooses, and longer if it supplies the learner's
+    baseline."""
     second: str = "p75"
     """Name of the second method. It learns from the start what the first one's goals teach: outcomes and transitions.
-    (Of candidates, which RND, grid and PLR learn from as well, it sees none before it chooses.)"""
+    (It sees no candidates, which RND, grid and PLR learn from as well, before it chooses.)"""
     at: float = 0.5
     """Share of the training after which it switches, in (0, 1)."""
 
@@ -57,14 +57,14 @@ class Schedule(Delegate):
 
     def critic(self) -> Callable[[Tensor], Tensor] | None:
         """See ``GoalSelector.critic``."""
-        # The baseline stays with whoever has it: the learner's own has learnt nothing meanwhile.
+        # Whichever supplies the baseline keeps doing so: the learner's own critic has learnt nothing meanwhile.
         return self.current.critic() or self.parts[0].critic()
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``GoalSelector.learn``."""
         row = {"schedule/switched": float(self.switched)}
         first, second = self.parts
-        # The scores at issue are those of whoever chose: the other one must not be evaluated by them.
+        # The scores at issue are those of the method that chose: the other one must not be evaluated by them.
         of_first, of_second = interactions, interactions.without_scores()
         if self.switched:
             of_first, of_second = of_second, of_first

@@ -29,10 +29,10 @@ class Config(director.Config):
 
 
 class Swapped(director.Director):
-    """See ``Config``. The other state is one of the last decisions, any of as many as there are worlds.
+    """See ``Config``. The other state is from one of the last decisions, of which as many count as there are worlds.
 
     So a goal is as likely as under the Director, whatever the state that it is issued in. Candidates stay the world's
-    own, for what is valid may depend on the state.
+    own, since what is valid may depend on the state.
     """
 
     saved = (*director.Director.saved, "_state", "_goal", "_count")

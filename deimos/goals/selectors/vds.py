@@ -37,7 +37,7 @@ class Config(SelectorConfig):
     """Whether the ensemble's mean is the learner's baseline too (the thesis), or the learner keeps its own critic
     (the comparison of goal selection alone)."""
     data: Literal["all", "share"] = "all"
-    """Whether every critic learns from all transitions, or from those of its own part of the worlds, drawn anew
+    """Whether every critic learns from all transitions, or from those of its own part of the worlds, redrawn
     for every rollout: K times cheaper."""
     critics: int = 10
     """K, at least 2 where they are to disagree; 1 is a plain critic."""
@@ -134,7 +134,7 @@ class VDS(GoalSelector):
 
     @torch.no_grad()
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
-        """Move every critic towards the lambda-returns that it sees itself."""
+        """Move every critic towards the lambda-returns of its own values."""
         if rollout is None:
             raise ValueError("vds learns values, so it needs the learner's rollout, got None.")
         worlds = self._worlds(rollout.obs.shape[1], rollout.obs.device)
@@ -149,7 +149,7 @@ class VDS(GoalSelector):
         count = self.config.critics
         if self.config.data == "all":
             return torch.arange(num_envs, device=device).expand(count, -1)
-        size = num_envs // count  # what does not divide evenly is left out, another part every time
+        size = num_envs // count  # a remainder is left out, a different one every time
         return torch.randperm(num_envs, generator=self.generator, device=device)[: count * size].view(count, size)
 
     def _targets(self, rollout: Transitions, worlds: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,7 +181,7 @@ class VDS(GoalSelector):
     def _fit(self, rollout: Transitions, worlds: Tensor, old: Tensor, returns: Tensor) -> float:
         """Adam on the clipped value loss; returns its mean over critics and minibatches.
 
-        A minibatch has the same places in the rollouts of all ranks. As PPO, it learns nothing, and gives NaN, where
+        A minibatch has the same places in the rollouts of all ranks. Like PPO, it learns nothing, and returns NaN, if
         fewer transitions count than a minibatch has.
         """
         rows = rollout.num_steps * worlds.shape[1]

@@ -4,7 +4,7 @@ Source: off-environment reinforcement learning (Ciosek and Whiteson, *OFFER*, AA
 et al., *SAMPLR*, NeurIPS 2022, arXiv:2207.05219). Hypothesis: what a Director costs in performance is that it trains on
 other goals than those that count; weights give that back, and the crashes that it collects stay.
 
-The weights mend which goal is met in a state, not which states are met.
+The weights correct which goal is met in a state, not which states are met.
 """
 
 import math
@@ -60,7 +60,7 @@ class Weighted(FearSelector):
 
     def choose(self, score: Tensor, draw: Tensor) -> Tensor:
         """See ``FearSelector.choose``."""
-        mix = self.config.mix  # one number tells both which kind of goal it is and which goal
+        mix = self.config.mix  # one number decides both which kind of goal it is and which goal
         anything = picks.uniformly(draw / mix, score.shape[1])
         if mix == 1.0:
             return anything
@@ -108,8 +108,8 @@ def _state_shift(interactions: Interactions) -> float:
     """How well a state tells whether the goal that led to it was a uniform one or from the top.
 
     Returns:
-        AUROC of a linear discriminant that is fitted on the worlds of even number, on the others; 0.5 where they are
-        alike, NaN where there is too little to tell.
+        AUROC, on the worlds of odd number, of a linear discriminant that is fitted on those of even number; 0.5 where
+        they are alike, NaN where there are too few interactions to tell.
     """
     done = interactions.resolved()
     done = done.where(interactions.followed(done))
