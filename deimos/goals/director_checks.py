@@ -10,6 +10,7 @@ from torch import Tensor
 
 from deimos.checks import check_at_least, check_choice, check_is, check_seed, one_line
 from deimos.goals import given
+from deimos.goals.faults import Faults
 from deimos.goals.given import Bound, Candidates, Inputs
 from deimos.goals.selector import SelectorConfig
 from deimos.nn.stateful import LARGEST, is_sound
@@ -129,7 +130,9 @@ def check_candidates(candidates: Candidates, count: int, inputs: Inputs, drawn: 
         given.tensor("candidates", candidates, inputs.device)
 
 
-def refuse_unsound(name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None) -> None:
+def refuse_unsound(
+    name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None, faults: Faults | None = None
+) -> None:
     """Raise ``ValueError`` where a number is not finite, or so large that what is learnt from it would not be.
 
     Args:
@@ -137,7 +140,13 @@ def refuse_unsound(name: str, numbers: Tensor, rows: Tensor | None = None, but: 
         numbers: Shape (m, n), m and n at least 1.
         rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
         but: Rows that do not matter, bool, shape (m,).
+        faults: Where to note what does not fit; ``None`` to refuse it at once.
     """
+    if faults is not None:
+        bad = ~is_sound(numbers).all(1)
+        text = f"{name} of world {{world}} must be finite and at most {LARGEST:g} in size"
+        faults.note(text, bad if but is None else bad & ~but, rows)
+        return
     if bool(is_sound(torch.stack(numbers.aminmax())).all()):
         return
     given.refuse_not_finite(name, numbers, rows, but)

@@ -5,13 +5,10 @@ from collections.abc import Callable, Hashable
 import torch
 from torch import Tensor
 
-from deimos.goals.core import Changes, GoalCore
+from deimos.goals.core import Changes, GoalCore, on_gpu
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Spaces
 from deimos.sim.env import Env, Step
-
-AS_ON_GPU = False
-"""Whether a CPU also asks for the next goals of all worlds at every step, as a GPU does: for tests."""
 
 GoalGuard = Callable[[Env, Tensor, Tensor], Tensor]
 """Has the last word on goals: of the environment, the worlds, int64, shape (B,), and the goals, shape (B, goal_dim),
@@ -79,8 +76,7 @@ class GoalLoop:
 
     @property
     def _dense(self) -> bool:
-        on_gpu = AS_ON_GPU or self.env.device.type == "cuda"
-        return on_gpu and self.selector.dense and self._guard is None
+        return on_gpu(self.env.device) and self.selector.dense and self._guard is None
 
     def graph_key(self) -> Hashable:
         """What Python decides by in ``advance``; ``None`` where a CUDA graph cannot replay it, see ``why_eager``."""
