@@ -27,10 +27,10 @@ HOME = Path(deimos.__file__).resolve().parent.parent
 TRAIN_ERRORS = {
     # what is asked for, and what the one line says
     "--env.variant cubic": "'cubic' .*'absolute', 'directional', 'relative'",
-    "env:moon": "There is no 'env:moon'; there are: env:particle",
+    "env:moon": "Unknown argument 'env:moon'; choose from: env:particle",
     "--method q33": f"Unknown method 'q33'; choose from: {re.escape(', '.join(METHODS))}",
     "--method=": f"Unknown method ''; choose from: {re.escape(', '.join(METHODS))}",
-    "selector:nope": "There is no 'selector:nope'; there are: .*selector:director, .*selector:uniform",
+    "selector:nope": "Unknown argument 'selector:nope'; choose from: .*selector:director, .*selector:uniform",
     "--method p25 selector:uniform": "method 'p25' and a selector cannot be combined",
     "selector:director --selector.percentile 100.5": r"percentile must be in \[0, 100\], got 100.5",
     "selector:director --selector.percentile -1": r"percentile must be in \[0, 100\], got -1.0",
@@ -96,22 +96,22 @@ TRAIN_ERRORS = {
     "--init-from there": "there is not a run folder: it holds no config.json",
 }
 OTHER_ERRORS = {
-    "frobnicate": "There is no command 'frobnicate'; there are: train, evaluate, pool, study, play, view, "
+    "frobnicate": "Unknown command 'frobnicate'; choose from: train, evaluate, pool, study, play, view, "
     "shield, export, robot, doctor, terrain",
-    "--bogus": "There is no command '--bogus'",
+    "--bogus": "Unknown command '--bogus'",
     "evaluate": "Missing from deimos evaluate: .*Folder of the run",
     "evaluate nowhere": "nowhere is not a run folder: it holds no config.json",
     "evaluate there": "there is not a run folder: it holds no config.json",
     "evaluate there --worlds many": r"deimos: --worlds: invalid literal for int\(\) with base 10: 'many'$",
     "evaluate there --attackers oracle --attackers search": "--attackers is given twice; give it once",
-    "view there --shield maybe": "There is no 'maybe' for --shield; there are: 'ignore', 'project', 'stop'.$",
+    "view there --shield maybe": "Unknown value 'maybe' for --shield; choose from: 'ignore', 'project', 'stop'.$",
     "terrain grid --difficulty 0.9": "deimos: --difficulty: input length 1 did not match .* 2 of `FLOAT FLOAT`$",
     "terrain grid --out=a.npz --levels 1 --out=b.npz": "--out is given twice",
     "doctor --device gpu": "device must be auto, cpu, cuda or cuda:N, got 'gpu'",
-    "bench": "There is no command 'bench'",
-    "study walk": "There is no command 'study walk'; there are: run, cell, show, attack, pool, pack, unpack, merge, "
+    "bench": "Unknown command 'bench'",
+    "study walk": "Unknown command 'study walk'; choose from: run, cell, show, attack, pool, pack, unpack, merge, "
     "export, report",
-    "terrain walk": "There is no command 'terrain walk'; there are: list, shape, grid",
+    "terrain walk": "Unknown command 'terrain walk'; choose from: list, shape, grid",
 }
 
 

@@ -3,6 +3,7 @@
 import importlib
 import math
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -53,6 +54,14 @@ def test_a_swapped_choice_ignores_its_own_state(twins):
     _, other = twins
     same = [other.propose(rows, s, g, options, draws).goal for s, g in ((state, goal), (state + 2.0, -goal))]
     assert torch.equal(*same)
+
+
+def test_swapped_goals_can_be_shuffled_too(twins, monkeypatch):
+    """With both controls at once, goals are distributed as Uniform's (1 %)."""
+    _, other = twins
+    monkeypatch.setattr(other, "config", replace(other.config, control="shuffled"))
+    counts = torch.bincount(cells(other.propose(*decisions()).goal), minlength=64)
+    assert stats.chisquare(counts.numpy()).pvalue > 0.01
 
 
 def test_state_blind_fear_learns_what_goals_alone_tell():

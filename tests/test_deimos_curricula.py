@@ -90,10 +90,10 @@ def test_a_saved_curriculum_stays_what_it_was():
     assert other.goal_range().tolist() == [0.5, 0.5, 0.25]
 
 
-def adaptive(bins=8, **changes):
-    """A grid selector that knows that goals lie in [-1, 1]^3."""
+def adaptive(bins=8, corner=(1.0, 1.0, 1.0), **changes):
+    """A grid selector that knows that goals lie between ``corner`` and its opposite."""
     selector = grid.Config(bins=bins, **changes).build(SPACES, 0)
-    corners = torch.tensor([[[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]]])
+    corners = torch.tensor([[corner, corner]]) * torch.tensor([[1.0], [-1.0]])
     decision = torch.zeros(1).long(), torch.zeros(1, 2), torch.zeros(1, 3), corners
     selector.issued(*decision, selector.propose(*decision, torch.zeros(1, 4)))
     selector.learn(Interactions(10, 2, 3, 5, 10, CPU, groups=2), None)
@@ -142,6 +142,12 @@ def test_groups_have_grids_of_their_own():
     assert torch.equal(selector._weights[0], before[0])
     risen = selector._weights[1] - before[1]
     assert risen.tolist() == pytest.approx([0, 0, 0, 0, 0, 0, 0.5, 0.5])  # ten worlds
+
+
+def test_what_never_varies_is_always_in_one_cell():
+    """A component of 0 alone, such as the speed of a robot that stands, does not keep the grid from its work."""
+    selector = adaptive(corner=(1.0, 0.0, 0.5))
+    assert selector._cells(torch.tensor([[0.9, 0.0, -0.2], [-0.9, 0.0, 0.45]])).tolist() == [[7, 4, 2], [0, 4, 7]]
 
 
 def test_candidates_are_drawn_by_their_cells():

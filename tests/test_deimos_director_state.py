@@ -324,8 +324,13 @@ def test_numbers_that_would_spoil_the_networks_are_refused(size):
         goals.step(state, goal, NO, NO)
     with pytest.raises(ValueError, match=r"state of world 5 must be at most 1e\+15 in size, got \[0\.0, "):
         goals.propose([5], state[3:4], goal[5:6])
+    with pytest.raises(ValueError, match=r"executed of world 3 must be at most 1e\+15 in size"):
+        goals.step(torch.zeros(N, 2), goal, NO, NO, executed=state[:, 1:])
     assert_same(goals.state_dict(), before)
     goals.step(state, goal, torch.arange(N) == 3, NO)  # of a world that is done nobody looks at it
+    unbounded = GoalDirector(AFRAID, max_horizon=9)
+    with pytest.raises(ValueError, match=r"candidates of world 3 must be at most 1e\+15 in size"):
+        unbounded.propose(None, torch.zeros(N, 2), torch.zeros(N, 1), state[:, 1:].unsqueeze(1))
 
 
 def test_a_network_that_is_not_finite_stops_the_run():

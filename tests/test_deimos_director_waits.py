@@ -174,10 +174,10 @@ def good(**changes):
 STEPS = [
     ({"state": NAN.expand(N, 2)}, "state of world 5 must be finite and at most 1e+15 in size"),
     ({"goal": NAN.nan_to_num(1e16)}, "goal of world 5 must be finite and at most 1e+15 in size"),
-    ({"tracking": NAN[:, 0]}, "tracking of world 5 must be finite"),
+    ({"tracking": NAN[:, 0]}, "tracking of world 5 must be in [0, 1]"),
     ({"tracking": NAN[:, 0].nan_to_num(7.0)}, "tracking of world 5 must be in [0, 1]"),
-    ({"executed": NAN}, "executed of world 5 must be finite"),
-    ({"candidates": NAN.unsqueeze(1)}, "candidates of world 5 must be finite"),
+    ({"executed": NAN}, "executed of world 5 must be finite and at most 1e+15 in size"),
+    ({"candidates": NAN.unsqueeze(1)}, "candidates of world 5 must be finite and at most 1e+15 in size"),
     ({"candidates": NAN.unsqueeze(1).nan_to_num(2.0)}, "candidates of world 5 must be in the goal_box"),
     ({"truncated": NAN[:, 0]}, "truncated of world 5 must be bool, or 0 and 1"),
     ({"goal": NAN.nan_to_num(0.5)}, "goal of world 5 must be what it was given"),

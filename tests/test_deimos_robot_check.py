@@ -235,6 +235,6 @@ def test_a_file_that_no_check_has_drawn_stays(page, monkeypatch, capsys, is_pict
     Image.new("RGB", (4, 4)).save("scout.png") if is_picture else Path("scout.png").write_text("a note")
     before = Path("scout.png").read_bytes()
     assert cli.main(["robot", "check", "scout.toml"]) == 2
-    line = "scout.png exists and is not overwritten, for it is no picture of a check; choose another --picture."
+    line = "scout.png exists and is not overwritten: it is not a picture of a check; choose another --picture."
     assert capsys.readouterr().err == f"deimos: {line}\n"
     assert Path("scout.png").read_bytes() == before

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from scipy import stats
 from states import assert_same
 
 from deimos.goals.methods import method
@@ -29,6 +30,7 @@ class Recorder(GoalSelector):
 
     def propose(self, rows, state, goal, candidates, draws):
         """See ``GoalSelector.propose``."""
+        self.draws = draws
         return Proposal(candidates[:, self.place], torch.full_like(draws[:, 0], self.score), **self.proposal)
 
     def learn(self, interactions, rollout):
@@ -164,6 +166,20 @@ def test_the_uniform_goals_of_a_mix_are_not_replayed_ones(recorders):
     proposal = selector.propose(torch.arange(4000), *arguments, torch.rand(4000, 4, generator=generator))
     assert torch.equal(proposal.weight, (~proposal.probe).float())
     assert 0 < proposal.weight.sum() < 4000
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
+def test_a_mixed_method_draws_from_uniform_numbers(recorders, share):
+    """Where it chooses, its fourth number is as uniform as the others, though the mix has decided by that one."""
+    selector = mix.Config(base="noted", share=share).build(SPACES, 0)
+    draws = torch.rand(4000, 4, generator=torch.Generator().manual_seed(0))
+    zeros = (torch.zeros(4000, *shape) for shape in ((9,), (3,), (5, 3)))
+    free = selector.propose(torch.arange(4000), *zeros, draws).probe
+    seen = recorders["noted"].draws
+    assert torch.equal(seen[:, :3], draws[:, :3])
+    assert share > 0 or torch.equal(seen, draws)
+    assert 0 <= seen.min() <= seen.max() < 1
+    assert stats.kstest(seen[~free, 3].numpy(), "uniform").pvalue > 1e-3
 
 
 def test_a_mix_is_its_method_in_all_else():

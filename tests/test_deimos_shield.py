@@ -20,7 +20,7 @@ from deimos.run.attack import uniform_goals
 from deimos.run.evaluation import EvalConfig, make_target
 from deimos.run.folder import RunFolder
 from deimos.run.loop import GoalLoop, spaces
-from deimos.run.shield import Guard, ShieldConfig, Trial, collect, plain_rule, random_rule
+from deimos.run.shield import Guard, ShieldConfig, Trial, _goal_scale, _seen_range, collect, plain_rule, random_rule
 from deimos.sim.envs import particle, quad_arm
 
 CPU = torch.device("cpu")
@@ -243,6 +243,15 @@ def test_the_plain_rules():
     assert name == "tilt"
     assert rule(robots, torch.arange(3), torch.zeros(3, 2, 6)).flatten().tolist() == pytest.approx([-1.0] * 6, abs=1e-4)
     assert robots.rest_goal() == (0.0, 0.0, 0.0, None, None, None)
+
+
+def test_robots_that_stand_can_have_a_shield():
+    """Velocity goals of 0 alone have no range, but there are distances between goals of the arm."""
+    env = quad_arm.Config(engine="native", speed=0.0).for_evaluation().build(1, CPU, seed=0)
+    reach = _seen_range(env)
+    assert (reach > 0).all()
+    assert torch.equal(reach[3:], (env.goal_range * _goal_scale(env))[3:])
+    Shield(0.0, "project", env.rest_goal(), reach.tolist())
 
 
 def test_a_calibration_takes_one_goal_of_each_world():

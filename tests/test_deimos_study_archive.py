@@ -281,7 +281,7 @@ def test_foreign_archive_is_refused(tmp_path, name):
     """An archive that would write anything but the files of cells is refused, and nothing of it is written."""
     with zipfile.ZipFile(tmp_path / "policies.zip", "w") as archive:
         archive.writestr(name, "x")
-    with pytest.raises(RunError, match=r"policies\.zip is no archive of policies, or it is broken"):
+    with pytest.raises(RunError, match=r"policies\.zip is not an archive of policies, or it is broken"):
         cli.UnpackOptions(folder=tmp_path).run()
     assert [path.name for path in tmp_path.iterdir()] == ["policies.zip"]
 
@@ -332,7 +332,7 @@ def test_run_that_lost_its_configuration_is_made_again(whole, tmp_path, capsys):
     run.mkdir()
     (run / "checkpoint.pt").write_text("whatever")
     assert worker.main([str(study.path), cell.name]) == 0
-    assert capsys.readouterr().err == f"{run} holds no config.json; the cell is made again.\n"
+    assert capsys.readouterr().err == f"{run} holds no config.json; the cell starts again.\n"
     assert table(study, WORST) == [row for row in table(whole, WORST) if row["hash"] == repr(cell.digest)]
 
 

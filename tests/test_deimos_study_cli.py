@@ -52,7 +52,7 @@ RUN_ERRORS = {
     "no study": ({}, "study holds no study; begin one with --file"),
     "missing file": ({"file": Path("huge.toml")}, r"huge\.toml is not a study's TOML file .*No such file"),
     "unknown method": ({"file": SMALL, "methods": ["q33"]}, "Unknown method 'q33'"),
-    "doubled seed": ({"file": SMALL, "seeds": "0,0"}, "Every seed must be given once; doubled: 0"),
+    "doubled seed": ({"file": SMALL, "seeds": "0,0"}, "Every seed must be given once; repeated: 0"),
     "foreign environment": (
         {"file": SMALL, "environments": ["quad"]},
         "This study has no environment quad; it has: directional",

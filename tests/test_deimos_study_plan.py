@@ -159,12 +159,12 @@ def test_cell_survives_its_file(tmp_path):
 ERRORS = {
     # what is said in the file, and the one line that refuses it
     TOML.replace('"uniform", "p25"', '"uniform", "q33"'): "Unknown method 'q33'; choose from: uniform, coop",
-    TOML.replace('"uniform", "p25"', '"uniform", "uniform"'): "Every method must be given once; doubled: uniform",
-    TOML.replace("[3, 5]", "[3, 3]"): "Every seed must be given once; doubled: 3",
+    TOML.replace('"uniform", "p25"', '"uniform", "uniform"'): "Every method must be given once; repeated: uniform",
+    TOML.replace("[3, 5]", "[3, 3]"): "Every seed must be given once; repeated: 3",
     TOML.replace("[3, 5]", "0"): "seeds must be a number of seeds, .* or a list like 0,3,5, got 0",
     TOML.replace("[3, 5]", "[-1]"): r"seeds must be .* got \[-1\]",
     TOML.replace("[3, 5]", "[4294967296]"): r"seed must be in \[0, 2\^32\), got 4294967296",
-    TOML.replace('"far"', '"near"'): "Every environment must be given once; doubled: near",
+    TOML.replace('"far"', '"near"'): "Every environment must be given once; repeated: near",
     TOML.replace('"far"', '"../far"'): r"must have a name of letters, digits, '\.' and '_', got '\.\./far'",
     TOML.replace(
         '"particle", variant = "absolute"', '"hexapod"'
@@ -172,7 +172,7 @@ ERRORS = {
     TOML.replace('variant = "absolute"', 'variant = "cubic"'): "'far': variant must be one of",
     TOML.replace('variant = "absolute"', "friction = 1"): "'far': .*Config has no friction; it has: ",
     TOML.replace("num_envs = 64", "num_worlds = 64"): "TrainConfig has no num_worlds; it has: ",
-    TOML.replace("num_envs = 64", "seed = 64"): "seed cannot stand in 'train' or be a factor: the grid",
+    TOML.replace("num_envs = 64", "seed = 64"): "seed cannot be in 'train' or be a factor: the grid",
     TOML.replace("num_envs = 64", "num_envs = 0"): "num_envs must be at least 1, got 0",
     TOML.replace("[50, 100]", "[50, 5000]"): "eval.steps must be at least 2 T = 10000, got 2000",
     TOML.replace("[50, 100]", "[50, 50]"): r"goal_periods must be one or more different numbers, got \(50, 50\)",
@@ -182,8 +182,8 @@ ERRORS = {
     'base = "huge.toml"': r"huge\.toml is not a study's TOML file",
     'base = "study.toml"': r"study\.toml is a base of itself",
     "base = 3": r"study\.toml: base must be a text, got 3",
-    TOML.replace("[3, 5]", "1000000000000"): "seeds must be at most 100000, got 1000000000000",
-    TOML.replace("[3, 5]", '"0-1000000000000"'): "seeds must be at most 100000, got '0-1000000000000'",
+    TOML.replace("[3, 5]", "1000000000000"): "seeds must be at most 100000 in number, got 1000000000000",
+    TOML.replace("[3, 5]", '"0-1000000000000"'): "seeds must be at most 100000 in number, got '0-1000000000000'",
     TOML.replace("[3, 5]", "true"): "seeds must be a number of seeds, .* got True",
     TOML.replace("[3, 5]", "{ a = 1 }"): "seeds must be a number of seeds, .* got {'a': 1}",
     TOML.replace('name = "far"', 'name = "far"\npreset = []'): r"preset must be a text, got \[\]",

@@ -45,7 +45,7 @@ def test_a_pool_for_every_setting(screening, short_study, tmp_path, capsys):
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith(f"{fast}: ")
     assert said[0].endswith(" crashes")
-    assert said[1] == f"{slow}: no crashes, or nothing else: the attacker's goals are uniform"
+    assert said[1] == f"{slow}: no crashes, or only crashes: the attacker's goals are uniform"
     facts = [load_tensors(path, "pool", SCHEMA)["facts"] for path in (fast, slow)]
     assert [each["uninformed"] for each in facts] == [False, True]
     assert facts[0]["adversary_crashes"] > 0 == facts[1]["adversary_crashes"]
@@ -75,7 +75,7 @@ def test_a_pool_that_is_there_stays(screening, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stderr == ""
     first_line, second = done.stdout.splitlines()
-    assert first_line == f"{fast}: is there"
+    assert first_line == f"{fast}: exists already"
     assert second.startswith(f"{slow}: no crashes")
     assert fast.read_bytes() == b"made before"
     assert slow.read_bytes() == first

@@ -176,7 +176,7 @@ def test_committed_studies_can_be_read():
 
 def test_empty_folder_has_no_report(tmp_path):
     """There is no report of nothing."""
-    with pytest.raises(RunError, match="holds no results; it is empty, or no study folder"):
+    with pytest.raises(RunError, match="holds no results; it is empty, or not a study's folder"):
         report.write(tmp_path, tmp_path)
 
 

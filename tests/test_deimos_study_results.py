@@ -313,7 +313,7 @@ def test_merge_checks_before_it_writes(tmp_path):
     """An empty source, or one of another schema, is refused and the target is not made."""
     fill(tmp_path / "a", [result("1")])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(RunError, match="empty holds no results; it is empty, or no study folder"):
+    with pytest.raises(RunError, match="empty holds no results; it is empty, or not a study's folder"):
         merge(tmp_path / "c", [tmp_path / "a", tmp_path / "empty"])
     (tmp_path / "empty" / "results.csv").write_text("reward\n")
     with pytest.raises(RunError, match="another schema; missing: environment"):

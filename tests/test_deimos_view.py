@@ -360,7 +360,7 @@ def test_a_video_is_recorded_meanwhile(scared, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--goals", "argmax"], "There is no 'argmax' for --goals here; there are: uniform, p75, and with --attackers"),
+        (["--goals", "argmax"], "Unknown value 'argmax' for --goals; choose from: uniform, p75, and with --attackers"),
         (["--attackers", "nobody"], "There is no attacker 'nobody'"),
         (["--pool", "a.pt"], "pool is the file of the attacker pooled; add --attackers pooled"),
         (["--attackers", "argmax", "pooled", "--pool", "a.pt"], "a.pt cannot be read (No such file or directory)"),
@@ -382,7 +382,7 @@ def test_what_cannot_be_shown_is_one_line(scared, tmp_path, monkeypatch, capsys,
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--goals argmx --attackers argmax", "There is no 'argmx' for --goals here"),
+        ("--goals argmx --attackers argmax", "Unknown value 'argmx' for --goals"),
         ("--shield stop --attackers argmax", "has no shield; make one by deimos shield"),
         ("--record none/x.mp4 --attackers argmax", "The folder none does not exist; make it first"),
         ("--record x.avi --attackers argmax", "video must end in one of .mp4,"),

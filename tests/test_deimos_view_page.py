@@ -6,6 +6,7 @@ import http.client
 import socket
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -15,7 +16,7 @@ import torch
 
 from benchmarks import viewer
 from deimos.app.view import simulate
-from deimos.app.viewer_panel import Moment, Panel
+from deimos.app.viewer_panel import MAP, Moment, Panel
 from deimos.app.viewer_scene import build_scene
 from deimos.app.viewer_session import BY_HAND, Session
 from deimos.app.viewer_web import check_port, serve
@@ -163,6 +164,21 @@ def test_a_drag_beyond_the_map_stays_on_it(particles):
         for command in panel.commands():
             command(particles)
         assert particles.goal[:2] == pytest.approx(place)
+
+
+def test_goals_are_marked_on_a_map_without_extent(particles):
+    """Where they are along an axis, and in the middle of one that is a point, as the speed of a robot that stands."""
+    scene = build_scene(particles)
+    shown = Moment.of(particles, scene)
+    flat = replace(shown.fear, axes=(0, 1), low=(-1.0, 2.0), high=(3.0, 2.0))
+    panel, imgui = Panel(scene), MagicMock()
+    imgui.GetCursorScreenPos.return_value = SimpleNamespace(x=100.0, y=200.0)
+    imgui.Vec2 = lambda x, y: (x, y)
+    imgui.IsItemActive.return_value, imgui.Combo.return_value = False, (False, 0)
+    goals = {"goal": [0.0, 2.0, 0.0], "next_goal": [3.0, 2.0, 0.0]}
+    panel._draw_map(imgui, replace(shown, fear=flat, **goals), MagicMock())
+    marks = [call.args[0] for call in imgui.GetWindowDrawList().AddCircle.call_args_list]
+    assert marks == [(100 + MAP, 200 + MAP / 2), (100 + MAP / 4, 200 + MAP / 2)]
 
 
 def own_addresses():

@@ -26,7 +26,7 @@ def test_report_has_the_claims(tmp_path, capsys, monkeypatch):
 def test_report_of_nothing_is_refused(tmp_path, capsys):
     """An empty folder is refused in one line with exit code 2."""
     assert reproduction.main(["report", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"error: {tmp_path} holds no results; it is empty, or no study folder.\n"
+    assert capsys.readouterr().err == f"error: {tmp_path} holds no results; it is empty, or not a study's folder.\n"
 
 
 def test_coverage_is_a_table(capsys, monkeypatch):

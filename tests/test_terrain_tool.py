@@ -252,7 +252,7 @@ def test_force_overwrites_and_nothing_else_does(folder, capsys):
         ("shape flat --difficulty 1.5", "difficulty must be in [0, 1], got 1.5"),
         ("shape flat --difficulty nan", "difficulty must be in [0, 1], got nan"),
         ("grid --difficulty 0 2", "hardest must be in [0, 1], got 2.0"),
-        ("shape stairs", "There is no command 'terrain shape stairs'; there are: discrete, flat, gap"),
+        ("shape stairs", "Unknown command 'terrain shape stairs'; choose from: discrete, flat, gap"),
         ("grid --shapes flat stair", "There is no shape 'stair'; there are: discrete, flat, gap"),
         ("grid --preset go2", "There is no preset 'go2'; there are: go1, legged-gym"),
         ("shape pit --tile 3", "platform must be smaller than tile = 3 m, got 4 m"),
@@ -278,7 +278,7 @@ def test_force_overwrites_and_nothing_else_does(folder, capsys):
         ("grid --file here.npz", "here.npz: "),
         ("grid --file a.toml --preset go1", "file excludes preset and shapes"),
         ("grid --shapes flat --preset go1", "shapes excludes preset"),
-        ("shapes", "There is no command 'terrain shapes'; there are: list, shape, grid"),
+        ("shapes", "Unknown command 'terrain shapes'; choose from: list, shape, grid"),
     ],
 )
 def test_mistakes_give_one_line(folder, capsys, arguments, message):

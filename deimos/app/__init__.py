@@ -1,1 +1,1 @@
-"""What a person meets: the command line, the console, figures and videos."""
+"""What users see: the command line, the console, figures and videos."""

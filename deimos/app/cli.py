@@ -1,6 +1,6 @@
 """The command line: one table of commands, one table of errors.
 
-Whatever the user can mend (a flag, a folder, a disk, a missing package) ends in one line on stderr and exit code 2.
+Whatever the user can fix (a flag, a folder, a disk, a missing package) ends in one line on stderr and exit code 2.
 A process that runs ``main`` is a command's: its environment and its standard streams are set up here, and only here.
 Importing the library leaves both alone; a program that shares its cores sets OMP_WAIT_POLICY=passive itself.
 """
@@ -30,7 +30,7 @@ COMMANDS = {
     "shield": ("deimos.app.shield", "calibrate a shield against goals that would crash a policy, and test it"),
     "export": ("deimos.app.export", "write a policy as ONNX, with all that a robot's controller needs"),
     "robot": ("deimos.app.robot", "check a robot of your own, and draft its file from an MJCF"),
-    "doctor": ("deimos.app.doctor", "say what this machine has, and what works on it"),
+    "doctor": ("deimos.app.doctor", "report what this machine has, and what works on it"),
     "terrain": ("deimos.app.terrain", "generate terrain for legged robots (also: python -m terrain)"),
 }
 """By name: the module whose ``main`` is the command, imported when it is asked for, and a line about it."""
@@ -43,7 +43,7 @@ EXTRAS = {
 }  # fmt: skip
 """The extra of ``deimos-rl`` that installs a package."""
 
-BROKEN_PIPE = 141  # what a shell says of a program that SIGPIPE ends
+BROKEN_PIPE = 141  # a shell's exit code for a program that SIGPIPE ends
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,8 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         with console.on_signals(console.raise_stopped):
             _run(arguments)
-        sys.stdout.flush()  # what cannot be written is said here, and not by Python when it ends
-    except BrokenPipeError:  # whoever read has read enough
+        sys.stdout.flush()  # what cannot be written is reported here, and not by Python when it ends
+    except BrokenPipeError:  # the reader has read enough
         return BROKEN_PIPE
     except (RunError, SimulationError) as error:
         return _fail(str(error))
@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _shortage(error: BaseException) -> str:
-    """What the system did not give, if that is what an error is about."""
+    """What the system is short of, if that is what an error is about."""
     if "can't start new thread" in str(error):  # Python's words
         return "The system does not let this process start another thread; see ulimit -u, or use fewer --threads."
     if isinstance(error, MemoryError):
@@ -107,22 +107,22 @@ def _shortage(error: BaseException) -> str:
 
 def _prepare_process() -> None:
     """Set up what torch and matplotlib read when they are loaded, and the standard streams."""
-    # Threads that wait sleep: where cores are shared, those that spin cost more than they win. A user's value stays.
+    # Threads that wait sleep: where cores are shared, those that spin cost more than they gain. A user's value stays.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     atexit.register(gc.freeze)  # Python would search torch's modules for garbage when it ends, half a second long
     os.environ["MPLBACKEND"] = "agg"  # commands draw into files; the back end of a notebook need not be installed here
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
-        if stream is None:  # closed: the next file that is opened would take its number, and all that is said to it
+        if stream is None:  # closed: the next file that is opened would get its number, and everything written to it
             null = open(os.devnull, "w" if number else "r")
             os.dup2(null.fileno(), number)
             setattr(sys, name, null)
-        elif number and isinstance(stream, io.TextIOWrapper):  # not what is read, which may have been begun
+        elif number and isinstance(stream, io.TextIOWrapper):  # not stdin, which may have been read from
             stream.reconfigure(errors="backslashreplace")  # a path that this terminal cannot spell
 
 
 def _drop_broken_streams() -> None:
-    """Send to nowhere what can no longer be written; Python would complain of it when it ends."""
+    """Discard what can no longer be written; Python would complain about it when it ends."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -152,12 +152,12 @@ def _command(module: str) -> console.Command:
 def _spell_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    """A warning in one line: whoever runs a command need not know which line of the program says it."""
+    """A warning in one line: users of a command need not know which line of the program it comes from."""
     return f"deimos: {' '.join(str(message).split())}\n"
 
 
 def _skip_file_errors(thread: threading.ExceptHookArgs) -> None:
-    """Say nothing of a full disk that TensorBoard's thread has met: it reports it to the main thread."""
+    """Print nothing about a full disk that TensorBoard's thread has met: it reports that to the main thread."""
     if not issubclass(thread.exc_type, OSError):
         threading.__excepthook__(thread)
 

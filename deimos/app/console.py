@@ -1,4 +1,4 @@
-"""What all commands share: their dispatch, the parsing of options, progress bars, the way in which they are stopped.
+"""What all commands share: their dispatch, the parsing of options, progress bars, and how they are stopped.
 
 Importing it needs Python alone, so that ``deimos`` can say which packages are missing.
 """
@@ -28,10 +28,10 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from deimos.checks import RunError
 
 Command = Callable[[list[str], str], None]
-"""Runs on its arguments, under the name that a person calls it by, such as ``deimos study run``."""
+"""Runs on its arguments, under the name that a user calls it by, such as ``deimos study run``."""
 
 LEAST_WIDTH = 60  # columns of a terminal that help is wrapped at
-# From line to line where progress cannot be shown in place: seconds at least, and a share of what has passed.
+# From line to line where progress cannot be shown in place: seconds at least, and a share of the time so far.
 PLAIN_SECONDS, PLAIN_SHARE = 20.0, 0.05
 
 
@@ -42,7 +42,7 @@ def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments:
         commands: By name, one line about the command and the command.
         about: What they do together.
         arguments: What follows ``program`` on the command line.
-        program: How a person calls them.
+        program: How a user calls them.
 
     Raises:
         RunError: If there is no such command.
@@ -60,7 +60,7 @@ def dispatch(commands: Mapping[str, tuple[str, Command]], about: str, arguments:
     name, rest = arguments[0], arguments[1:]
     if name not in commands:
         asked = " ".join([*program.split()[1:], name])
-        raise RunError(f"There is no command '{asked}'; there are: {', '.join(commands)}.")
+        raise RunError(f"Unknown command '{asked}'; choose from: {', '.join(commands)}.")
     commands[name][1](rest, f"{program} {name}")
 
 
@@ -78,8 +78,8 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
     rule, registry = _Fields(is_help), tyro.constructors.ConstructorRegistry()
     registry.struct_rule(rule)
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(ImportError):  # then tyro's own, framed words stay, with exit code 2
-            from tyro._errors import on_parse_error  # since 1.0.16, and not promised
+        with contextlib.suppress(ImportError):  # then tyro's own framed messages stay, with exit code 2
+            from tyro._errors import on_parse_error  # since 1.0.16, and private
 
             stack.enter_context(on_parse_error(_refuse))
         if is_help:
@@ -92,7 +92,7 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
 
 
 def _refuse_repeated(arguments: list[str], lists: set[str]) -> None:
-    """Refuse an option of several values that is given twice: of such, the last one's values alone would count."""
+    """Refuse an option of several values that is given twice: only the values of the last one would count."""
     flags = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
     for flag in dict.fromkeys(flags):
         if flags.count(flag) > 1 and flag.rpartition(".")[2].lstrip("-").replace("-", "_") in lists:
@@ -102,7 +102,7 @@ def _refuse_repeated(arguments: list[str], lists: set[str]) -> None:
 class _Fields:
     """A rule of tyro's: how the fields of a dataclass are read and, for help, explained.
 
-    None is no value that can be given, and not shown: what it stands for is in the docstring. Docstrings below fields
+    None cannot be given as a value and is not shown: what it stands for is in the docstring. Docstrings below fields
     are shown without the line breaks that tyro would keep.
 
     Args:
@@ -111,12 +111,12 @@ class _Fields:
 
     def __init__(self, explained: bool) -> None:
         self._explained = explained
-        self._is_asking = False  # what tyro would say without this rule
+        self._is_asking = False  # whether tyro's answer without this rule is asked for
         self.lists: set[str] = set()
         """Names of the fields that take any number of values."""
 
     def __call__(self, struct: Any) -> Any:
-        """What tyro is to show; ``None`` leaves it to the other rules."""
+        """What tyro is to show; ``None`` leaves that to the other rules."""
         import tyro
 
         if self._is_asking or not (isinstance(struct.type, type) and dataclasses.is_dataclass(struct.type)):
@@ -135,7 +135,7 @@ class _Fields:
 
 
 def _is_list(kind: Any) -> bool:
-    """Whether a type is a list or a tuple of any length, or either one or None."""
+    """Whether a type is a list or a tuple of any length, or one of these or None."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Annotated, Union, UnionType):
         return any(map(_is_list, parts))
@@ -153,7 +153,7 @@ def _explain(kind: type) -> None:
 
 
 def _without_none(field: Any) -> Any:
-    """A field of tyro's that is a value and None by default, without None as a value; other fields as they are."""
+    """A field of tyro's that is None by default, without None as a value that can be given; others as they are."""
     from tyro import conf, constructors
 
     if field.default is not None:
@@ -183,10 +183,10 @@ def _docstrings(module: str) -> dict[str, dict[str, str]]:
 
 @contextlib.contextmanager
 def _wrapped_help() -> Iterator[None]:
-    """Wrap what tyro prints without regard to the terminal's width: what a command is for."""
+    """Wrap the description of a command, which tyro prints without regard to the terminal's width."""
     said, width = io.StringIO(), max(LEAST_WIDTH, shutil.get_terminal_size().columns)
     said.isatty = sys.stdout.isatty  # type: ignore[method-assign]
-    os.environ["COLUMNS"] = str(width)  # in less, tyro leaves descriptions a column of one letter
+    os.environ["COLUMNS"] = str(width)  # in less, tyro leaves descriptions a column one letter wide
     try:
         with contextlib.redirect_stdout(said):
             yield
@@ -196,7 +196,7 @@ def _wrapped_help() -> Iterator[None]:
 
 
 def _at_home(argument: str) -> str:
-    """An argument with its ``~`` expanded as by a shell, which leaves that of ``--out=~/x`` alone."""
+    """An argument with its ``~`` expanded as by a shell, which would leave that of ``--out=~/x`` alone."""
     flag, is_given, value = argument.partition("=")
     if argument.startswith("--") and is_given:
         return f"{flag}={os.path.expanduser(value)}"
@@ -204,14 +204,14 @@ def _at_home(argument: str) -> str:
 
 
 def _plainly(message: str) -> str:
-    """What tyro says of a value, without its markup and, where it could be of one type alone, without naming that."""
+    """What tyro says about a value, without its markup and, if only one type is possible, without naming that."""
     message = re.sub(r"\[/?bold\]", "", message)
     tried = re.findall(r"^- .*?: (.*)$", message, re.MULTILINE)
     return tried[0] if len(tried) == 1 else message
 
 
 def _refuse(event: Any) -> None:
-    """Raise ``RunError`` in place of tyro's framed words; what is not known here stays with tyro."""
+    """Raise ``RunError`` in place of tyro's framed messages; what is not known here stays with tyro."""
     argument = getattr(event, "argument", None)
     name = argument and argument.display_name()
     match type(event).__name__:
@@ -222,10 +222,10 @@ def _refuse(event: Any) -> None:
             choices = event.choices
             if "None" in choices:  # tyro has made a set of them
                 choices = sorted(set(choices) - {"None"})
-            raise RunError(f"There is no '{event.value}' for {name}; there are: {', '.join(map(repr, choices))}.")
+            raise RunError(f"Unknown value '{event.value}' for {name}; choose from: {', '.join(map(repr, choices))}.")
         case "SubcommandConflict":
             chosen, flag = event.already_selected, event.trigger_flag
-            raise RunError(f"{event.attempted} must stand before {flag}, which is an option of {chosen}.")
+            raise RunError(f"{event.attempted} must come before {flag}, which is an option of {chosen}.")
         case "BadValue":
             raise RunError(f"Missing value for argument '{name}'.")
         case "UnrecognizedArgs":
@@ -241,7 +241,7 @@ def _refuse(event: Any) -> None:
 def progress(title: str) -> Iterator[Callable[[str, float], None]]:
     """Show how far something is: gives the function that reports (what is done, fraction of the whole that is done).
 
-    On a terminal a bar; elsewhere, such as in the log of a job, a plain line now and then, more seldom in a long job.
+    On a terminal a bar; elsewhere, such as in the log of a job, a plain line now and then, less often in a long job.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -260,7 +260,7 @@ def progress(title: str) -> Iterator[Callable[[str, float], None]]:
 
 @contextlib.contextmanager
 def log_shown() -> Iterator[None]:
-    """Show what Deimos logs, such as why goals are uniform yet: a line each on stderr, above a progress bar."""
+    """Show what Deimos logs, such as why goals are still uniform: a line each on stderr, above a progress bar."""
     logger, handler = logging.getLogger("deimos"), logging.StreamHandler()
     before = logger.level
     logger.addHandler(handler)
@@ -296,7 +296,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with as many significant digits, in full: never in powers of ten, and 0 for nothing but zero."""
+    """A number with ``digits`` significant digits, in full: never in powers of ten, and 0 only for zero."""
     value += 0.0  # no -0
     if 0 < abs(value) < 1e-6:
         return "< 0.000001" if value > 0 else "> -0.000001"
@@ -311,7 +311,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], int]]:
-    """Let Ctrl-C, SIGTERM and SIGHUP end the iteration instead of cutting it; a second one cuts.
+    """Let Ctrl-C, SIGTERM and SIGHUP stop after the iteration instead of within it; a second one stops at once.
 
     Gives a function that returns the number of the signal that came, or 0.
     """
@@ -328,7 +328,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], int]]:
 
 @contextlib.contextmanager
 def on_signals(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Have a function called on Ctrl-C and on what clusters and terminals send before they are gone.
+    """Call a function on Ctrl-C and on the signals that clusters and terminals send before they are gone.
 
     Signals reach the main thread alone; in others nothing is changed. A SIGHUP that is ignored, as under nohup, stays
     so.
@@ -353,7 +353,7 @@ def raise_stopped(number: int, frame: Any) -> None:
 
 
 def quiet_warp() -> None:
-    """Keep Warp's start-up report off the terminal, with its warning that there is no GPU; all else shows."""
+    """Keep Warp's start-up report off the terminal, and its warning that there is no GPU; everything else shows."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING

@@ -1,4 +1,4 @@
-"""``deimos doctor``: what this machine has, what works on it, and what does not; ``--gpu``: ten minutes of a GPU's."""
+"""``deimos doctor``: what this machine has, what works on it, and what does not; ``--gpu``: ten minutes on a GPU."""
 
 import contextlib
 import importlib.metadata
@@ -26,7 +26,7 @@ from deimos.sim.shared import one_stream
 
 REPORT = "gpu.json"
 SCHEMA = 1  # of the report
-# The thesis's budget for Quad, 295 million transitions, in the shape that GPUs are trained in.
+# The thesis's budget for Quad, 295 million transitions, with the worlds and networks that suit a GPU.
 QUAD_WORLDS, QUAD_STEPS, QUAD_HIDDEN = 4096, 72_000, (512, 256, 128)
 PURPOSES = {
     "mujoco": ("robots", "legged"), "mujoco_warp": ("robots on a GPU", "legged"), "trimesh": ("terrain", "legged"),
@@ -39,9 +39,9 @@ PURPOSES = {
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions:
-    """Say what this machine has, and what of Deimos works on it: exit code 0 if a policy can be trained, else 1.
+    """Report what this machine has, and what of Deimos works on it: exit code 0 if a policy can be trained, else 1.
 
-    With --gpu, run the stages that show on a GPU what no CPU can: ten minutes, a JSON report after each.
+    With --gpu, run the stages that test what only a GPU can show: ten minutes, a JSON report after each.
     """
 
     device: str = "auto"
@@ -101,7 +101,7 @@ def examine(device_name: str) -> bool:
         begin = time.perf_counter()
         try:
             said = check(device_name)
-        except Exception as error:  # whatever it is: that is what is asked for
+        except Exception as error:  # any error is a finding
             said, works = f"FAILS: {one_line(error) or type(error).__name__}", works and not is_needed
         rows.append((what, f"{time.perf_counter() - begin:.1f} s", said))
     print(_table("what was tried", rows))
@@ -117,10 +117,10 @@ def _table(title: str, rows: Sequence[Sequence[str]]) -> str:
 
 
 def _package(name: str, extra: str) -> tuple[str, str]:
-    """The version of a package and what to say of it."""
+    """The version of a package, and a note on it."""
     try:
         return importlib.metadata.version(name.replace("_", "-")), "installed"
-    except importlib.metadata.PackageNotFoundError:  # a folder of that name, such as wandb's logs, is no package
+    except importlib.metadata.PackageNotFoundError:  # a folder of that name, such as wandb's logs, is not a package
         return "-", f"pip install 'deimos-rl[{extra}]'"
 
 
@@ -201,12 +201,12 @@ def run_stages(names: tuple[str, ...], device: torch.device, out: Path) -> bool:
 
 
 def _fails(found: Any) -> bool:
-    """Whether a check has failed in what a stage found, however deep it stands there."""
+    """Whether a check has failed in what a stage found, however deeply nested."""
     return isinstance(found, dict) and (found.get("passed") is False or any(map(_fails, found.values())))
 
 
 def _run_stage(name: str, device: torch.device, limit: float) -> dict[str, Any]:
-    """What a stage found, in a process of its own that may take ``limit`` seconds; or its error."""
+    """What a stage found, in a separate process that may take ``limit`` seconds; or its error."""
     with tempfile.TemporaryDirectory() as home:
         file = Path(home) / "found.json"
         command = [sys.executable, "-m", "deimos.app.gpu_stages", name, str(device), str(file)]
@@ -219,7 +219,7 @@ def _run_stage(name: str, device: torch.device, limit: float) -> dict[str, Any]:
                 return {"error": f"it took longer than {limit:.0f} s"}
             finally:
                 with contextlib.suppress(ProcessLookupError):  # they have ended, as they should
-                    os.killpg(process.pid, signal.SIGKILL)  # with what it has begun
+                    os.killpg(process.pid, signal.SIGKILL)  # with what it has started
         if not file.exists():
             last = said.strip().splitlines()[-1:] or [f"exit code {process.returncode}"]
             return {"error": last[0], "said": said[-4000:]}
@@ -230,7 +230,7 @@ def science(device: torch.device, out: Path) -> list[list[str]]:
     """The commands of ``--science``: each continues what is there.
 
     Raises:
-        RunError: If this is no checkout: benchmarks are not installed.
+        RunError: If this is not a checkout: benchmarks are not installed.
     """
     if not (gpu_stages.HOME / "benchmarks").is_dir():
         raise RunError("--science needs a checkout of the repository; benchmarks are not installed.")

@@ -37,7 +37,7 @@ _QUALITIES = {"auroc": "AUROC (0.5: chance, 1: perfect)", "brier": "Brier score"
 
 @dataclass(frozen=True, kw_only=True)
 class Elsewhere:
-    """What the policy is evaluated in, where that is not what it was trained in."""
+    """What the policy is evaluated in, if that is not what it was trained in."""
 
     engine: Literal["warp", "native"] | None = None
     """What simulates legged robots. By default as in training; the other one shows how the policy does in another
@@ -112,7 +112,7 @@ def main(arguments: list[str], program: str) -> None:
 
 
 def title(config: TrainConfig) -> str:
-    """What stands above the figures of a run."""
+    """Title of the figures of a run."""
     env = " ".join([kind(config.env), *filter(None, [getattr(config.env, "variant", None)])])
     return f"{env}, goals chosen by {config.label}, seed {config.seed}"
 
@@ -123,7 +123,7 @@ def show_evaluation(
     """Evaluate the policy of a run, whose configuration is ``config``; draw the summary and print what was found."""
     with console.progress("evaluating") as report:
         rows = evaluate_run(folder, env_config, eval_config, device, report)
-    # Before anything is printed: whoever reads it may be gone.
+    # Before anything is printed: its reader may be gone.
     figures.draw_summary(folder, title(config), rows[0]["weights"])
     print(describe(rows, elsewhere(folder, rows)))
 

@@ -17,8 +17,8 @@ from deimos.run.folder import RunFolder
 class ExportOptions:
     """Write the policy of a run for a deployment without Deimos: networks as ONNX, the robot as MJCF, and all numbers.
 
-    The folder gets policy.onnx, fear.onnx where the run has a fear network, deploy.json, an example of a controller
-    and, of robots, robot.xml and deploy.yaml.
+    The folder gets policy.onnx, fear.onnx if the run has a fear network, deploy.json, an example of a controller and,
+    for robots, robot.xml and deploy.yaml.
     """
 
     run: tyro.conf.Positional[Path]
@@ -33,7 +33,7 @@ class ExportOptions:
 def main(arguments: list[str], program: str) -> None:
     """Run ``deimos export``."""
     options: ExportOptions = console.parse(ExportOptions, arguments, program)
-    import onnx  # noqa: F401 (what is missing is said before the work)
+    import onnx  # noqa: F401 (what is missing is reported before the work)
 
     if options.check:
         import onnxruntime  # noqa: F401
@@ -47,7 +47,7 @@ def main(arguments: list[str], program: str) -> None:
 
 
 def check(folder: Path) -> None:
-    """Run an exported folder's own check in a process of its own, which imports nothing of ours.
+    """Run an exported folder's own check in a separate process, which imports nothing of ours.
 
     Raises:
         RunError: If it does not do what was exported.

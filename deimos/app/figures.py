@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
-BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"  # of Okabe and Ito's palette, told apart by the colour-blind
+BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"  # of Okabe and Ito's palette, distinct for the colour-blind
 ATTACKED = (ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 VALUES = ("explained_variance", "critic: explained variance\nof the values", BLUE)
 FEAR = ("fear/auroc", "fear network: how well it ranked\nthe goals' crashes (AUROC)", BLUE)
@@ -30,7 +30,7 @@ CURVES = (
 )
 """Columns of ``progress.csv`` that are drawn, what they are called, and their colours."""
 MARKED = 3  # points; a line through fewer is hard to see
-BAR = 0.42  # largest width of a bar with the gap beside it; evaluations are 1 apart
+BAR = 0.42  # largest width of a bar with the gap next to it; evaluations are 1 apart
 MOST_EVALUATIONS = 4
 EVALUATION = "evaluation"
 
@@ -38,12 +38,12 @@ EVALUATION = "evaluation"
 def draw_summary(folder: RunFolder, title: str, weights: str) -> None:
     """Draw ``summary.png``: reward, crashes and the learners' quality over training, and what the evaluations found.
 
-    There is no panel for what the folder has no numbers of, and no picture where it has none at all.
+    There is no panel for numbers that the folder does not have, and no picture if it has none at all.
 
     Args:
         folder: The run.
         title: Above it all.
-        weights: ``weights_hash`` of the policy as it is now. What was evaluated before it was trained on is left out.
+        weights: ``weights_hash`` of the policy as it is now. Evaluations from before further training are left out.
 
     Raises:
         RunError: If it cannot be written.

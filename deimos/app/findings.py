@@ -1,4 +1,4 @@
-"""What an evaluation has found, in words: a table in full words and units, and a sentence that says what it means."""
+"""What an evaluation has found: a table in full words and units, and a sentence that says what it means."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -104,7 +104,7 @@ def conclude(rows: list[dict]) -> str:
 
 
 def _is_raised(row: dict, naive: dict) -> bool:
-    """Whether more goals ended in a crash than under uniform goals, beyond chance: their intervals lie apart."""
+    """Whether more goals ended in a crash than under uniform goals, beyond chance: their intervals do not overlap."""
     (_, highest), (lowest, _) = (wilson(each["crash_rate"], each["interactions"]) for each in (naive, row))
     return bool(lowest > highest)
 
@@ -122,7 +122,7 @@ def wilson(share: Any, count: Any) -> tuple[Any, Any]:
 
 
 def risk_name(afraid: FearSelector) -> str:
-    """What the numbers in (0, 1) are called that a fear network's calibration makes of its scores."""
+    """Name of the numbers in (0, 1) that a fear network's calibration makes of its scores."""
     return "predicted crash probability" if afraid.is_calibrated else "fear (no probability)"
 
 
@@ -136,6 +136,6 @@ def _is_missing(value: Any) -> bool:
 
 
 def known(value: Any, spell: Callable[[Any], str] | None = None) -> str:
-    """A value as it is spelled, by default whole numbers with all digits and others with three; ``-`` for none."""
+    """A value as ``spell`` writes it, by default whole numbers with all digits, others with three; ``-`` for none."""
     spell = spell or ("{:,d}".format if isinstance(value, int) else number)
     return "-" if _is_missing(value) else spell(value)

@@ -1,4 +1,4 @@
-"""What the first minutes on a GPU are for: stages, each of which finds out one thing and says it as JSON types.
+"""What the first minutes on a GPU are for: stages, each of which finds out one thing and reports it as JSON types.
 
 ``python -m deimos.app.gpu_stages NAME DEVICE FILE`` runs one and writes what it found; ``deimos doctor --gpu`` runs
 all, each in such a process, since a kernel that fails takes its process with it. On a CPU the same stages run at
@@ -55,15 +55,15 @@ class Sizes:
     worlds: int
     """Particles."""
     iterations: int
-    """Of a training that is looked at."""
+    """Iterations of the training that is examined."""
     scales: tuple[int, ...]
     """Numbers of particles whose speed is compared."""
     robots: int
-    """On flat ground."""
+    """Robots on flat ground."""
     rough: int
     """Robots on rough ground."""
     steps: int
-    """Of robots under random actions."""
+    """Steps of robots under random actions."""
 
 
 FULL = Sizes(worlds=2000, iterations=84, scales=(2_000, 16_000, 65_000, 262_000), robots=4096, rough=1024, steps=200)
@@ -179,7 +179,7 @@ def _play_particles(device: torch.device, worlds: int) -> dict[str, list[Tensor]
 
 
 def learning(device: torch.device, sizes: Sizes) -> dict[str, Any]:
-    """Training under Uniform and the Director: curves to lay beside a CPU's, speed, where time goes."""
+    """Training under Uniform and the Director: curves to compare with a CPU's, speed, where time goes."""
     found: dict[str, Any] = {}
     for name in ("uniform", "p25"):
         trainer = _particles(device, sizes.worlds, name)
@@ -294,7 +294,7 @@ def flat(device: torch.device, sizes: Sizes) -> dict[str, Any]:
 
 
 def _graph_against_eager(device: torch.device) -> dict[str, Any]:
-    """How far robots are apart after some control steps of a graph and of the same launches."""
+    """How far apart robots are after some control steps of a graph and of the same launches."""
     states = []
     for captured in (True, False):
         physics = engines.build("warp", go1.build(), None, 64, device, engines.PhysicsConfig(deterministic=True))
@@ -326,7 +326,7 @@ def _walk_at_random(env: Env, steps: int) -> dict[str, Any]:
 
 
 def rebuilding(device: torch.device, sizes: Sizes) -> dict[str, Any]:
-    """A second environment is captured while the first one is dropped; then, what determinism costs, and gives."""
+    """A second environment is captured while the first one is dropped; then, what determinism costs and gives."""
     config = preset("quad").env
     assert isinstance(config, LocomotionConfig)
     first = config.build(sizes.robots, device, seed=0)
@@ -366,14 +366,14 @@ def _particles(device: torch.device, worlds: int, method: str = "p25") -> Traine
 
 
 def _since(begin: float, device: torch.device) -> float:
-    """Seconds since then, once the device has done all that it was asked to."""
+    """Seconds since ``begin``, once the device has done everything that it was asked to."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter() - begin
 
 
 def _memory(device: torch.device) -> dict[str, int]:
-    """Memory that a GPU has given away, whoever has it [B]."""
+    """Memory of a GPU that is in use by any process [B]."""
     if device.type != "cuda":
         return {}
     free, total = torch.cuda.mem_get_info(device)
@@ -385,7 +385,7 @@ STAGES: dict[str, tuple[Callable[[torch.device, Sizes], dict[str, Any]], float]]
     "learning": (learning, 40.0), "graphs": (graphs, 90.0), "scales": (scales, 40.0), "resuming": (resuming, 30.0),
     "flat": (flat, 180.0), "rebuilding": (rebuilding, 60.0), "rough": (rough, 60.0),
 }  # fmt: skip
-"""By name, in their order: each stage, and how long it may take [s]. Kernels that it compiled are there next time."""
+"""By name, in their order: each stage, and how long it may take [s]. Kernels that it compiled are cached."""
 
 
 def main(name: str, device_name: str, file: Path) -> None:

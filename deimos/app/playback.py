@@ -34,7 +34,7 @@ class PlayOptions:
     frames: Path | None = None
     """Folder for single pictures (.png) instead; must not exist."""
     seconds: float = 10.0
-    """Length of the video [s], positive: simulated seconds, or 50 steps each where the world has no seconds."""
+    """Length of the video [s], positive: simulated seconds, of 50 steps each in worlds without units of time."""
     fps: float = 25.0
     """Pictures per second, positive."""
     width: int = 640
@@ -96,7 +96,7 @@ def _render(env: Env, policy: Policy, afraid: FearSelector | None, options: Play
 
 
 def _risk(env: Env, afraid: FearSelector | None) -> str:
-    """A line that says how likely the goal of world 0 ends in a crash; nothing where nobody knows."""
+    """A line that says how likely the goal of world 0 is to end in a crash; empty without a fear network."""
     if afraid is None:
         return ""
     goal = env.obs[:, env.goal_slice]

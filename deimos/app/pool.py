@@ -1,4 +1,4 @@
-"""``deimos pool``: the network of the attacker ``pooled``, from runs whose policies it shall not attack."""
+"""``deimos pool``: the network of the attacker ``pooled``, from runs whose policies it is not to attack."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SIZE = 480  # [pixels] of either side of each of the two views
 SEEN = 3.2  # distance of the camera, in heights of the base
-DRAWN_BY = "deimos robot check"  # what a picture says of itself
+DRAWN_BY = "deimos robot check"  # the software that a picture names
 COLOURS = {"base": (0.85, 0.2, 0.15, 1.0), "feet": (0.1, 0.6, 0.25, 1.0), "limbs": (0.2, 0.4, 0.8, 1.0)}
 
 
@@ -43,7 +43,7 @@ class CheckOptions:
     engine: Literal["native", "warp"] = "native"
     """What simulates it; warp, mujoco-warp, compiles for a minute or two first."""
     picture: Path | None = None
-    """PNG file for the picture: the robot beside its collision geometry. By default NAME.png here. A picture of an
+    """PNG file for the picture: the robot next to its collision geometry. By default NAME.png here. A picture of an
     earlier check is replaced, another file is not."""
 
 
@@ -56,7 +56,7 @@ class NewOptions:
     held: tuple[str, ...] = ()
     """Joints that are held at zero: of a head, a tail, an arm."""
     out: Path | None = None
-    """The file (.toml), which must lie beside the MJCF. By default the MJCF's name with .toml."""
+    """The file (.toml), which must be next to the MJCF. By default the MJCF's name with .toml."""
     force: bool = False
     """Overwrite what exists."""
 
@@ -69,7 +69,7 @@ def main(arguments: list[str], program: str) -> None:
     }
     try:
         console.dispatch(commands, "Makes a robot from your own MJCF.", arguments, program)
-    except ValueError as error:  # a file that is no robot's
+    except ValueError as error:  # a file that is not a robot's
         raise RunError(str(error)) from error
 
 
@@ -104,7 +104,7 @@ def check(arguments: list[str], program: str) -> None:
 
 
 def _load(options: CheckOptions) -> tuple[Robot, list[str]]:
-    """The robot that is asked for, and what there is to say of its file."""
+    """The robot that is asked for, and notes on its file."""
     path = Path(options.robot)
     if options.held and path.suffix.lower() != ".xml":
         raise RunError("held is for an MJCF; a robot file names the joints that it holds.")
@@ -146,7 +146,7 @@ def _say(robot: Robot, report: Report, notes: list[str]) -> None:
 
 
 def _check_picture(path: Path) -> None:
-    """Raise ``RunError`` unless a picture can be written there: where nothing is, or one of an earlier check."""
+    """Raise ``RunError`` unless a picture can be written there: to a new file, or over one of an earlier check."""
     from PIL import Image
 
     if path.suffix.lower() != ".png":
@@ -157,7 +157,7 @@ def _check_picture(path: Path) -> None:
     with contextlib.suppress(Exception), Image.open(path) as found:  # a foreign file may raise anything
         if found.info.get("Software") == DRAWN_BY:
             return
-    raise RunError(f"{path} exists and is not overwritten, for it is no picture of a check; choose another --picture.")
+    raise RunError(f"{path} exists and is not overwritten: it is not a picture of a check; choose another --picture.")
 
 
 def _draw(path: Path, robot: Robot, report: Report) -> None:
@@ -184,7 +184,7 @@ def _draw(path: Path, robot: Robot, report: Report) -> None:
 
 
 def _colour(model: "mujoco.MjModel", robot: Robot) -> None:
-    """Paint what collides by what it counts as."""
+    """Colour what collides by what it counts as."""
     for kind, parts in (("base", robot.parts[:1]), ("feet", robot.parts[1:5]), ("limbs", robot.parts[5:])):
         for name in itertools.chain.from_iterable(parts):
             model.geom_rgba[model.geom(name).id] = COLOURS[kind]

@@ -16,7 +16,7 @@ def main(arguments: list[str], program: str) -> None:
 
 def _run(options: Any, arguments: list[str], program: str) -> None:
     parsed = console.parse(options, arguments, program)
-    if isinstance(parsed, (*LONG, PoolOptions)):  # they simulate, be it to say how long it takes
+    if isinstance(parsed, (*LONG, PoolOptions)):  # they simulate, if only to estimate how long it takes
         console.quiet_warp()
     if isinstance(parsed, LONG):
         with console.stop_on_interrupt() as stopped, console.progress("study") as report:

@@ -39,7 +39,7 @@ class Outputs:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TileOptions(Outputs):
-    """What a single tile has besides the parameters of its shape."""
+    """Options of a single tile besides the parameters of its shape."""
 
     difficulty: float = 0.5
     """From 0, the easiest, to 1."""
@@ -53,7 +53,7 @@ class TileOptions(Outputs):
     """Highest step that is allowed [m]."""
 
     def __post_init__(self) -> None:
-        """Leave the checks to the shape and the grid that are made of it."""
+        """Leave the checks to the shape and the grid that are made from it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -217,13 +217,13 @@ def _make(grid: Grid, outputs: Outputs, title: str) -> None:
 
 
 def _columns(grid: Grid) -> str:
-    """How many columns every shape has got: with few of them, a small share is none."""
+    """How many columns every shape gets: with few of them, a small share may be none."""
     counts = Counter(map(catalog.name_of, grid.column_shapes))
     return ", ".join(f"{counts[name]} {name}" for name in dict.fromkeys(catalog.name_of(p.shape) for p in grid.shapes))
 
 
 def import_terrain(arguments: list[str], program: str) -> None:
-    """Make a terrain of a file of another program."""
+    """Make a terrain from another program's file."""
     options: ImportOptions = console.parse(ImportOptions, arguments, program)
     if not (options.out or options.mjcf or options.preview):
         options = dataclasses.replace(options, out=(Path(f"{options.file.stem}.npz"),))
@@ -256,7 +256,7 @@ def _write(
 
 
 def _measure(terrain: Terrain, mesh: Mesh) -> dict[str, str]:
-    """What is to be said of any terrain."""
+    """The facts to report about any terrain."""
     low, high = float(terrain.heights.min()) + 0.0, float(terrain.heights.max()) + 0.0  # no -0
     nx, ny = terrain.heights.shape
     return {

@@ -43,7 +43,7 @@ class ResumeOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FirstOptions:
-    """What decides which other options there are."""
+    """The options that decide which others there are."""
 
     preset: str | None = None
     """Name of a ready-made configuration to start from; the other options change it."""
@@ -58,7 +58,7 @@ class FirstOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FolderOptions(TrainConfig, FirstOptions):
-    """What people ask for first, ``TrainConfig``, and what belongs to the folder."""
+    """The options of ``FirstOptions`` and ``TrainConfig``, and what belongs to the folder."""
 
     init_from: Path | None = None
     """Start with the networks of the run in this folder."""
@@ -116,7 +116,7 @@ def _fit(trainer: Trainer, folder: RunFolder) -> None:
 
 
 def _finish(trainer: Trainer, folder: RunFolder) -> None:
-    """Evaluate, draw and say where everything is."""
+    """Evaluate, draw and print where everything is."""
     config = trainer.config
     total = sum(trainer.seconds.values())
     if trainer.env.device.type == "cpu" and total > 0:  # a GPU works on while the host counts
@@ -166,12 +166,12 @@ def _start_from(first: FirstOptions, arguments: list[str]) -> TrainConfig:
     if first.branch_from is None:
         return _preset(first.preset, arguments)
     if first.preset is not None:
-        raise RunError("--preset and --branch-from cannot be combined; the run has settings of its own.")
+        raise RunError("--preset and --branch-from cannot be combined; the run has its own settings.")
     return branch_config(training.read_config(RunFolder.open(first.branch_from)))
 
 
 def _preset(name: str | None, arguments: list[str]) -> TrainConfig:
-    """What the options start from: the preset of a name, or that of the environment."""
+    """What the options start from: the preset of this name, or that of the environment."""
     env = next((argument.removeprefix("env:") for argument in arguments if argument.startswith("env:")), None)
     name = name or env or "particle"
     try:
@@ -191,6 +191,6 @@ def _check_names(arguments: list[str]) -> None:
         known = {f"{kind}:{name.replace('_', '-')}": name for name in [*none, *plugins.names(package)]}
         for argument in arguments:
             if argument.startswith(f"{kind}:") and argument.replace("_", "-") not in known:
-                raise RunError(f"There is no '{argument}'; there are: {', '.join(known)}.")
+                raise RunError(f"Unknown argument '{argument}'; choose from: {', '.join(known)}.")
             if (name := known.get(argument.replace("_", "-"), "none")) != "none":
-                plugins.load(package, name)  # says what is wrong with a broken one
+                plugins.load(package, name)  # reports what is wrong with a broken one

@@ -1,4 +1,4 @@
-"""``deimos view``: a policy at work in the browser, live; also from beside a training that is still going on."""
+"""``deimos view``: a policy at work in the browser, live; even while its training is still running."""
 
 import itertools
 import sys
@@ -35,8 +35,8 @@ SIDE_OF_MAP = 0.3  # of a picture's height, in its corner
 class ViewOptions:
     """Watch the policy of a run in the browser, and drive it; the page is served on 127.0.0.1 alone.
 
-    The panel has a slider for every component of the goal, pause, step and reset, and a map of how likely each goal
-    ends in a crash, by the run's own fear network. Whenever the run writes a checkpoint, it is loaded.
+    The panel has a slider for every component of the goal, pause, step and reset, and a map of how likely each goal is
+    to end in a crash, by the run's own fear network. Whenever the run writes a checkpoint, it is loaded.
     """
 
     run: tyro.conf.Positional[Path]
@@ -70,7 +70,7 @@ class ViewOptions:
     """Video to write meanwhile: .mp4, .mkv, .mov, .webm, .gif or .webp; an existing one is replaced. Pauses are left
     out."""
     seconds: float | None = None
-    """End after so many simulated seconds, or 50 steps each where the world has none; by default it runs until
+    """End after this many simulated seconds, of 50 steps each in worlds without units of time; by default it runs until
     stopped."""
     fps: float = 25.0
     """Changes of the panel, and pictures of the video, per second, positive."""
@@ -108,10 +108,10 @@ def main(arguments: list[str], program: str) -> None:
     if options.goals not in (*session.names, *options.attackers):
         possible = sorted({*session.names[:-1], *attacker_names()})
         raise RunError(
-            f"There is no '{options.goals}' for --goals here; there are: {', '.join(session.names[:-1])}, and with "
+            f"Unknown value '{options.goals}' for --goals; choose from: {', '.join(session.names[:-1])}, and with "
             f"--attackers: {', '.join(possible)}."
         )
-    with console.progress("attackers learn") as report:  # for minutes: all that can be refused has been
+    with console.progress("attackers learn") as report:  # takes minutes, so everything has been checked before
         attacks, afraid = prepare(run, options.attackers, options.attacker_worlds, report, options.pool)
     session.add_attackers(attacks, afraid)
     session.choose(options.goals)
@@ -132,7 +132,7 @@ def watch(session: Session, options: ViewOptions) -> None:
             print(f"There is no fear network for a map: {advice}.", file=sys.stderr)
         try:
             simulate(session, scene, panel, handle, write, fps=options.fps, seconds=options.seconds)
-        except KeyboardInterrupt as interrupt:  # it is how one leaves; a video is kept
+        except KeyboardInterrupt as interrupt:  # this is how users leave; a video is kept
             left = interrupt
     if options.record:
         print(options.record)
@@ -151,9 +151,9 @@ def simulate(
     Args:
         session: What runs.
         scene: What is shown of it.
-        panel: What stands beside it.
+        panel: The panel next to it.
         handle: The viewer, from ``serve``.
-        write: Takes every moment that the panel shows, unless it stands still.
+        write: Takes every moment that the panel shows, unless it is paused.
         fps: Moments per second, positive.
         seconds: Duration, positive, in the seconds of the simulation; ``None`` for no end.
     """
@@ -220,7 +220,7 @@ def _recorder(session: Session, scene: Scene, options: ViewOptions) -> Iterator[
 
 
 def caption(moment: Moment) -> str:
-    """What stands in the corner of a picture: the time, who chooses the goals, the goal and its risk."""
+    """The text in the corner of a picture: the time, who chooses the goals, the goal and its risk."""
     goal = "  ".join(f"{value + 0.0:+.2f}" for value in np.round(moment.goal, 2))
     lines = [moment.text[0], f"goals: {moment.current}   {goal}", *moment.text[2:]]
     if moment.risk is not None:

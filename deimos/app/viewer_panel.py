@@ -1,4 +1,4 @@
-"""What stands beside the picture in the browser: the map of fear, the goals, and what a person can ask for."""
+"""The panel next to the picture in the browser: the map of fear, the goals, and what a user can ask for."""
 
 import math
 import queue
@@ -22,7 +22,7 @@ WIDTH = 330  # [pixels] of the panel
 MAP = 250  # [pixels] along a side of the map
 WHITE, ORANGE, CYAN = (1.0, 1.0, 1.0, 1.0), (1.0, 0.6, 0.0, 1.0), (0.3, 1.0, 1.0, 1.0)
 Command = Callable[[Session], object]
-"""What a person asks of a session."""
+"""What a user asks of a session."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Moment:
     """What a panel and its picture show of one moment."""
 
     text: tuple[str, ...]
-    """Lines that say where the session is."""
+    """Lines on the state of the session."""
     names: list[str]
     """Who can choose the goals."""
     current: str
-    """Who does."""
+    """Who chooses them now."""
     world: int
     """Global number of the world."""
     paused: bool
-    """Whether it stands still."""
+    """Whether it is paused."""
     components: list[GoalComponent]
     """What the goal consists of."""
     low: list[float]
@@ -54,7 +54,7 @@ class Moment:
     risk: float | None
     """Predicted probability that asking for the active goal now ends in a crash, in (0, 1)."""
     next_risk: float | None
-    """The same of the next goal."""
+    """The same for the next goal."""
     fear: FearMap | None
     """The map of fear."""
     axes: tuple[int, int]
@@ -84,7 +84,7 @@ class Moment:
 
 
 class Panel:
-    """Draws what it was shown last, and keeps what a person asks for.
+    """Draws what it was last shown, and keeps what a user asks for.
 
     ``show``, ``commands`` and ``wait`` belong to the thread that simulates, the rest to that of the viewer.
 
@@ -123,7 +123,7 @@ class Panel:
         time.sleep(seconds)
 
     def place_camera(self, viewer: Any) -> None:
-        """Look at the robot, or at the whole box; a person moves the camera from there."""
+        """Look at the robot, or at the whole box; the user moves the camera from there."""
         import mujoco
         from mujoco.studio import ux
 
@@ -187,7 +187,7 @@ class Panel:
             _, self.scene.has_tiles = imgui.Checkbox("tiles of fear", self.scene.has_tiles)
 
     def _draw_goal(self, imgui: Any, shown: Moment) -> None:
-        """A slider per component of the goal: to move one is to choose by hand."""
+        """A slider per component of the goal: moving one chooses by hand."""
         imgui.SeparatorText("goal: move a slider to choose by hand")
         imgui.PushItemWidth(150)
         goal, is_moved = list(shown.goal), False
@@ -219,15 +219,12 @@ class Panel:
         imgui.Image(self._texture, imgui.Vec2(MAP, MAP))
         imgui.SetCursorScreenPos(corner)
         imgui.InvisibleButton("map", imgui.Vec2(MAP, MAP))  # else a click would move the panel
-        lists, low, size = (
-            imgui.GetWindowDrawList(),
-            fear.low,
-            [b - a for a, b in zip(fear.low, fear.high, strict=True)],
-        )
         for goal, colour, radius in ((shown.next_goal, CYAN, 4.0), (shown.goal, WHITE, 6.0)):
-            share = [(goal[axis] - low[k]) / size[k] for k, axis in enumerate(fear.axes)]
-            middle = imgui.Vec2(corner.x + MAP * share[0], corner.y + MAP * (1.0 - share[1]))
-            lists.AddCircle(middle, radius, imgui.ColorConvertFloat4ToU32(imgui.Vec4(*colour)), 0, 2.5)
+            right, up = fear.shares(goal)
+            middle = imgui.Vec2(corner.x + MAP * right, corner.y + MAP * (1.0 - up))
+            imgui.GetWindowDrawList().AddCircle(
+                middle, radius, imgui.ColorConvertFloat4ToU32(imgui.Vec4(*colour)), 0, 2.5
+            )
         if imgui.IsItemActive():
             mouse, goal = imgui.GetMousePos(), list(shown.goal)
             place = fear.at((mouse.x - corner.x) / MAP, 1.0 - (mouse.y - corner.y) / MAP)

@@ -1,4 +1,4 @@
-"""What a viewer shows of a session: a model and data of MuJoCo's, and shapes that are drawn on top of them."""
+"""What a viewer shows of a session: a MuJoCo model with its data, and shapes that are drawn on top."""
 
 import abc
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ def palette() -> np.ndarray:
 
 
 def shades(fear: FearMap) -> np.ndarray:
-    """Where the colour of each point of a map stands in the palette, in [0, 255], int64, shape (SIDE, SIDE).
+    """Place in the palette of the colour of each point of a map, in [0, 255], int64, shape (SIDE, SIDE).
 
     The colours span the map's own probabilities: those of a safe policy differ by little, and by place.
     """
@@ -51,9 +51,9 @@ class Scene(abc.ABC):
     body: int
     """The body that a camera may follow; 0 where nothing is to be followed."""
     is_flat: bool = False
-    """Whether it is a robot on flat ground, where tiles of fear can lie."""
+    """Whether it is a robot on flat ground, which can have tiles of fear."""
     has_tiles: bool = True
-    """Whether tiles of fear lie on the ground around it."""
+    """Whether there are tiles of fear on the ground around it."""
 
     @abc.abstractmethod
     def update(self) -> None:
@@ -81,7 +81,7 @@ class RobotScene(Scene):
     """The first world of an environment with a ``scene``, with its goal and, on flat ground, tiles of fear.
 
     Args:
-        session: Where it lives.
+        session: The session.
     """
 
     distance, elevation = 1.8, -18.0
@@ -137,7 +137,7 @@ class BoxScene(Scene):
     """Particles in their box, by the ``sketch`` of every world: their velocities, their goals, where episodes ended.
 
     Args:
-        session: Where they live.
+        session: The session.
     """
 
     distance, elevation, body = 4.8, -20.0, 0
@@ -241,7 +241,7 @@ def line(
 
 
 def _box(particles: int) -> Any:
-    """The model of a box of half side 1 with particles in it, as a specification of MuJoCo's."""
+    """The model of a box of half side 1 with particles in it, as a MuJoCo specification."""
     import mujoco
 
     spec = mujoco.MjSpec()

@@ -1,4 +1,4 @@
-"""A policy at work in a few worlds, steered by a person: who chooses its goals, pause, step, reset, new checkpoints."""
+"""A policy at work in a few worlds, steered by a user: who chooses its goals, pause, step, reset, new checkpoints."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +24,7 @@ from deimos.run.shield import stored_guard
 from deimos.sim.env import Env
 
 UNIFORM, BY_HAND = "uniform", "by hand"
-EXTENT = 512  # goals that tell how far goals reach where they fill no box
+EXTENT = 512  # goals that show how far goals reach where they do not fill a box
 SIDE = 21  # points of the map of fear along each of its axes
 WATCHED = ("policy.pt", "checkpoint.pt")  # written one after the other, whole
 
@@ -51,15 +51,21 @@ class FearMap:
     def at(self, right: float, up: float) -> tuple[float, float]:
         """The two components at a place: how far right and up it is, as shares of the sides; 0 and 1 are the ends.
 
-        What is beyond the map has those of its edge: who drags the mouse that far asks for no goal that is not on it.
+        What is beyond the map has those of its edge: dragging the mouse that far asks for no goal outside it.
         """
         shares = zip(self.low, self.high, (right, up), strict=True)
         first, second = (low + (high - low) * min(max(share, 0.0), 1.0) for low, high, share in shares)
         return first, second
 
+    def shares(self, goal: Sequence[float]) -> tuple[float, float]:
+        """The place of a goal, as in ``at``; the middle along an axis without extent, such as a speed of always 0."""
+        ends = zip(self.axes, self.low, self.high, strict=True)
+        right, up = ((goal[axis] - low) / (high - low) if high > low else 0.5 for axis, low, high in ends)
+        return right, up
+
 
 class Steered(GoalSelector):
-    """Whoever of some selectors is asked for at the moment, or a person's own goal.
+    """The one of some selectors that is chosen at the moment, or a user's own goal.
 
     Args:
         choices: The selectors, by name.
@@ -69,7 +75,7 @@ class Steered(GoalSelector):
         self.choices = dict(choices)
         self.current = UNIFORM
         self.own: Tensor | None = None
-        """The person's goal as the policy sees it, shape (goal_dim,)."""
+        """The user's goal as the policy sees it, shape (goal_dim,)."""
 
     @property
     def num_candidates(self) -> int:  # type: ignore[override]
@@ -89,19 +95,19 @@ class Steered(GoalSelector):
 
 
 class Session:
-    """Worlds in which a policy acts, the first of which is looked at.
+    """Worlds in which a policy acts, the first of which is watched.
 
     Args:
-        run: Whose policy it is.
+        run: The run whose policy it is.
         worlds: How many, at least 1.
         seed: Seed of the worlds and their goals.
         world: Global number of the first.
         attacks: Attackers that are ready, by name; see ``prepare``.
-        afraid: Whose fear is shown where the run itself has no fear network.
+        afraid: Makes the selector whose fear is shown if the run itself has no fear network.
         shield: What becomes of goals that the run's shield refuses; ``None`` for no shield.
 
     Raises:
-        RunError: If the policy, the worlds or the shield cannot be had.
+        RunError: If the policy, the worlds or the shield cannot be loaded.
     """
 
     def __init__(
@@ -116,13 +122,13 @@ class Session:
         self.axes = (0, 1)
         self.crashes = self.steps = self.episodes = 0
         self.restarts = 0
-        """How often ``reset`` and ``go_to`` have begun everything anew."""
+        """How often ``reset`` and ``go_to`` have restarted everything."""
         self.goals = Steered({})
         self._build(world)
         self._load()
 
     def _build(self, world: int) -> None:
-        """Make the worlds, the first of a global number."""
+        """Make the worlds; ``world`` is the global number of the first."""
         self.world = world
         self.env = self._run.build(self._worlds, self._seed, world)
         self.components = goal_components(self.env.layout, self.env.goal_groups, self.env.goal_group_names)
@@ -131,7 +137,7 @@ class Session:
         self._extent: tuple[Tensor, Tensor] | None = None
 
     def _load(self) -> None:
-        """Load the policy and who chose the goals as they are now; the worlds go on."""
+        """Load the policy and the selector of the run as they are now; the worlds continue."""
         self._stamp = self._stamps()
         self._policy, self.iteration = self._run.policy(self.env), self._run.iteration()
         self._trained, self._guard = self._run.selector(self.env), None
@@ -141,7 +147,7 @@ class Session:
         self._join()
 
     def _join(self) -> None:
-        """Let those who can choose goals serve the worlds."""
+        """Let the selectors that can choose goals serve the worlds."""
         current, own = self.goals.current, self.goals.own
         self.fear = learnt_fear(self._trained) or (self._fallback(self.env) if self._fallback else None)
         choices = {UNIFORM: uniform_goals(self.env)}
@@ -160,7 +166,7 @@ class Session:
         self._join()
 
     def _stamps(self) -> list[tuple[int, int]]:
-        """What tells whether the files of a run are those that were loaded."""
+        """Marks that show whether the files of a run are those that were loaded."""
         try:
             found = [(self._run.folder.path / name).stat() for name in WATCHED]
         except OSError:
@@ -168,7 +174,7 @@ class Session:
         return [(file.st_mtime_ns, file.st_ino) for file in found]
 
     def reload(self) -> bool:
-        """Load the policy and the fear network again if the run has written new ones; gives whether it has loaded them.
+        """Load the policy and the fear network again if the run has written new ones; returns whether it has.
 
         A shield is made for one policy and one fear network, so with a shield those that were loaded stay.
         """
@@ -192,14 +198,14 @@ class Session:
 
     @property
     def seconds_per_step(self) -> float:
-        """Duration of a step as it is shown [s]: 1/50 where the world has no seconds."""
+        """Duration of a step as it is shown [s]: 1/50 in worlds without units of time."""
         return seconds_per_step(self.env)
 
     def choose(self, name: str) -> None:
-        """Have somebody else choose the goals, from the next one on; by hand it begins with the active one.
+        """Change who chooses the goals, from the next one on; by hand it begins with the active one.
 
         Raises:
-            ValueError: If there is nobody of this name.
+            ValueError: If the name is not one of ``names``.
         """
         check_choice("goals", name, self.names)
         if name == BY_HAND and self.goals.current != BY_HAND:
@@ -227,12 +233,12 @@ class Session:
         self._loop.advance(step)
 
     def reset(self) -> None:
-        """Begin new episodes in all worlds, and count crashes anew."""
+        """Begin new episodes in all worlds, and reset the counts."""
         self._loop.start()
         self._count_anew()
 
     def go_to(self, world: int) -> None:
-        """Look at the world of another global number, from its beginning.
+        """Watch the world with another global number, from its beginning.
 
         Raises:
             ValueError: If the number is negative.
@@ -285,7 +291,7 @@ class Session:
 
     @torch.no_grad()
     def _risks(self, candidates: Tensor) -> Tensor | None:
-        """The same of many goals as the policy sees them, shape (1, n, goal_dim); gives shape (1, n)."""
+        """The same for many goals as the policy sees them, shape (1, n, goal_dim); returns shape (1, n)."""
         if self.fear is None:
             return None
         obs = self.env.obs[self._rows]
@@ -326,15 +332,15 @@ def prepare(
         run: The run.
         names: The attackers.
         worlds: Worlds that they learn in.
-        report: Told the attacker and the share of its steps that are done.
+        report: Called with the attacker and the share of its steps that are done.
         pool: The file of the attacker ``pooled``; ``None`` for the run's own.
 
     Returns:
-        The attackers, and what makes a selector with the fear network that the first of them has learnt, with the
-        crash rate that it has met; ``None`` where none has.
+        The attackers, and a function that makes a selector with the first fear network that one of them has learnt, and
+        with the crash rate that it has met; ``None`` if none has learnt one.
 
     Raises:
-        RunError: If an attacker is unknown, lacks what it needs, or is too slow to be watched.
+        RunError: If an attacker is unknown, lacks what it needs, or is too slow to watch.
     """
     try:
         setting = replace(run.config.eval, attackers=tuple(names), worlds=worlds, pool=pool or run.config.eval.pool)
@@ -344,7 +350,7 @@ def prepare(
     require_pool(setting)
     slow = [name for name in names if attacker(name).few_worlds]
     if slow:
-        raise RunError(f"{slow[0]} tries every goal in clones of the world, which is too slow to be watched.")
+        raise RunError(f"{slow[0]} tries every goal in clones of the world, which is too slow to watch.")
     env = run.build(1, 0, 0)
     policy = run.policy(env)
     target = make_target(policy.scaled, run.config.env, setting, env.device)

@@ -1,7 +1,7 @@
-"""The page in the browser: MuJoCo's web viewer, on the loopback address alone, with a panel of our own.
+"""The page in the browser: MuJoCo's web viewer, on the loopback address alone, with our own panel.
 
-The viewer runs in a thread of its own and draws from what it is shown last; what a person asks for waits in a queue
-until the thread that simulates takes it.
+The viewer runs in its own thread and draws what it was last shown; what a user asks for waits in a queue until the
+thread that simulates takes it.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 """The only address that the page is served on."""
-HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]+)?")  # whom a browser may ask for; a tunnel has a port of its own
+HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]+)?")  # that a browser may ask for; a tunnel has its own port
 
 
 def check_port(port: int) -> None:
@@ -41,7 +41,7 @@ def serve(panel: Panel, port: int) -> "Iterator[tuple[ViewerHandle, int]]":
     """Serve the page of a panel and its scene; gives the handle that takes states, and the port.
 
     Args:
-        panel: What is beside the picture, and what the picture shows.
+        panel: What is next to the picture, and what the picture shows.
         port: Where, in [0, 65535]; 0 takes the first free one from 8080 on.
 
     Raises:
@@ -54,7 +54,7 @@ def serve(panel: Panel, port: int) -> "Iterator[tuple[ViewerHandle, int]]":
     made: list[Any] = []
     config = viewer_protocol.ViewerConfig(title="Deimos", gfx="web", http_port=port)
     started = partial(_run, config=config, plugins=[_plugin(panel)], made=made)
-    with contextlib.redirect_stdout(io.StringIO()):  # what it says itself; the command says where the page is
+    with contextlib.redirect_stdout(io.StringIO()):  # its own messages; the command prints where the page is
         handle = launch_thread.launch_thread(started)
         try:
             while not made and handle.is_running():
@@ -69,7 +69,7 @@ def serve(panel: Panel, port: int) -> "Iterator[tuple[ViewerHandle, int]]":
 
 
 def _await_answer(port: int, panel: Panel, handle: "ViewerHandle") -> None:
-    """Wait until somebody listens on a port that is bound already."""
+    """Wait until something listens on a port that is bound already."""
     while handle.is_running():
         with contextlib.suppress(ConnectionRefusedError), socket.create_connection((HOST, port)):
             return
@@ -83,20 +83,20 @@ def _run(endpoint: Any, config: Any, plugins: list[Any], made: list[Any]) -> Non
     viewer = _loopback_viewer()(config, endpoint, plugins=plugins)
     made.append(viewer)
     viewer_protocol.run_viewer_loop(viewer)
-    # Who holds whom in a circle is undone, so that the viewer is freed here, in its own thread: the garbage collector
-    # would do it in any other, beside another viewer's graphics, and the process would crash.
+    # Reference cycles are broken, so that the viewer is freed here, in its own thread: the garbage collector would do
+    # it in any other, next to another viewer's graphics, and the process would crash.
     viewer.plugins = None
     for plugin in plugins:
         plugin.viewer = None
 
 
 def is_own(path: str, hosts: list[str], origins: list[str]) -> bool:
-    """Whether a request is one of the viewer's own page, or of a program that is no browser.
+    """Whether a request is from the viewer's own page, or from a program that is not a browser.
 
-    A browser lets every page that is open in it send requests to this machine, and WebSockets are not kept from reading
-    the answers; it says in ``Origin`` whose page it is. A page whose name is suddenly resolved to this machine (DNS
-    rebinding) is of the same origin, but its name is in ``Host``. Models that are dropped on the page are of no use
-    here, and the server would keep them in memory without a limit.
+    A browser lets every page that is open in it send requests to this machine, and does not keep WebSockets from
+    reading the answers; it says in ``Origin`` whose page it is. A page whose name is suddenly resolved to this machine
+    (DNS rebinding) is of the same origin, but its name is in ``Host``. Models that are dropped on the page are of no
+    use here, and the server would keep them in memory without a limit.
 
     Args:
         path: What is asked for, with its query.
@@ -109,7 +109,7 @@ def is_own(path: str, hosts: list[str], origins: list[str]) -> bool:
 
 
 def _guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
-    """The ``serve`` of websockets that MuJoCo calls, with 403 for whatever is not its own page's."""
+    """The ``serve`` of websockets that MuJoCo calls, with 403 for requests that are not from its own page."""
 
     def guarded(*arguments: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
@@ -140,7 +140,7 @@ def _loopback_viewer() -> Any:
 
         @_host.setter
         def _host(self, value: str) -> None:
-            """The constructor asks for another one."""
+            """Ignore the constructor, which asks for another one."""
 
         @property
         def port(self) -> int:
@@ -148,11 +148,11 @@ def _loopback_viewer() -> Any:
             return self._http_port
 
         def _start_server(self) -> None:
-            """Not yet: MuJoCo 4.0.0 has crashed where a page connected before there was a model."""
+            """Wait: MuJoCo 4.0.0 has crashed when a page connected before there was a model."""
             self._web_server = None
 
         def _update_model(self) -> None:
-            """Serve the model that has come."""
+            """Serve the new model."""
             if self._web_server is None:
                 super()._start_server()
             else:
@@ -162,7 +162,7 @@ def _loopback_viewer() -> Any:
 
 
 def _plugin(panel: Panel) -> Any:
-    """What hands the events of the viewer to a panel; a class of its own since MuJoCo is imported here at last."""
+    """Hands the events of the viewer to a panel; the class is made here since MuJoCo is imported only here."""
     from mujoco.studio import messages, plugin
 
     class Bridge(plugin.ViewerPlugin):

@@ -14,7 +14,8 @@ from deimos.checks import check_at_least
 from deimos.goals import given
 from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore, window_between
-from deimos.goals.director_checks import check_candidates, check_options, placed, refuse_unsound, settings, unpacked
+from deimos.goals.director_checks import check_candidates, check_options, placed, settings, unpacked
+from deimos.goals.faults import refuse_not_finite, refuse_unsound
 from deimos.goals.fear_selector import FearEstimate, fear_selector
 from deimos.goals.given import A, Array, Assignment, Bound, Candidates, GoalBox, Inputs, Rows
 from deimos.goals.horizons import Horizons
@@ -325,7 +326,7 @@ class GoalDirector:
         states, goals = inputs.states(state, count), inputs.goals(goal, count)
         new_goals = inputs.goals(new_goal, count, "new_goal")
         for name, numbers in (("state", states), ("goal", goals), ("new_goal", new_goals)):
-            given.refuse_not_finite(name, numbers, what="row")
+            refuse_not_finite(name, numbers, what="row")
         rows = torch.arange(count, device=inputs.device)
         lasts = self._horizons.steps(self.max_horizon if horizon is None else horizon, rows, inputs)
         return afraid.estimate(self._horizons.behind(states, lasts), goals, new_goals)
@@ -426,7 +427,7 @@ class GoalDirector:
             candidates = candidates(given.like(rows, model))
         offered = self._expected(rows, None, None, None).candidates(candidates, len(rows))
         but = None if where is None else ~where
-        given.refuse_not_finite("candidates", offered, rows, but, faults=clocks.faults)
+        refuse_unsound("candidates", offered, rows, but, clocks.faults)
         if self._box is not None:
             self._box.check(offered, rows, share, but, clocks.faults)
         return offered

@@ -10,10 +10,8 @@ from torch import Tensor
 
 from deimos.checks import check_at_least, check_choice, check_is, check_seed, one_line
 from deimos.goals import given
-from deimos.goals.faults import Faults
 from deimos.goals.given import Bound, Candidates, Inputs
 from deimos.goals.selector import SelectorConfig
-from deimos.nn.stateful import LARGEST, is_sound
 
 PLAIN = (bool, int, float, str, type(None))
 
@@ -128,31 +126,3 @@ def check_candidates(candidates: Candidates, count: int, inputs: Inputs, drawn: 
         raise ValueError("candidates must be given where GoalDirector was made without a goal_box, got None.")
     if isinstance(candidates, Tensor):
         given.tensor("candidates", candidates, inputs.device)
-
-
-def refuse_unsound(
-    name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None, faults: Faults | None = None
-) -> None:
-    """Raise ``ValueError`` where a number is not finite, or so large that what is learnt from it would not be.
-
-    Args:
-        name: What they are.
-        numbers: Shape (m, n), m and n at least 1.
-        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
-        but: Rows that do not matter, bool, shape (m,).
-        faults: Where to note what does not fit; ``None`` to refuse it at once.
-    """
-    if faults is not None:
-        bad = ~is_sound(numbers).all(1)
-        text = f"{name} of world {{world}} must be finite and at most {LARGEST:g} in size"
-        faults.note(text, bad if but is None else bad & ~but, rows)
-        return
-    if bool(is_sound(torch.stack(numbers.aminmax())).all()):
-        return
-    given.refuse_not_finite(name, numbers, rows, but)
-    large = ~is_sound(numbers).all(1)
-    large = large if but is None else large & ~but
-    if bool(large.any()):
-        row = int(large.nonzero()[0])
-        world = row if rows is None else int(rows[row])
-        raise ValueError(f"{name} of world {world} must be at most {LARGEST:g} in size, got {numbers[row].tolist()}.")

@@ -188,7 +188,7 @@ class FearSelector(GoalSelector):
             self._age += 1
         else:
             self._say_why(window)
-        share = (int(window.crashed.sum()) + 0.5) / (len(window) + 1.0)  # no crash lately is no certainty
+        share = (int(window.crashed.sum()) + 0.5) / (len(window) + 1.0)  # never certain, even without a recent crash
         self.calibration.set_share(share)
         return row | {"fear/loss": loss, "fear/age": float(self._age) if self.fear.fitted else math.nan}
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from deimos.goals.core import GoalCore
-from deimos.goals.faults import Faults
+from deimos.goals.faults import Faults, refuse_outside_0_and_1, refuse_unsound
 from deimos.goals.interactions import assign
 from deimos.goals.selector import Delegate, GoalSelector, Transitions, with_parts
 from deimos.nn.random import Purpose, uniforms
@@ -151,49 +151,6 @@ def _check_mask(rows: Tensor, num_envs: int) -> None:
         raise ValueError(f"rows must be a mask of the shape {(num_envs,)}, got {tuple(rows.shape)}.")
 
 
-def refuse_not_finite(
-    name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None, what: str = "world",
-    faults: Faults | None = None,
-) -> None:  # fmt: skip
-    """Raise a ``ValueError`` that names the first row of ``numbers`` with one that is not finite.
-
-    Args:
-        name: What they are.
-        numbers: Shape (m, ...).
-        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
-        but: Rows that do not matter, bool, shape (m,).
-        what: What a row is.
-        faults: Where to note what does not fit; ``None`` to refuse it at once.
-    """
-    if faults is None and bool(numbers.sum().isfinite()):  # a sum costs a tenth of looking at every number
-        return
-    bad = ~numbers.flatten(1).isfinite().all(1) if numbers.dim() > 1 else ~numbers.isfinite()
-    if but is not None:
-        bad &= ~but
-    if faults is not None:
-        faults.note(f"{name} of world {{world}} must be finite", bad, rows)
-    elif bool(bad.any()):
-        row = int(bad.nonzero()[0])
-        world = row if rows is None else int(rows[row])
-        raise ValueError(f"{name} of {what} {world} must be finite, got {numbers[row].tolist()}.")
-
-
-def refuse_outside_0_and_1(name: str, numbers: Tensor, faults: Faults | None = None) -> None:
-    """Raise a ``ValueError`` that names the first world with a number outside [0, 1] by more than rounding.
-
-    Args:
-        name: What they are.
-        numbers: Finite, shape (num_envs, ...).
-        faults: Where to note what does not fit; ``None`` to refuse it at once.
-    """
-    outside = (numbers - 0.5).abs() > 0.5 + 1e-5
-    if faults is not None:
-        faults.note(f"{name} of world {{world}} must be in [0, 1]", outside.view(len(outside), -1).any(1))
-    elif bool(outside.any()):
-        world = int(outside.nonzero()[0, 0])
-        raise ValueError(f"{name} of world {world} must be in [0, 1], got {numbers[world].tolist()}.")
-
-
 def like(values: Tensor, model: A) -> A:
     """Values as an array if ``model`` is one, else as a tensor; floats in its dtype, if it has floats."""
     if isinstance(model, Tensor):
@@ -261,11 +218,10 @@ class Inputs:
         met = pursued = None
         if tracking is not None:
             met = floats("tracking", tracking, (self.num_envs, *self.columns), self.device)
-            refuse_not_finite("tracking", met, faults=self.faults)
             refuse_outside_0_and_1("tracking", met, self.faults)
         if executed is not None:
             pursued = self.goals(executed, self.num_envs, "executed")
-            refuse_not_finite("executed", pursued, faults=self.faults)
+            refuse_unsound("executed", pursued, faults=self.faults)
         return crashed, cut_off, met, pursued
 
     def check_candidates(self, value: Candidates, count: int) -> None:

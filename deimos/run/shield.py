@@ -344,7 +344,8 @@ def _goal_scale(env: Env) -> Tensor:
 def _seen_range(env: Env) -> Tensor:
     """Half side of the box of goals, as the policy sees them, shape (goal_dim,); 1 where there is no box."""
     scale = _goal_scale(env)
-    return torch.ones_like(scale) if env.goal_range is None else env.goal_range * scale
+    reach = torch.ones_like(scale) if env.goal_range is None else env.goal_range * scale
+    return reach.masked_fill(reach == 0.0, 1.0)  # where all goals are the same, as at speed 0, any unit will do
 
 
 def shield_run(

@@ -1,7 +1,7 @@
 """The policies of a study in one file, ``policies.zip``, so that a new attacker needs no new training.
 
-It has of every cell ``cell.json``, ``run/config.json``, ``run/policy.pt`` and, where there is one, ``fear.pt``. The
-same files give the same bytes: names are sorted, and there are no times.
+It holds every cell's ``cell.json``, ``run/config.json``, ``run/policy.pt`` and, if there is one, ``fear.pt``. The same
+files give the same bytes: names are sorted, and there are no times.
 """
 
 import re
@@ -17,12 +17,12 @@ from deimos.study.results import SCHEMA, Results
 
 FILE = "policies.zip"
 PARTS = ("cell.json", "run/config.json", "run/policy.pt", FEAR)
-MOST_BYTES = 2**28  # of a part
+MOST_BYTES = 2**28  # in a part
 _NAME = re.compile(rf"(?!\.\.?/)[\w.+-]+/({'|'.join(map(re.escape, PARTS))})")
 
 
 def pack(study: StudyFolder) -> tuple[Path, int]:
-    """Write the policies of a study's finished cells into its archive, beside those that are in it already.
+    """Add the policies of a study's finished cells to its archive.
 
     Returns:
         The archive, and how many policies it holds.
@@ -44,7 +44,7 @@ def pack(study: StudyFolder) -> tuple[Path, int]:
     def write(file: BinaryIO) -> None:
         with zipfile.ZipFile(file, "w") as archive:
             for name in sorted(files):
-                info = zipfile.ZipInfo(name)  # of 1980, wherever and whenever it is written
+                info = zipfile.ZipInfo(name)  # dated 1980, wherever and whenever it is written
                 info.compress_type, info.create_system, info.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
                 archive.writestr(info, files[name], compresslevel=9)
 
@@ -53,9 +53,9 @@ def pack(study: StudyFolder) -> tuple[Path, int]:
 
 
 def unpack(study: StudyFolder) -> int:
-    """Put the policies of a study's archive back where cells lie, with their rows of the study's tables.
+    """Put the policies of a study's archive back into folders of cells, with their rows of the study's tables.
 
-    Cells that are there stay as they are. Returns how many were put back; raises ``RunError`` if the archive is broken.
+    Existing cells stay as they are. Returns how many were put back; raises ``RunError`` if the archive is broken.
     """
     path = study.path / FILE
     if not path.exists():
@@ -76,8 +76,8 @@ def unpack(study: StudyFolder) -> int:
 
 
 def _put_rows(home: Path, tables: Results) -> None:
-    """Make a cell's ``result.json`` of its rows in the tables, so that it is finished."""
-    digits = home.name.rpartition("-")[2]  # the first of its hash
+    """Make a cell's ``result.json`` from its rows in the tables, so that it is finished."""
+    digits = home.name.rpartition("-")[2]  # the first ones of its hash
     rows, curves = ([row for row in part if row["hash"].startswith(digits)] for part in (tables.rows, tables.curves))
     if rows and curves:
         RunFolder(home).write_json("result.json", {"schema": SCHEMA, "rows": rows, "curve": curves[0]})
@@ -92,4 +92,4 @@ def _read(path: Path) -> dict[str, bytes]:
                     raise ValueError(f"it holds {info.filename!r}, {info.file_size} bytes")
             return {name: archive.read(name) for name in archive.namelist()}
     except UNREADABLE as error:
-        raise RunError(f"{path} is no archive of policies, or it is broken ({one_line(error)}).") from error
+        raise RunError(f"{path} is not an archive of policies, or it is broken ({one_line(error)}).") from error

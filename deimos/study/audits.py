@@ -27,7 +27,7 @@ from deimos.sim.env import Env, EnvConfig
 POINTS = 5  # in the last quarter of a training
 BINS = 12  # of either axis of a map
 PLACES, SPAWNS = 64, 16  # worlds in which fear is asked about dangerous and safe places, and their fresh starts
-WORLDS = 200  # that speed is measured in
+WORLDS = 200  # in which speed is measured
 SPEEDS = ("velocity", "linear_velocity")  # what environments call the velocity in their observations
 FILE = "audits.json"
 
@@ -38,7 +38,7 @@ def points(iterations: int) -> list[int]:
 
 
 class Audits:
-    """The audits of one cell, kept in its folder: one that is there is not made again.
+    """The audits of one cell, kept in its folder: an existing one is not made again.
 
     Args:
         home: The cell's folder.
@@ -56,7 +56,7 @@ class Audits:
     @torch_on_one()
     @torch.no_grad()
     def after(self, trainer: Trainer) -> None:
-        """Audit a run where it is time to; it is not touched."""
+        """Audit a run if it is time to; the run does not change."""
         name = str(trainer.iteration)
         if trainer.iteration not in self._points or name in self._found:
             return
@@ -73,7 +73,7 @@ class Audits:
         self._home.write_json(FILE, self._found)
 
     def row(self) -> dict:
-        """The columns ``AUDITS`` of a training curve, but for the speed."""
+        """The columns ``AUDITS`` of a training curve, except the speed."""
         rows = [self._found[str(point)] for point in self._points if str(point) in self._found]
         if not rows:
             return {}
@@ -110,14 +110,14 @@ def _risk(trainer: Trainer) -> float:
 
 
 def goal_map(place: Tensor, chosen: Tensor) -> list[int]:
-    """How often goals were chosen where: counts, rows by the place of a world, columns by that of its goal.
+    """Where goals were chosen, and how often: counts, rows by the place of a world, columns by that of its goal.
 
     Args:
         place: In [-1, 1], shape (n, k); the k axes count alike.
-        chosen: The same of the goals.
+        chosen: The same for the goals.
 
     Returns:
-        BINS x BINS counts, row by row; none of nothing.
+        BINS x BINS counts, row by row; empty without goals.
     """
     if not len(place):
         return []
@@ -131,7 +131,7 @@ def diversity(counts: Sequence[float]) -> float:
 
     Returns:
         The conditional entropy H(goal | place) / log(BINS), in [0, 1]: 1 where goals are uniform, 0 where the place
-        says the goal. NaN of an empty map.
+        determines the goal. NaN for an empty map.
     """
     table = np.reshape(np.asarray(counts, float), (-1, BINS))
     if not table.sum():
@@ -147,7 +147,7 @@ def diversity(counts: Sequence[float]) -> float:
 def speed(run: RunFolder, env_config: EnvConfig, seed: int, device: torch.device) -> float:
     """Mean speed of a run's policy under uniform goals, over 2 T steps, in the units of its observations.
 
-    NaN where the environment shows no velocity.
+    NaN if its observations have no velocity.
     """
     policy = load_policy(run.path, str(device))
     env = env_config.for_evaluation().resolved(device).build(WORLDS, device, seed)

@@ -41,9 +41,9 @@ class _Interrupted(Exception):
 
 
 def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: False) -> bool:
-    """Train and evaluate a cell from wherever it stands, and write its ``result.json``.
+    """Train and evaluate a cell from wherever it is, and write its ``result.json``.
 
-    ``stopped`` is asked now and then; true ends the work early, with everything done so far kept. Returns whether the
+    ``stopped`` is called now and then; true ends the work early, with everything done so far kept. Returns whether the
     cell is finished.
 
     Raises:
@@ -73,10 +73,10 @@ def run(study: StudyFolder, cell: Cell, stopped: Callable[[], bool] = lambda: Fa
 
 
 def _train(home: RunFolder, cell: Cell, device: torch.device, stopped: Callable[[], bool]) -> bool:
-    """Train to the end, with audits on the way, and keep the fear network; returns whether it came there."""
+    """Train to the end, with audits on the way, and keep the fear network; returns whether the end was reached."""
     path = home.path / "run"
     if (path / "checkpoint.pt").exists() and not (path / "config.json").exists():
-        print(f"{path} holds no config.json; the cell is made again.", file=sys.stderr)
+        print(f"{path} holds no config.json; the cell starts again.", file=sys.stderr)
     if (path / "checkpoint.pt").exists() and (path / "config.json").exists():
         trainer, folder = training.resume(path)
     else:
@@ -90,7 +90,7 @@ def _train(home: RunFolder, cell: Cell, device: torch.device, stopped: Callable[
 
 
 def _keep_fear(path: Path, trainer: Trainer) -> None:
-    """Keep the fear network of a selector that has one which has learnt: a file that the attacker ``pooled`` reads."""
+    """Keep the selector's fear network, if it has learnt, in a file that the attacker ``pooled`` reads."""
     afraid = fear_selector(trainer.loop.selector)
     if afraid is not None and afraid.fear.fitted:
         save_fear(path, afraid.fear, trainer.env, {})
@@ -109,7 +109,7 @@ def _finish(study: StudyFolder, cell: Cell, device: torch.device, watch: Callabl
 
 
 def _scales(study: StudyFolder) -> Once:
-    """The scales of scores that a study keeps, of this code."""
+    """The scales of scores that a study keeps for this code."""
     made_by = {"code": code().name}
     return lambda task, compute: study.scale(task | made_by, compute)
 
@@ -142,7 +142,7 @@ def main(arguments: list[str], stopped: Callable[[], bool] = lambda: False) -> i
 
 
 def _listen(stop: threading.Event) -> None:
-    """Set ``stop`` at the first byte of the standard input, and end this process where that ends."""
+    """Set ``stop`` at the first byte of the standard input, and end this process when the input ends."""
     while os.read(0, 1):  # not sys.stdin: a thread that waits in it would hold its lock when Python shuts down
         stop.set()
     os._exit(1)

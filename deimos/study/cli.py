@@ -1,4 +1,4 @@
-"""The commands of ``deimos study``: the options of each, and ``run``, which does what it is for."""
+"""The commands of ``deimos study``: the options of each, and its ``run``."""
 
 import math
 import sys
@@ -46,9 +46,9 @@ class _WorkOptions(_FolderOptions):
     workers: int | None = None
     """Cells at a time, at least 1. By default 1, and with ray as many as its cluster has room for."""
     gpus: float | None = None
-    """GPUs of a cell with ray, at least 0; 0.25 puts four on one. By default 1 for cells whose device is cuda."""
+    """GPUs per cell with ray, at least 0; 0.25 puts four on one. By default 1 for cells whose device is cuda."""
     allow_uncommitted: bool = False
-    """Whether sources may differ from the commit that is checked out; a hash of them then takes its place."""
+    """Whether sources may differ from the commit that is checked out; their hash then takes its place."""
 
     def __post_init__(self) -> None:
         if self.workers is not None:
@@ -62,7 +62,7 @@ class _WorkOptions(_FolderOptions):
         self, study: StudyFolder, stopped: Callable[[], bool], report: Callable[[str, float], None],
         seconds: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:  # fmt: skip
-        """Work on a study until it is finished; see ``RunOptions.run``, and ``Runner`` for what cells take."""
+        """Work on a study until it is finished; see ``RunOptions.run``, and ``Runner`` for ``seconds``."""
         engine: Engine = LocalProcesses(study)
         workers = self.workers or 1
         if self.engine == "ray":
@@ -97,7 +97,7 @@ class RunOptions(_WorkOptions):
     """
 
     file: Path | None = None
-    """The study, in a TOML file (docs/how_to/study.md). By default the one that was begun in the folder."""
+    """The study, as a TOML file (docs/how_to/study.md). By default the one that was begun in the folder."""
     seeds: str | None = None
     """Seeds in place of the file's: a number of them (10), a range (10-19) or a list (0,3,5)."""
     methods: list[str] | None = None
@@ -110,14 +110,14 @@ class RunOptions(_WorkOptions):
     env_steps: int | None = None
     """Steps of every world, in place of the file's."""
     device: str | None = None
-    """Where to simulate and learn, in place of the file's. Part of what fixes a cell's numbers."""
+    """Where to simulate and learn, in place of the file's. A cell's numbers depend on it."""
     threads: int | None = None
-    """CPU threads of every worker, in place of the file's, by default 1. They change no number of a cell, but are part
-    of what names it: keep them the same throughout a study."""
+    """CPU threads of every worker, in place of the file's, by default 1. A cell's numbers do not depend on them, but
+    its name does: keep them the same throughout a study."""
     retry_failed: bool = False
     """Whether to retry cells that have failed."""
     estimate: bool = False
-    """Whether to print what the study would take, and start nothing."""
+    """Whether to print how long the study would take, and start nothing."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -134,11 +134,11 @@ class RunOptions(_WorkOptions):
         """Work on a study until it is finished.
 
         Args:
-            stopped: Asked now and then; true lets the running cells end.
-            report: Told a few times per second where the study stands, and the share of its cells that are done.
+            stopped: Called now and then; true lets the running cells end.
+            report: Called a few times per second with the state of the study and the share of its cells that are done.
 
         Raises:
-            RunError: If the study is not well described or another process works on it, or if a cell has failed; the
+            RunError: If the study's description is wrong or another process works on it, or if a cell has failed; the
                 rest are finished then.
             SystemExit: With 130, if it was stopped before the end.
         """
@@ -164,7 +164,7 @@ class RunOptions(_WorkOptions):
             self._work(study, stopped, report, seconds)
 
     def _add(self, study: StudyFolder, description: dict) -> None:
-        """Add what a file describes to a study, after all that can be wrong with it was checked."""
+        """Add what a file describes to a study, after checking everything that can be wrong with it."""
         train = {name: getattr(self, name) for name in ("num_envs", "env_steps", "device", "threads")}
         cells = plan.expand(
             description, seeds=self.seeds, methods=self.methods, environments=self.environments,
@@ -189,17 +189,17 @@ def _check_committed(allowed: bool) -> None:
     if here.changed and not allowed:
         raise RunError(
             f"{len(here.changed)} source file(s) differ from commit {here.commit} ({here.changed[0]} first), so no "
-            f"commit says what made the rows. Commit them, or let a hash stand for them by --allow-uncommitted."
+            f"commit says what made the rows. Commit them, or use a hash of them with --allow-uncommitted."
         )
     if here.name == here.sources:
-        print(f"No commit says what code this is; a hash of it does: {here.name}.", file=sys.stderr)
+        print(f"No commit identifies this code; a hash does: {here.name}.", file=sys.stderr)
 
 
 def _say_strays(study: StudyFolder) -> None:
     if strays := study.strays():
         print(
             f"{len(strays)} folder(s) in {study.path / 'cells'} hold no cell.json ({strays[0]} first) and are left "
-            f"out; give the study's --file again to make such cells anew.", file=sys.stderr,
+            f"out; give the study's --file again to make such cells again.", file=sys.stderr,
         )  # fmt: skip
 
 
@@ -274,7 +274,7 @@ class CellOptions(_FolderOptions):
         stopped: Callable[[], bool] = lambda: False,
         report: Callable[[str, float], None] = lambda said, share: None,
     ) -> None:
-        """Work on the cell from wherever it stands; one that is finished stays as it is.
+        """Work on the cell from wherever it is; one that is finished stays as it is.
 
         For the arguments see ``RunOptions.run``.
 
@@ -313,9 +313,9 @@ class PoolOptions(_FolderOptions):
         study, device = StudyFolder(self.folder), training.resolve_device(self.device)
         for path, facts in write_pools(study, self.out or self.folder / POOLS, device):
             if facts is None:
-                said = "is there"
+                said = "exists already"
             elif facts["uninformed"]:
-                said = "no crashes, or nothing else: the attacker's goals are uniform"
+                said = "no crashes, or only crashes: the attacker's goals are uniform"
             else:
                 said = f"{facts['adversary_interactions']:,} goals, {facts['adversary_crashes']:,} crashes"
             print(f"{path}: {said}", flush=True)
@@ -347,7 +347,7 @@ class UnpackOptions(_FolderOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ShowOptions(_FolderOptions):
-    """Print where a study stands."""
+    """Print the state of a study."""
 
     def run(self) -> None:
         """Print the medians of a study and what has failed or is open; ``RunError`` if there is no study."""
@@ -387,9 +387,9 @@ class MergeOptions:
     """Add the results of other study folders to the tables of one: their rows and training curves, not their runs."""
 
     folder: tyro.conf.Positional[Path]
-    """The folder that grows."""
+    """The folder to add to."""
     sources: tyro.conf.Positional[list[Path]]
-    """The folders that are read."""
+    """The folders to read."""
 
     def __post_init__(self) -> None:
         if not self.sources:
@@ -400,8 +400,8 @@ class MergeOptions:
         added, present, differing = merge(self.folder, self.sources)
         print(f"{added} rows added, {present} were there already.")
         if differing:
-            print(f"{differing} of those have other numbers in the source; the first ones stay. Cells repeat bit for "
-                  f"bit only on the same kind of device with the same versions.")  # fmt: skip
+            print(f"{differing} of those have different numbers in the source; the first ones stay. Cells repeat bit "
+                  f"for bit only on the same kind of device with the same versions.")  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -435,7 +435,7 @@ COMMANDS: dict[str, Any] = {
     "pack": PackOptions, "unpack": UnpackOptions, "merge": MergeOptions, "export": ExportOptions,
     "report": ReportOptions,
 }  # fmt: skip
-"""The options of every command, whose ``run`` does it; those of ``LONG`` can be stopped and show progress."""
+"""The options of every command, whose ``run`` executes it; those of ``LONG`` can be stopped and show progress."""
 LONG = (RunOptions, CellOptions, AttackOptions)
 
 

@@ -19,7 +19,7 @@ _MARKERS = "ovs^D<P>X*hpdH8"
 
 @dataclass(frozen=True)
 class Style:
-    """How methods are ordered and drawn; a caller gives what the study's own methods should look like."""
+    """How methods are ordered and drawn; a caller says what the study's own methods should look like."""
 
     order: Sequence[str] = ()
     """Environments and methods as tables and figures show them; others follow, by name."""
@@ -28,7 +28,7 @@ class Style:
     everywhere: str = ""
     """A method whose training curve is in every panel, to compare with; empty for none."""
     colours: Mapping[str, str] = field(default_factory=dict)
-    """Hexadecimal colours of methods, the same in every figure; others get one of Okabe and Ito's or the like."""
+    """Hexadecimal colours of methods, the same in every figure; others get one of Okabe and Ito's or a similar one."""
     reference: str = "uniform"
     """The method that tables compare the others with."""
 
@@ -66,7 +66,7 @@ class Data:
     """The results of a study. All policies count, also those whose attacker found nothing to learn from.
 
     ``style`` says how methods are ordered and drawn; those without a colour get one. Raises ``RunError`` if the
-    results are no one study; see ``Results.check``.
+    results are not those of one study; see ``Results.check``.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Data:
     ) -> None:  # fmt: skip
         results.check()
         self.settings = settings or {}
-        """Configurations by environment, as JSON types; none where the tables are all that there is."""
+        """Configurations by environment, as JSON types; empty if there are only tables."""
         self.lacking = lacking
         """Names of cells that have no results: they were given up, or have not run yet."""
         self._results, self.rows = results, results.rows
@@ -104,7 +104,7 @@ class Data:
 
     @property
     def environments(self) -> list[str]:
-        """Their names, in order."""
+        """Names of the environments, in order."""
         return self._sorted({row["environment"] for row in self.rows})
 
     def periods(self, environment: str) -> list[int]:
@@ -122,18 +122,18 @@ class Data:
         return [Where(environment, goals, period) for period in self.periods(environment)]
 
     def methods(self, environment: str, period: int | None = None) -> list[str]:
-        """Methods that an environment has results of, at one T or at any, in order."""
+        """Methods that an environment has results for, at one T or at any, in order."""
         own = [row for row in self.rows if row["environment"] == environment and period in (None, row["goal_period"])]
         return self._sorted({row["method"] for row in own})
 
     def _sorted(self, names: Collection[str]) -> list[str]:
-        """Names in order; the numbers in those that have no place in it count as numbers."""
+        """Names in the style's order; the others follow, with numbers in them sorted as numbers."""
         known = [name for name in self.style.order if name in names]
         parts = {name: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", name)] for name in names}
         return known + sorted(set(names) - set(known), key=parts.__getitem__)
 
     def seeds(self, where: Where, methods: Sequence[str]) -> list[int]:
-        """Seeds that all of some methods have a row of."""
+        """Seeds for which all of some methods have a row."""
         found = [set(self._samples.get((where, name), {})) for name in methods]
         return sorted(set.intersection(*found)) if found else []
 
@@ -153,7 +153,7 @@ class Data:
         return values[~np.isnan(values)]
 
     def in_pairs(self, where: Where, methods: Sequence[str], metric: str) -> list[Array]:
-        """The samples of some methods over the seeds of which all of them have the metric."""
+        """The samples of some methods over the seeds for which all of them have the metric."""
         both = [
             [self.sample(where, name, metric, [seed]) for name in methods] for seed in self.seeds(where, methods)
         ]  # fmt: skip
@@ -189,14 +189,14 @@ class Data:
         return {seed: dose for seed, dose in doses.items() if not math.isnan(dose)}
 
     def dosed_late(self, environment: str) -> list[str]:
-        """Methods whose delivered dose is that of a last part of their training, as it is not known of the first."""
+        """Methods whose delivered dose is that of the last part of their training, as the first part's is unknown."""
         return [
             name for name in self.methods(environment) if self.delivered(environment, name)
             and any(np.isnan(values).any() for values in self.curves(environment, name, "goal_percentile"))
         ]  # fmt: skip
 
     def trained_in(self, environment: str) -> str:
-        """The environment whose policies those of an environment are: another one where they were only judged again."""
+        """The environment that an environment's policies were trained in: another if they were only evaluated again."""
         weights = {name: {row.get("weights") for row in self.rows if row["environment"] == name}
                    for name in self.environments}  # fmt: skip
         own = weights[environment]
@@ -208,7 +208,7 @@ class Data:
 def delivered_dose(percentiles: Array) -> float:
     """Mean percentile of fear of the goals of a training, shape (k,), since it has been known without a gap.
 
-    First goals and the time before fear had learnt count. Nobody ranks the goals of some selectors, and of one that
+    First goals and the time before fear had learnt count. The goals of some selectors are not ranked, and of one that
     hands over to a Director (``vds+p75``) the Director's part counts. NaN where it is not known at the end.
     """
     unknown = np.flatnonzero(np.isnan(percentiles))

@@ -26,10 +26,10 @@ Table = list[dict[str, str]]
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure that lies beside the page as NAME.png and NAME.svg."""
+    """A figure that is next to the page as NAME.png and NAME.svg."""
 
     name: str
-    """Of its files."""
+    """Name of its files."""
     caption: str
     """What it shows."""
 

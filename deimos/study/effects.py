@@ -9,11 +9,11 @@ PERMUTATIONS = 3999
 
 
 def factor_effects(levels: Array, outcome: Array, *, permutations: int | None = None, seed: int = 0) -> list[Interval]:
-    """By how much each factor of a design moves an outcome, with intervals that hold for all factors at once.
+    """How much each factor of a design moves an outcome, with intervals that hold for all factors at once.
 
     Least squares over all factors; standard errors allow settings to differ in their spread (HC3 [1]_). The intervals
     are as wide as the largest ratio of an effect to its error is in 95 % of permutations of the outcome over settings
-    [2]_: if no factor moves it, one of them excludes 0 in 5 % of all studies.
+    [2]_: if no factor moves it, some interval excludes 0 in 5 % of all studies.
 
     Args:
         levels: -1 or 1 for the two levels of each factor, shape (n, k), n at least k + 3.
@@ -37,7 +37,7 @@ def factor_effects(levels: Array, outcome: Array, *, permutations: int | None = 
     if n < k + 3:
         raise ValueError(f"levels must be of {k + 3} settings or more for {k} factors, got {n}.")
     if np.linalg.matrix_rank(design) <= k:
-        raise ValueError("The levels of a factor follow from those of others here, so their effects cannot be told.")
+        raise ValueError("The levels of a factor follow from those of others, so their effects cannot be separated.")
     outcomes = np.tile(outcome, ((permutations or PERMUTATIONS) + 1, 1))
     outcomes[1:] = np.random.default_rng(seed).permuted(outcomes[1:], axis=1)
     inverse = np.linalg.pinv(design)  # (k + 1, n)
@@ -55,15 +55,15 @@ def factor_effects(levels: Array, outcome: Array, *, permutations: int | None = 
 
 
 def instrumented_slope(outcome: Array, base: Array, instrument: Array) -> Interval:
-    """Slope of an outcome over a noisy base line, by a second measurement of it as an instrumental variable [1]_.
+    """Slope of an outcome over a noisy baseline, by a second measurement of it as an instrumental variable [1]_.
 
-    The noise of ``base`` may be in ``outcome`` too, as where it is a difference to the base line; least squares would
+    The noise of ``base`` may be in ``outcome`` too, as where it is a difference to the baseline; least squares would
     then find a slope where there is none. That of ``instrument`` must be independent of both.
 
     Args:
         outcome: Shape (n,), n at least 4.
-        base: The base line with noise, shape (n,).
-        instrument: The base line measured anew, shape (n,).
+        base: The baseline with noise, shape (n,).
+        instrument: The baseline measured again, shape (n,).
 
     Returns:
         The slope with its interval by Fieller's theorem [2]_, infinite where the two measurements have nothing in

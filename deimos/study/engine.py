@@ -18,20 +18,20 @@ class Engine(Protocol):
     """Works on cells; ``run`` is called from one thread for each cell that is worked on at a time."""
 
     def run(self, cell: Cell) -> str | None:
-        """Work on a cell, from wherever it stands, until it is finished, was stopped or has failed.
+        """Work on a cell, from wherever it is, until it is finished, was stopped or has failed.
 
-        Returns ``None``, or in one line how the work has failed; a cell that has no result then has failed too.
+        Returns ``None``, or one line on how the work has failed; a cell without a result has then failed too.
         """
 
     def stop(self) -> None:
         """Let all running cells write their checkpoints and end; from now on ``run`` begins nothing."""
 
     def kill(self) -> None:
-        """End all that runs at once; from now on ``run`` begins nothing."""
+        """End everything that runs, at once; from now on ``run`` begins nothing."""
 
 
 class LocalProcesses:
-    """An engine that makes a process of its own for each cell; each ends when this process does."""
+    """An engine that starts a process for each cell; each ends when this process does."""
 
     def __init__(self, study: StudyFolder) -> None:
         self._study = study

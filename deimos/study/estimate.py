@@ -1,4 +1,4 @@
-"""What the open cells of a study take, told before they start."""
+"""How long the open cells of a study take, estimated before they start."""
 
 import random
 import time
@@ -24,10 +24,10 @@ from deimos.study.results import Results
 
 SECONDS = 10.0  # of training that a kind of cells is measured for, at most; a period of goals if that is less
 PLAYED = 50  # steps of a policy that evaluations are measured by
-MOST_KINDS = 16  # that are measured; others are as fast as these in the mean
+MOST_KINDS = 16  # that are measured; others are taken to be as fast as their mean
 OF_ORACLE = 100  # candidates that an attacker tries in clones
 Kind = tuple[str, str]
-"""Cells that are as fast: their setting, and who chooses the goals."""
+"""Cells of equal speed: their setting, and the kind of their selector."""
 
 
 @dataclass(frozen=True)
@@ -42,27 +42,27 @@ class Speed:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the cells of a study take."""
+    """How long the cells of a study take."""
 
     text: str
     """A line on all of them."""
     seconds: dict[str, tuple[float, float]]
-    """Of every cell, by its name: seconds of a core for its training, and for all else."""
+    """For every cell, by its name: seconds of a core for its training, and for everything else."""
 
 
 def estimate(
     study: StudyFolder, cells: Iterable[Cell], *, elsewhere: bool = False, stopped: Callable[[], bool] = lambda: False
 ) -> Estimate:  # fmt: skip
-    """What the cells of a study that are not finished take; it measures kinds of cells for some seconds each.
+    """Estimate how long unfinished cells of a study take; this measures kinds of cells for some seconds each.
 
     Of more than ``MOST_KINDS``, as a design over many settings has, a random sample is measured. Training is as fast as
-    the finished cells of a kind were where there are any, and acting as measured.
+    the finished cells of a kind were, if there are any, and acting as measured.
 
     Args:
         study: The study.
         cells: At least one cell.
-        elsewhere: Whether other machines work on them: then what this one cannot run, for want of a GPU, is left out.
-        stopped: Asked before a kind is measured; true leaves out those that are left.
+        elsewhere: Whether other machines work on them: then what this one cannot run, for lack of a GPU, is left out.
+        stopped: Called before a kind is measured; true leaves out those that are left.
 
     Raises:
         RunError: If a kind of cells cannot be run here, and not ``elsewhere``.
@@ -117,7 +117,7 @@ def _measure_all(
 
 
 def cost(study: StudyFolder, cell: Cell, results: Results | None = None) -> tuple[int, int]:
-    """Transitions that a cell still has to be trained for at most, and world-steps of all else that it lacks.
+    """Transitions that a cell still has to be trained for at most, and world-steps of everything else that it lacks.
 
     For ``results`` see ``StudyFolder.missing``.
     """

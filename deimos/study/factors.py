@@ -17,7 +17,7 @@ from deimos.study.tables import check_keys, check_kind
 KINDS = ("full", "fractional", "sobol")
 MOST_POINTS = 10_000  # of a design
 TIMES = "times"
-"""What the name of a factor begins with that multiplies a field."""
+"""Prefix of the name of a factor that multiplies a field."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Point:
     levels: dict[str, Any]
     """Level of every factor, by its name, in JSON types; a level that is a table is its name."""
     fields: dict[str, Any]
-    """What they change of the training; under ``TIMES``, what numbers of it are multiplied by."""
+    """What they change in the training; under ``TIMES``, what its numbers are multiplied by."""
 
 
 def expand(factors: Mapping[str, Any], design: Mapping[str, Any]) -> list[Point]:
@@ -37,7 +37,7 @@ def expand(factors: Mapping[str, Any], design: Mapping[str, Any]) -> list[Point]
         factors: By name, a list of levels, or for a Sobol sample also a range ``{low, high}``, logarithmic with
             ``log = true``, whole if both ends are.
         design: ``kind``: ``full`` (the default), all combinations; ``fractional``, of factors with two levels, where
-            ``generators`` names for each factor that is no combination of its own those that it is the product of;
+            ``generators`` gives for each factor that is not a base factor those that it is the product of;
             ``sobol``, a sample of ``points`` with a ``seed`` (0).
 
     Raises:
@@ -64,7 +64,7 @@ def expand(factors: Mapping[str, Any], design: Mapping[str, Any]) -> list[Point]
 
 
 def aliases(generators: Mapping[str, Sequence[str]], factors: Sequence[str]) -> tuple[int, list[str]]:
-    """What a fractional design cannot tell apart.
+    """The effects that a fractional design cannot distinguish.
 
     Args:
         generators: For each generated factor, those that it is the product of.
@@ -88,9 +88,9 @@ def aliases(generators: Mapping[str, Sequence[str]], factors: Sequence[str]) -> 
 
 
 def describe(factors: Mapping[str, Any], design: Mapping[str, Any]) -> str:
-    """A line on the design, and one for each set of effects that it cannot tell apart.
+    """A line on the design, and one for each set of effects that it cannot distinguish.
 
-    Of a fractional design these are main effects and interactions of two, of others main effects.
+    For a fractional design these are main effects and interactions of two, for others main effects.
     """
     flat = _flat(factors)
     kind, points = design.get("kind", "full"), expand(factors, design)
@@ -150,7 +150,7 @@ def _fractional(factors: Mapping[str, list], design: Mapping[str, Any]) -> list[
     """All combinations of the base factors; the sign of each generated one is the product of its factors' signs."""
     generators = check_kind("generators", design.get("generators"), dict)
     if more := [name for name, levels in factors.items() if len(levels) != 2]:
-        raise ValueError(f"a fractional design is of factors with two levels; {', '.join(more)} has not.")
+        raise ValueError(f"a fractional design takes factors with two levels, unlike {', '.join(more)}.")
     base = [name for name in factors if name not in generators]
     for name, product in generators.items():
         if name not in factors or not isinstance(product, list) or len(product) < 2 or set(product) - set(base):

@@ -1,7 +1,7 @@
 """The figures of a study, as PNG and SVG, for print and the colour-blind.
 
 Every method has one colour and one marker throughout: those of the data's ``Style``. What the rows of an older version
-do not say is named in the place of its panel.
+do not hold is named in the place of its panel.
 """
 
 import math
@@ -41,18 +41,18 @@ PRINT: dict[Any, Any] = {
 }  # fmt: skip
 
 Figures = dict[str, tuple[str, "Figure | None"]]
-"""Captions and figures by their names; ``None`` for a figure that there are no data for."""
+"""Captions and figures by their names; ``None`` for a figure without data."""
 
 
 def print_size() -> AbstractContextManager[None]:
-    """Figures that are made inside have the letters of a printed page."""
+    """A context in which figures get the font sizes of a printed page."""
     import matplotlib
 
     return matplotlib.rc_context(PRINT)
 
 
 def write(figures: Figures, folder: Path) -> list[Block]:
-    """Write figures, each as PNG and SVG, and return them as blocks of a page; a figure without data says so there."""
+    """Write figures, each as PNG and SVG, and return them as blocks of a page, with a text in place of missing ones."""
     import matplotlib
 
     blocks: list[Block] = []
@@ -69,7 +69,7 @@ def write(figures: Figures, folder: Path) -> list[Block]:
 
 
 def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) -> "tuple[Figure, Any]":
-    """A figure that belongs to nobody else, unlike pyplot's, of width and height ``size`` [inch], and its axes.
+    """A figure outside pyplot's global state, of width and height ``size`` [inch], and its axes.
 
     The axes have shape (rows, columns); ``more`` is for ``Figure.subplots``.
     """
@@ -80,7 +80,7 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **more: Any) ->
 
 
 def instead(axes: "Axes", text: str) -> None:
-    """Say in the place of a panel why it is empty."""
+    """Write in the place of a panel why it is empty."""
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, color="#555555")
     axes.tick_params(axis="y", left=False, labelleft=False)  # of these axes alone, where others share their ticks
 
@@ -88,8 +88,8 @@ def instead(axes: "Axes", text: str) -> None:
 def as_rates(axes: "Axes", which: Literal["x", "y"], label: str, rates: Iterable[float] = ()) -> None:
     """An axis of shares in percent, from none to all: linear up to 0.01 %, logarithmic above.
 
-    Where the rates that it shows are given [%] and none is in the linear part, it ends with them: decades that nothing
-    is in would hide what is between policies.
+    Where the rates that it shows are given [%] and none is in the linear part, it ends with them: empty decades would
+    hide the differences between policies.
     """
     axis = axes.xaxis if which == "x" else axes.yaxis
     getattr(axes, f"set_{which}scale")("symlog", linthresh=0.01, linscale=0.5)
@@ -149,7 +149,7 @@ def unfitted(data: Data, environment: str, method: str) -> Array | None:
 def _strips(axes: "Axes", data: Data, environment: str, names: Sequence[str], known: bool, rows: int) -> None:
     """A strip for each method with a fear network, dark where the networks of its policies did not learn.
 
-    ``known`` says whether that was recorded of any method; there is room for as many ``rows``, as beside it.
+    ``known`` says whether that was recorded for any method; there is room for ``rows`` strips, as in the other panels.
     """
     found = {name: shares for name in names if (shares := unfitted(data, environment, name)) is not None}
     if not found:
@@ -178,7 +178,7 @@ def line(
     axes: "Axes", style: Style, name: str, x: Array, y: Array, band: Sequence[Array],
     *, every: int, alpha: float, step: Literal["post"] | None = None,
 ) -> None:  # fmt: skip
-    """A method's line with its band of that opacity, and a marker at ``every`` so many points."""
+    """A method's line with its band of opacity ``alpha``, and a marker every ``every`` points."""
     axes.plot(
         x, y, drawstyle=step and f"steps-{step}", color=style.colours[name], linewidth=1.3, label=name,
         marker=style.marker(name), markersize=3.6, markevery=every, markeredgecolor="black", markeredgewidth=0.4,
@@ -190,7 +190,7 @@ def line(
 def legend(
     figure: "Figure", style: Style, methods: Mapping[str, Any] | Sequence[str], place: Literal["beside", "below"]
 ) -> None:
-    """What belongs to whom, outside the axes; beside them it makes the figure as high as it is itself."""
+    """A legend of the methods, outside the axes; ``beside`` them, it makes the figure at least as high as itself."""
     from matplotlib.lines import Line2D
 
     handles = [

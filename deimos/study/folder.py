@@ -36,11 +36,11 @@ class StudyFolder:
         self.path = path
 
     def results(self) -> Results:
-        """The results that there are."""
+        """The results so far."""
         return Results.read(self.path)
 
     def hold(self) -> AbstractContextManager[None]:
-        """Hold the study as the only process that works on it; ``RunError`` if another does, or machine may."""
+        """Hold the study as the only process that works on it; ``RunError`` if another one does, or machine may."""
         return hold(self.path / "lock", str(self.path), one_machine=True)
 
     def cell_path(self, cell: Cell) -> Path:
@@ -48,7 +48,7 @@ class StudyFolder:
         return self.path / "cells" / cell.name
 
     def add(self, cells: Iterable[Cell]) -> None:
-        """Add cells to the study; those that are there already stay as they are."""
+        """Add cells to the study; existing ones stay as they are."""
         for cell in cells:
             path = self.cell_path(cell)
             if not (path / "cell.json").exists():
@@ -70,7 +70,7 @@ class StudyFolder:
             raise RunError(f"{self.path / ATTACK} does not list attackers ({one_line(error)}).") from error
 
     def add_rounds(self, rounds: Iterable[AttackRound]) -> None:
-        """Add attackers; those that are there already are not added twice."""
+        """Add attackers; those that were added already are not added twice."""
         known = self.rounds()
         if fresh := [each for each in dict.fromkeys(rounds) if each not in known]:
             RunFolder(self.path).write_json(ATTACK, [to_dict(each) for each in [*known, *fresh]])
@@ -83,7 +83,7 @@ class StudyFolder:
     def missing(self, cell: Cell, results: Results | None = None) -> dict[int, tuple[str, ...]]:
         """The added attackers that a finished cell has not met yet, by T; none where it has met all.
 
-        ``results`` are those of the study, from a caller who asks for many cells.
+        ``results`` are those of the study, from a caller that asks for many cells.
         """
         if not (names := self.added(cell)):
             return {}
@@ -111,7 +111,7 @@ class StudyFolder:
     def cell(self, name: str) -> Cell:
         """The cell of a name.
 
-        Where it has results, it is the cell of these, so that its policy can be attacked by later versions too.
+        If it has results, it is the cell that they belong to, so that its policy can be attacked by later versions too.
 
         Raises:
             RunError: If it cannot be read, or if it has no results and the same configuration is another cell today,
@@ -152,7 +152,7 @@ class StudyFolder:
         return found
 
     def record_failure(self, cell: Cell, error: str) -> None:
-        """Write down how a worker died."""
+        """Record how a worker died."""
         line = {"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "error": error}
         with open_file(self.cell_path(cell) / "failures.jsonl", "a") as file:
             file.write(json.dumps(line) + "\n")
@@ -164,7 +164,7 @@ class StudyFolder:
 
 
 def _left(cell: Cell, names: Iterable[str], results: Results) -> dict[int, tuple[str, ...]]:
-    """Those of some attackers that a cell has not met by some results, by T."""
+    """Those of some attackers that a cell has not met according to some results, by T."""
     met = {(row["goal_period"], row["goals"]) for row in results.rows if row["hash"] == cell.digest}
     left = {period: tuple(name for name in names if (period, name) not in met) for period in cell.goal_periods}
     return {period: attackers for period, attackers in left.items() if attackers}

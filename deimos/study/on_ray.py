@@ -1,8 +1,8 @@
 """Cells on the machines of a Ray cluster. This is the only file that knows Ray.
 
 Every machine must see the study's folder under the same path, and have the same Deimos installed. A machine that is
-given a cell works on it as this one would, in a process of its own (``deimos.study.engine.LocalProcesses``); Ray finds
-the machine, and starts a cell anew elsewhere, from its last checkpoint, where a worker or a machine is lost.
+given a cell works on it as this one would, in a separate process (``deimos.study.engine.LocalProcesses``); Ray finds
+the machine, and restarts a cell elsewhere, from its last checkpoint, if a worker or a machine is lost.
 """
 
 import os
@@ -21,12 +21,12 @@ RETRIES = 3  # of a cell whose worker or machine is lost
 class OnRay:
     """An engine that gives each cell to a machine of a Ray cluster.
 
-    The cluster is the one of ``RAY_ADDRESS`` or that runs on this machine; without one, Ray starts one here. A cell
-    takes as many CPUs as it has threads, 1 where it does not say.
+    The cluster is the one at ``RAY_ADDRESS`` or the one that runs on this machine; without either, Ray starts one here.
+    A cell takes as many CPUs as it has threads, by default 1.
 
     Args:
         study: The study.
-        gpus: GPUs of a cell, at least 0; below 1 for several on one. ``None`` for 1 where a cell asks for CUDA.
+        gpus: GPUs per cell, at least 0; below 1 for several on one. ``None`` for 1 where a cell asks for CUDA.
 
     Raises:
         RunError: If there is no cluster at the address.
@@ -63,7 +63,7 @@ class OnRay:
     def lacking(self, cells: list[Cell]) -> str:
         """Which of these cells no machine of the cluster, as it is now, has room for; empty where each has one.
 
-        Ray waits for such a machine, without a word and for ever unless the cluster grows.
+        Ray waits for such a machine silently, and forever unless the cluster grows.
         """
         machines = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         for cell in cells:
@@ -107,7 +107,7 @@ class OnRay:
 
 
 class _Stop:
-    """An actor that lets whoever works on a cell wait until the study is to stop."""
+    """An actor that lets workers wait until the study is to stop."""
 
     def __init__(self) -> None:
         import asyncio
@@ -124,8 +124,8 @@ class _Stop:
 def _work(study: str, name: str, stop: Any, working: str) -> str | None:
     """Work on a cell on the machine that Ray has chosen; see ``deimos.study.engine.Engine.run``.
 
-    ``working`` is the runner's working directory, from which a study's files and plug-ins are seen; without it, as
-    where machines do not share it, the study must name them by whole paths.
+    ``working`` is the runner's working directory, from which a study's files and plug-ins are found; where machines do
+    not share it, the study must give their full paths.
     """
     import ray
 

@@ -1,4 +1,4 @@
-"""What came out, drawn: the policies of every method, score against safety, and outcomes by level of a factor."""
+"""Figures of the outcomes: the policies of every method, score against safety, and outcomes by level of a factor."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -67,7 +67,7 @@ def of_environment(data: Data, environment: str) -> Figures:
 
 
 def late_doses(data: Data, environment: str) -> str:
-    """A sentence on the methods whose dose is that of a part of their training; empty where there are none."""
+    """A sentence on the methods whose dose is that of a part of their training; empty if there are none."""
     names = ", ".join(data.dosed_late(environment))
     return f" The dose of {names} is that of the last part of the training, whose goals alone fear ranked." * bool(
         names
@@ -75,7 +75,7 @@ def late_doses(data: Data, environment: str) -> str:
 
 
 def of_factors(data: Data) -> Figures:
-    """A figure by level for every environment that a study has several settings of."""
+    """A figure by level for every environment with several settings in a study."""
     bases = dict.fromkeys(base_of(data, name) for name, own in settings_of(data).items() if own)
     periods = {base: sorted({row["goal_period"] for row in data.rows if row.get("base_environment") == base})
                for base in bases}  # fmt: skip
@@ -98,7 +98,7 @@ class Attacked:
 
 
 def attacked(data: Data, environment: str, period: int) -> Attacked:
-    """Safety under the worst attacker that all policies met; under the thesis's where the rows do not say it."""
+    """Safety under the worst attacker that all policies met; under the thesis's if the rows do not name it."""
     easy, hard = (Where(environment, goals, period) for goals in ("naive", "adversary"))
     if any(len(data.sample(easy, name, "worst")) for name in data.methods(environment)):
         return Attacked(easy, "worst", "the worst attacker")
@@ -143,7 +143,7 @@ def _both(data: Data, environment: str, period: int) -> list[Attacked]:
 
 
 def _boxes(axes: "Axes", style: Style, samples: Mapping[str, Array]) -> None:
-    """A box for each method, from above, with the number of its policies beside it."""
+    """A box for each method, from top to bottom, with the number of its policies next to it."""
     beside = axes.get_yaxis_transform()
     axes.text(1.01, -0.9, "n", transform=beside, va="center", fontsize=7)
     for i, (name, values) in enumerate(samples.items()):
@@ -259,7 +259,7 @@ def levels(data: Data, base: str, period: int) -> "Figure | None":
 
 
 def _grouped(levels: list[Any]) -> dict[str, list[Any]]:
-    """Levels in order, by their labels; more numbers than can be told apart in a figure are put into quarters."""
+    """Levels in order, by their labels; more numbers than a figure can distinguish are put into quarters."""
     ordered: list[Any] = []
     for level in sorted(levels, key=lambda level: (not isinstance(level, int | float), level)):
         ordered += [level] if level not in ordered else []

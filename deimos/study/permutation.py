@@ -2,8 +2,8 @@
 
 A sample is a float array of shape (..., n), one value per trained policy; leading axes hold many studies at once, each
 tested by itself. Except in blocks, every statistic is divided by its own standard error before it is compared with
-those of relabelled samples, so that its level holds, for more and more policies, also where populations differ in what
-is not tested [1]_.
+those of relabelled samples, so that the level also holds, asymptotically, where populations differ in what is not
+tested [1]_.
 
 References:
     .. [1] Chung and Romano, *Exact and Asymptotically Robust Permutation Tests*, Annals of Statistics 41, 2013.
@@ -21,7 +21,7 @@ from scipy import optimize, stats
 from deimos.study.stats import POWER, Array, Statistic
 
 Pairs = Sequence[tuple[int, int]]
-"""Of the numbers of two samples each: the first is claimed to have more."""
+"""Pairs of indices of samples: the first one is claimed to have more."""
 Kind = Literal["superiority", "mean", "spread"]
 """What is compared, averaged over pairs: P(X > Y), ties counting half; means; or the logarithm of Gini's mean
 difference between the values of a sample."""
@@ -46,7 +46,7 @@ def superiority(pairs: Pairs) -> Statistic:
 
 
 def superiority_in_blocks(pairs: Pairs) -> Statistic:
-    """The same of samples whose i-th values belong together: how often the first has more, within their blocks."""
+    """The same for samples whose i-th values belong together: how often the first has more, within their blocks."""
 
     def statistic(*samples: Array) -> Array:
         return 0.5 + np.mean([np.sign(samples[a] - samples[b]).mean(axis=-1) for a, b in pairs], axis=0) / 2
@@ -82,7 +82,7 @@ def p_values(
     Args:
         samples: Each of shape (..., n_i) with the same leading axes, n_i at least 2.
         pairs: The differences of each are averaged.
-        kind: What is compared. Of ``spread`` the medians of the samples are subtracted first.
+        kind: What is compared. For ``spread``, the medians of the samples are subtracted first.
         permutations: How many random ones; ``None``: ``PERMUTATIONS``.
         seed: Of the permutations.
 
@@ -136,7 +136,7 @@ def detectable_spread(n: int, m: int, alpha: float = 0.05) -> float:
 
     Simulated, to some 5 %; with five policies a side to some 12 %. Infinite where a ratio of 100 is not found.
     """
-    # Of few policies power rises slowly with the ratio: what few permutations lose, and few studies, would move it.
+    # With few policies, power rises slowly with the ratio: losses from few permutations or studies would shift it.
     cost = (n + m) ** 2
     studies = min(1000, max(400, 100_000 // cost))
     permutations = min(PERMUTATIONS, max(199, 200_000 // cost))
@@ -161,9 +161,9 @@ def _blocks(studies: int, permutations: int, number: int) -> Iterator[tuple[slic
 def _studentized(values: Array, labels: Labels, sizes: Labels, pairs: Pairs, kind: Kind) -> Array:
     """The statistic of every study and permutation over its standard error, shape (studies, permutations).
 
-    All kinds are U-statistics: means of a kernel over pairs of policies. What a policy has part in is the mean of the
-    kernel over its partners, and the variance of these parts within every sample is that of the statistic
-    (Hoeffding's; of P(X > Y) it is DeLong's).
+    All kinds are U-statistics: means of a kernel over pairs of policies. A policy's part is the mean of the kernel over
+    its partners, and the variance of these parts within every sample is that of the statistic (Hoeffding's; for
+    P(X > Y) it is DeLong's).
     """
     groups, weight = len(sizes), np.zeros((len(sizes), len(sizes)))
     for a, b in pairs:

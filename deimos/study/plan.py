@@ -67,9 +67,9 @@ class Cell:
     branch_from: Path | None = None
     """Folder of the run that it branches off; ``None`` to begin from nothing."""
     sources: dict[str, str] = field(default_factory=dict)
-    """What the numbers depend on beside all this: the ``code``, and by their SHA-256 the plugins and ``files``."""
+    """What the numbers depend on besides all this: the ``code``, and by their SHA-256 the plugins and ``files``."""
     by_seed: tuple[str, ...] = ()
-    """Names of the ``files`` that are another one for each seed."""
+    """Names of the ``files`` that differ from seed to seed."""
 
     def __post_init__(self) -> None:
         check_at_least("audit_worlds", self.audit_worlds, 0)
@@ -88,10 +88,9 @@ class Cell:
 
     @cached_property
     def setting(self) -> str:
-        """The same of what the cells of one environment must share to be compared: all but selector and seed.
+        """The same for what the cells of one environment must share to be compared: all but selector and seed.
 
-        Plug-ins count where the environment is from one; files that are another one for each seed do not, see
-        ``block``.
+        Plug-ins count if the environment is from one; files that differ from seed to seed do not, see ``block``.
         """
         return _digest(**self._shared())
 
@@ -105,27 +104,27 @@ class Cell:
 
     @cached_property
     def block(self) -> str:
-        """The same of the files that all cells of a seed have in common, and no other seed; empty without such files.
+        """The same for the files that all cells of a seed have in common, and no other seed; empty without such files.
 
-        Methods are compared within a block: what they began with is then no chance.
+        Methods are compared within a block, since all of them began with the same files there.
         """
         own = {name: value for name, value in self.sources.items() if name in self.by_seed}
         return _digest(sources=own) if own else ""
 
     @cached_property
     def selector(self) -> str:
-        """The same of what the cells of one method must share: what its name stands for, and whose code that is."""
+        """The same for what the cells of one method must share: what its name stands for, and whose code that is."""
         made_by = self._made_by(self.config.goals)
         return _digest(selector=_spelled_out(self.config.goals), **({"plugins": made_by} if made_by else {}))
 
     def _made_by(self, config: EnvConfig | SelectorConfig) -> dict[str, str]:
-        """The hashes of the plug-ins, if a configuration is that of one."""
+        """The hashes of the plug-ins, if a configuration belongs to one."""
         found = {name: self.sources[name] for name in self.plugins if name in self.sources}
         return {} if _is_own(config) else found
 
     @property
     def files(self) -> Files:
-        """Those of its environment, the ``pool`` of its attackers, and the checkpoint that it branches off."""
+        """The files of its environment, the ``pool`` of its attackers, and the checkpoint that it branches off."""
         env, pool = self.config.env, self.config.eval.pool
         others = {"pool": pool, "branch_from": self.branch_from and self.branch_from / "checkpoint.pt"}
 
@@ -136,7 +135,7 @@ class Cell:
         return {**own, **{name: path.read_bytes for name, path in others.items() if path}}
 
     def _config(self) -> dict:
-        """The run's configuration; files are told by their hashes, wherever they lie."""
+        """The run's configuration; files are identified by their hashes, wherever they are."""
         fields = to_dict(self.config)
         for part, left_out in (("env", self.config.env.files), ("eval", ("pool",))):
             fields[part] = {name: value for name, value in fields[part].items() if name not in left_out}
@@ -153,7 +152,7 @@ class Cell:
 
 
 def _named(config: SelectorConfig, known: tuple[str, ...]) -> dict[str, SelectorConfig]:
-    """The methods that a selector names, as Schedule and Mix do, but for those that are ``known``."""
+    """The methods that a selector names, as Schedule and Mix do, except those that are ``known``."""
     found, hints = {}, typing.get_type_hints(type(config))
     for value in [value for name, value in to_dict(config).items() if hints.get(name) is str and value not in known]:
         with contextlib.suppress(ValueError):  # it names no method
@@ -168,7 +167,7 @@ def _spelled_out(config: SelectorConfig, known: tuple[str, ...] = ()) -> dict:
 
 
 def _is_own(config: EnvConfig | SelectorConfig, known: tuple[str, ...] = ()) -> bool:
-    """Whether a configuration, and those of the methods that it names, are of Deimos' own code, no plug-in's."""
+    """Whether a configuration, and those of the methods that it names, are of Deimos' own code, not a plug-in's."""
     named = _named(config, known) if isinstance(config, SelectorConfig) else {}
     own = type(config).__module__.partition(".")[0] == deimos.__name__
     return own and all(_is_own(each, (*known, name)) for name, each in named.items())
@@ -180,7 +179,7 @@ def _digest(**data: Any) -> str:
 
 
 def check_settings(there: Iterable[Cell], cells: Iterable[Cell]) -> None:
-    """Raise ``RunError`` with what differs if a cell has not the setting of one of its environment and code."""
+    """Raise ``RunError`` with what differs if a cell's setting is not that of others of its environment and code."""
     known = {cell.environment: cell for cell in there}
     for cell in cells:
         other = known.get(cell.environment, cell)
@@ -192,7 +191,7 @@ def check_settings(there: Iterable[Cell], cells: Iterable[Cell]) -> None:
             if differ:  # an older version may have hashed something else
                 raise RunError(
                     f"The cells of environment '{cell.environment}' were made with other settings and cannot be "
-                    f"compared: {', '.join(differ[:5] + ['...'] * (len(differ) > 5))}. Put them back, or begin anew."
+                    f"compared: {', '.join(differ[:5] + ['...'] * (len(differ) > 5))}. Put them back, or begin again."
                 )
 
 
@@ -217,18 +216,18 @@ def read(path: Path) -> dict:
     * ``train``: fields of ``TrainConfig`` for all cells;
     * ``environment``: for each environment or variant its ``name``, ``env`` (``kind`` and fields) and, if they differ
       there, ``methods``, ``train``, ``audit_worlds`` and ``goal_periods``; its ``preset`` is one of
-      ``deimos.run.presets``, where its environment and settings come from that are not said;
+      ``deimos.run.presets``, which fills in what is not given of its environment and settings;
     * ``pools``: folder with a file NAME.pt for every environment, or those of an environment, which the attacker
       ``pooled`` attacks with (``deimos study pool`` makes it);
     * ``branch_from``: folder of a run that all cells branch off, or those of an environment (``deimos.run.branch``);
-      what is not said is as it was there, and critics learn first;
-    * ``{seed}`` in the name of a file or of a run stands for the number of the seed: each seed branches off a run of
-      its own, say, and methods are compared in pairs, seed by seed;
+      what is not given is as it was there, and critics learn first;
+    * ``{seed}`` in the name of a file or of a run stands for the number of the seed: so each seed may branch off its
+      own run, and methods are compared in pairs, seed by seed;
     * ``factors`` and ``design``: see ``deimos.study.factors``;
     * ``audit_worlds``: see ``Cell``;
     * ``plugins``: names of modules that register selectors, attackers or environments;
     * ``attack``: further attackers for some seeds, see ``deimos.study.rounds``;
-    * ``base``: another such file, as seen from this one, where everything comes from that is not said.
+    * ``base``: another such file, relative to this one, which fills in every key that is not given.
 
     Raises ``RunError`` if it or its base cannot be read or is not TOML.
     """
@@ -258,14 +257,14 @@ def expand(
 
     Args:
         description: See ``read``.
-        seeds: See ``parse_seeds``; in place of its own, as ``methods`` are, in every environment.
+        seeds: See ``parse_seeds``; in place of the description's, like ``methods``, in every environment.
         methods: Names.
         environments: Names of those to take, with all points of a design or with one (``directional.3``); ``None`` for
             all.
-        train: Fields of ``TrainConfig`` that come before its own.
+        train: Fields of ``TrainConfig`` that override its own.
 
     Raises:
-        RunError: If something is unknown, missing, doubled or out of range.
+        RunError: If something is unknown, missing, repeated or out of range.
     """
     check_table("A study", description, _KEYS, {"seeds"})
     tables = description.get("environment", [])
@@ -291,7 +290,7 @@ def expand(
 
 
 def _with_seed(value: Any, seed: int) -> Any:
-    """A description in which texts have the number of a seed in its place."""
+    """A description with the number of a seed in place of ``{seed}`` in its texts."""
     match value:
         case str():
             return value.replace(_SEED, str(seed))
@@ -329,7 +328,7 @@ def _grid(
 
 
 def _by_seed(table: dict, study: dict) -> tuple[str, ...]:
-    """Names of the files of an environment's cells that are another one for each seed."""
+    """Names of the files of an environment's cells that differ from seed to seed."""
     train = merged(study.get("train", {}), table.get("train", {}))
     origin, pools = (table.get(name, study.get(name)) for name in ("branch_from", "pools"))
     pool = train.get("eval", {}).get("pool", pools)
@@ -346,7 +345,7 @@ def _check_known(wanted: Sequence[str], names: Sequence[str], places: Sequence[s
 
 
 def _place(index: int, count: int) -> str:
-    """What the name of an environment ends in at a point of a design."""
+    """The ending of an environment's name at a point of a design."""
     return f".{index:0{len(str(count - 1))}d}" if count > 1 else ""
 
 
@@ -361,7 +360,7 @@ def _environment(
     tried = {key: value for key, value in point.fields.items() if key != factors.TIMES}
     times = check_kind("[factors] times", point.fields.get(factors.TIMES, {}), dict)
     if taken := sorted((set(shared) | set(own)) & _GRID | (set(tried) | set(times)) & (_GRID - {"env"})):
-        raise RunError(f"{', '.join(taken)} cannot stand in 'train' or be a factor: the grid of the study says it.")
+        raise RunError(f"{', '.join(taken)} cannot be in 'train' or be a factor: the grid of the study sets it.")
     methods = list(table.get("methods", study.get("methods")) or [] if methods is None else methods)
     if not methods:
         raise RunError(f"Environment '{name}' has no methods.")
@@ -399,7 +398,7 @@ def _environment(
 
 
 def _training_preset(table: dict) -> dict:
-    """What the preset that an environment's table names says of ``TrainConfig``, but for the grid and the machine."""
+    """The fields of ``TrainConfig`` in the preset of an environment's table, except the grid's and the machine's."""
     if "preset" not in table:
         return {}
     name = table["preset"]
@@ -410,23 +409,23 @@ def _training_preset(table: dict) -> dict:
 
 
 def _branch(table: dict, origin: TrainConfig) -> dict:
-    """The same of the run that an environment's cells branch off."""
+    """The same for the run that an environment's cells branch off."""
     if "preset" in table:
         raise ValueError("preset and branch_from cannot be combined; a branch has the settings of its run.")
     return _settings(branch_config(origin))
 
 
 def _settings(config: TrainConfig) -> dict:
-    """The fields of a training, but for the grid's and the machine's."""
+    """The fields of a training, except the grid's and the machine's."""
     return {
         key: value for key, value in to_dict(config).items() if key == "env" or key not in _GRID | {"threads", "device"}
     }
 
 
 def parse_seeds(given: Any) -> list[int]:
-    """Seeds of a number of them (10, or the text "10"), a range ("10-19") or a list ("0,3,5", or one of numbers).
+    """Seeds from a number of them (10, or the text "10"), a range ("10-19") or a list ("0,3,5", or one of numbers).
 
-    Raises ``RunError`` for anything else, and if a seed is there twice.
+    Raises ``RunError`` for anything else, and if a seed is given twice.
     """
     spans = []
     if type(given) is int or (isinstance(given, str) and re.fullmatch(r"[1-9]\d*", given)):
@@ -439,7 +438,7 @@ def parse_seeds(given: Any) -> list[int]:
         example = "a number of seeds, a range that rises like 10-19 or a list like 0,3,5"
         raise RunError(f"seeds must be {example}, got {shown(given)}.")
     if any(span.stop - span.start > MOST_SEEDS for span in spans):
-        raise RunError(f"seeds must be at most {MOST_SEEDS}, got {shown(given)}.")
+        raise RunError(f"seeds must be at most {MOST_SEEDS} in number, got {shown(given)}.")
     seeds = [seed for span in spans for seed in span]
     _check_unique("seed", seeds)
     return seeds
@@ -447,4 +446,4 @@ def parse_seeds(given: Any) -> list[int]:
 
 def _check_unique(what: str, values: Sequence[Any]) -> None:
     if doubled := sorted(value for value, count in Counter(values).items() if count > 1):
-        raise RunError(f"Every {what} must be given once; doubled: {', '.join(map(str, doubled))}.")
+        raise RunError(f"Every {what} must be given once; repeated: {', '.join(map(str, doubled))}.")

@@ -19,18 +19,18 @@ from deimos.study.plan import Cell
 from deimos.study.runner import ATTEMPTS
 
 POOLS = "pools"
-"""Name of the folder in a study's that they are in."""
+"""Name of their folder inside a study's."""
 
 
 def write_pools(study: StudyFolder, out: Path, device: torch.device) -> Iterator[tuple[Path, dict[str, Any] | None]]:
-    """Write OUT/ENVIRONMENT.pt for every environment of a study; a file that is there stays as it is.
+    """Write OUT/ENVIRONMENT.pt for every environment of a study; an existing file stays as it is.
 
     Each network learns from all policies of its environment, with the sizes of their evaluation. Where they never
     crashed, or always, the file says that it has learnt nothing. Environments with a cell that was given up get none.
 
     Yields:
-        The files, each once it is there, with the facts of ``deimos.run.attackers.pooled.make_pool``; ``None`` of one
-        that was there.
+        The files, each once it is there, with the facts of ``deimos.run.attackers.pooled.make_pool``; ``None`` for one
+        that existed.
 
     Raises:
         RunError: If the study has no cells, one of them is open, or a file cannot be read or written.
@@ -54,7 +54,7 @@ def write_pools(study: StudyFolder, out: Path, device: torch.device) -> Iterator
 
 
 def given_up(study: StudyFolder) -> list[Cell]:
-    """The cells of a study that have failed so often that nobody tries them again."""
+    """The cells of a study that have failed so often that they are not tried again."""
     return [
         cell for cell in study.cells() if not _is_finished(study, cell) and len(study.failures(cell)) >= ATTEMPTS
     ]  # fmt: skip

@@ -1,6 +1,6 @@
 """The report of a study as HTML and as Markdown: outcomes, figures, what was run, and limits.
 
-``write`` puts the sections of ``page`` together; a caller with more to say gives a ``page`` of its own, made of
+``write`` puts the sections of ``page`` together; a caller with more to report gives its own ``page``, made of
 these sections and others.
 """
 
@@ -38,7 +38,7 @@ Pictures = Mapping[str, Sequence[Block]]
 
 FIGURES = "figures"
 FACTORS = ""
-MOST_OF_FEW = 5  # policies, whose lowest and highest have the median between them in less than 95 % of studies
+MOST_OF_FEW = 5  # policies: the population's median is between their extremes in less than 95 % of studies
 COVERAGE = (  # docs/lab/study.md; `python -m reproduction coverage` simulates it again
     "Intervals of shares of policies and of pairs are exact, but for those over all environments; all others are "
     "percentile bootstraps over policies, but for the means under Distributions. Those of IQMs and medians cover 93 to "
@@ -76,7 +76,7 @@ def write(
         out: Where to write; made if it is not there.
         style: How methods are ordered and drawn.
         page: Makes the page.
-        draw: Draws the figures of an environment. Those of a design's settings are not drawn, but figures by level.
+        draw: Draws the figures of an environment. A design's settings have none, but there are figures by level.
 
     Raises:
         RunError: If there are no results, or they cannot be read.
@@ -121,7 +121,7 @@ def what_was_run(data: Data) -> list[Block]:
 
 
 def hyper_parameters(settings: Mapping[str, Mapping[str, Any]]) -> list[Block]:
-    """Every field of the environments, of the learner and of the evaluation, those that are not set left out.
+    """Every field of the environments, of the learner and of the evaluation, except those that are not set.
 
     A selector's are those that its method's name stands for.
 
@@ -152,7 +152,7 @@ def _values(rows: Sequence[dict], column: str) -> str:
 
 
 def _lacking(data: Data) -> list[Block]:
-    """Which cells have no results, so that nobody takes those that have for all."""
+    """Which cells have no results, so that those with results are not taken for all."""
     counts = Counter(name.rsplit("-", 2)[0] for name in data.lacking)  # without seed and hash
     if not counts:
         return []
@@ -178,7 +178,7 @@ def _uninformed(data: Data) -> list[Block]:
 
 
 def environments(data: Data, pictures: Pictures) -> list[Block]:
-    """Of every environment the outcomes and its figures; of settings of a design the outcomes and figures by level."""
+    """For every environment the outcomes and its figures; for a design's settings the outcomes and figures by level."""
     blocks: list[Block] = []
     for environment in data.environments:
         blocks.append(f"## {environment}")
@@ -229,7 +229,7 @@ def outcomes(data: Data, environment: str, period: int) -> list[Block]:
 
 
 def told(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """The rows of a table without the columns that none of them says anything in."""
+    """The rows of a table without the columns that are empty in all of them."""
     kept = [title for title in rows[0] if any(row[title] != "-" for row in rows)]
     return [{title: row[title] for title in kept} for row in rows]
 
@@ -247,7 +247,7 @@ def _safer(data: Data, hard: Attacked, method: str) -> str:
 
 
 def distributions(data: Data) -> list[Block]:
-    """Of every evaluation how its policies are distributed."""
+    """How the policies of every evaluation are distributed."""
     blocks: list[Block] = []
     for environment in data.environments:
         for period in data.periods(environment):

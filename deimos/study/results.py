@@ -1,8 +1,8 @@
 """The results of a study: a row per policy and evaluation, and one per training curve.
 
 A cell leaves its own in ``result.json``. The tables ``results.csv`` and ``curves.csv`` are what is exported, merged and
-kept; a folder's results are those of its cells, and of its tables those that no cell there has: other cells, and what
-other attackers have done to the policies of these.
+kept; a folder's results are those of its cells, and the rows of its tables that no cell there has: those of other
+cells, and of other attackers on these cells' policies.
 """
 
 import csv
@@ -33,7 +33,7 @@ _CELL: dict[str, type] = {
     "environment": str, "method": str, "seed": int, "hash": str, "setting": str, "selector": str, "num_envs": int,
     # The environment in the study's file, the levels of its factors there, and the code that made the row.
     "base_environment": str, "levels": dict, "code": str,
-    "block": str,  # a hash of the files that are another one for each seed; none where all seeds have the same
+    "block": str,  # a hash of the files that differ from seed to seed; empty if all seeds have the same
 }  # fmt: skip
 RESULT_COLUMNS = _CELL | {
     # What was run.
@@ -66,7 +66,7 @@ AUDITS: dict[str, type] = {
 CURVE_COLUMNS = _CELL | dict.fromkeys(("env_steps", *MEANS, "fear_fitted"), tuple) | AUDITS
 TABLES = {"results.csv": RESULT_COLUMNS, "curves.csv": CURVE_COLUMNS}
 FORMER_NAMES = {"selected_share": "selected_fraction"}
-"""Columns of version 0.1.0 that have another name today."""
+"""Columns of version 0.1.0 that have other names today."""
 LATER_COLUMNS = {
     "goal_groups", "uninformed", "even_interactions", "even_interaction_crashes", "base_environment", "levels", "code",
     "block",
@@ -89,7 +89,7 @@ class Results:
     def read(cls, folder: Path, *, may_be_empty: bool = True) -> "Results":
         """The results of a study's folder, or of one that holds tables only.
 
-        Raises ``RunError`` if a file is broken or of another schema, or if there must be results and are none.
+        Raises ``RunError`` if a file is broken or of another schema, or if results are required and missing.
         """
         found = cls()
         for path in sorted(folder.glob("cells/*/result.json")):
@@ -100,12 +100,12 @@ class Results:
         found.add(cls(*(read_table(folder / name, columns) for name, columns in TABLES.items())), attacks=True)
         found.find_worst()
         if not found.rows and not may_be_empty:
-            raise RunError(f"{folder} holds no results; it is empty, or no study folder.")
+            raise RunError(f"{folder} holds no results; it is empty, or not a study's folder.")
         return found
 
     @classmethod
     def of_cell(cls, home: Path) -> "Results":
-        """Those of one cell's folder; none where it has not finished. Raises ``RunError`` as ``read``."""
+        """Those of one cell's folder; none if it has not finished. Raises ``RunError`` as ``read`` does."""
         path = home / "result.json"
         if not path.exists():
             return cls()
@@ -118,9 +118,9 @@ class Results:
             raise RunError(f"{path} is not the result of a cell of schema {SCHEMA} ({one_line(error)}).") from error
 
     def add(self, other: "Results", *, attacks: bool = False) -> int:
-        """Take over the rows of cells that are not here yet; returns how many rows of evaluations that were.
+        """Take over the rows of cells that are not here yet; returns how many rows of evaluations were added.
 
-        With ``attacks`` also what other attackers have done to the very policies that are here.
+        With ``attacks``, also the rows of other attackers on the very policies that are here.
         """
         known, drawn = ({row["hash"]: row["weights"] for row in self.rows}, {row["hash"] for row in self.curves})
         met = {_evaluation(row) for row in self.rows}
@@ -148,7 +148,7 @@ class Results:
     def check(self) -> None:
         """Raise ``RunError`` if what cannot be compared is mixed, or if a policy is there twice.
 
-        One of the two would silently count for nothing.
+        One of the two would silently be ignored.
         """
         check_comparable([*self.rows, *self.curves])
         policy = ("environment", "method", "seed")
@@ -174,7 +174,7 @@ def result(cell: Cell, run: RunFolder, rows: Iterable[Row], audited: Row | None 
 def evaluated(cell: Cell, run: RunFolder, rows: Iterable[Row], code: str | None) -> list[Row]:
     """Rows of evaluations of a cell, as ``result.json`` has them; ``code`` evaluated it.
 
-    An attacker that is none of Deimos' own is part of the code of its rows, by the hash of its file.
+    An attacker that is not one of Deimos' own is part of the code of its rows, by the hash of its file.
     """
     stored = run.read_json("config.json")
     names = ("deimos", "commit", "python", "torch", "warp-lang", "numpy")
@@ -185,7 +185,7 @@ def evaluated(cell: Cell, run: RunFolder, rows: Iterable[Row], code: str | None)
         "device": stored["config"]["device"],
         "versions": " ".join(f"{name}={stored['versions'][name]}" for name in names),
     }
-    # Evaluations call their own seed and a hash of their task by names that mean the cell's here.
+    # Evaluations have their own seed, and a hash of their task, under names that here mean the cell's.
     own = {"seed": cell.config.seed, "environment": cell.environment}
     full = [
         shared | row | {
@@ -230,7 +230,7 @@ def _means(stretches: Sequence[Sequence[dict[str, str]]], column: str) -> list[f
 
 
 def identity(cell: Cell) -> Row:
-    """What a cell's rows of both kinds begin with."""
+    """The columns that a cell's rows of both kinds begin with."""
     return {
         "environment": cell.environment, "method": cell.config.label, "seed": cell.config.seed,
         "hash": cell.digest, "setting": cell.setting, "selector": cell.selector, "num_envs": cell.config.num_envs,
@@ -247,8 +247,8 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
         sources: Study folders; all are checked before anything is written.
 
     Returns:
-        How many rows of evaluations were added, how many were there already, and how many of those have other
-        numbers in the source: of those the first stay.
+        How many rows of evaluations were added, how many were there already, and how many of those have different
+        numbers in the source: of these the first stay.
 
     Raises:
         RunError: If a folder has no results or those of another schema, or they do not make one study.
@@ -296,14 +296,14 @@ def settings(folder: Path) -> dict[str, dict]:
 
 
 def without_results(folder: Path, results: Results) -> list[str]:
-    """Names of the cells of a study's folder that none of its results are of: given up, or not finished yet."""
+    """Names of the cells of a study's folder without results: given up, or not finished yet."""
     there = {row["hash"][:8] for row in results.rows}  # as a cell's name ends
     names = [path.parent.name for path in sorted(folder.glob("cells/*/cell.json"))]
     return [name for name in names if name.rpartition("-")[2] not in there]
 
 
 def _evaluation(row: Row) -> tuple:
-    """Of what cell and what evaluation a row is."""
+    """The cell and the evaluation that a row is of."""
     return row["hash"], row["goals"], row["goal_period"]
 
 
@@ -334,20 +334,20 @@ def check_comparable(rows: Iterable[Row]) -> None:
         if len(found) > 1:
             raise RunError(
                 f"Method '{method}' stands for {len(found)} different selectors in environment '{environment}' "
-                f"({', '.join(sorted(found))}), which are no one population; keep one of them in a folder."
+                f"({', '.join(sorted(found))}), which are not one population; keep one of them in a folder."
             )
     for (environment, seed), found in blocks.items():
         if len(found) > 1:
             raise RunError(
                 f"The cells of seed {seed} in environment '{environment}' began with {len(found)} different sets of "
-                f"files ({', '.join(sorted(found))}) and are no pairs; keep those of one in a folder."
+                f"files ({', '.join(sorted(found))}) and are not pairs; keep those of one in a folder."
             )
 
 
 def check_cells(rows: Iterable[Row]) -> None:
     """Raise ``RunError`` unless every policy is of one cell, and every cell in one environment.
 
-    Of two cells of a policy one would be trained in vain, as ``Results.check`` refuses their rows; two names of one
+    Of two cells of a policy, one would be trained in vain, since ``Results.check`` refuses their rows; two names of one
     cell would share its one result. ``rows`` as in ``check_comparable``.
     """
     policies, homes = defaultdict(set), defaultdict(set)
@@ -372,7 +372,7 @@ def check_cells(rows: Iterable[Row]) -> None:
 def read_table(path: Path, columns: dict[str, type]) -> list[Row]:
     """All whole rows of a table, in which empty cells are NaN in columns of numbers, else None; none if it is missing.
 
-    Raises ``RunError`` if it has other columns, or holds what is no value of its column.
+    Raises ``RunError`` if it has other columns, or a value that does not fit its column.
     """
     try:
         text = read_bytes(path).decode("utf-8-sig")
@@ -418,14 +418,14 @@ def _row(columns: dict[str, type], given: Row) -> Row:
 
 
 def _value(kind: type, given: Any) -> Any:
-    """The value of a column, from the text in a table or from JSON; what is missing is NaN where numbers stand."""
+    """The value of a column, from the text in a table or from JSON; what is missing is NaN in columns of numbers."""
     if kind is tuple:
         parts = given.split() if isinstance(given, str) else given or ()
         return tuple(math.nan if part is None else float(part) for part in parts)
     if kind in (dict, list):
         found: Any = json.loads(given) if given and isinstance(given, str) else given or kind()
         if not issubclass(type(found), kind):
-            raise ValueError(f"{str(given)!r:.80} is no {'table' if kind is dict else 'list'}")
+            raise ValueError(f"{str(given)!r:.80} is not a {'table' if kind is dict else 'list'}")
         return found if kind is list else {name: math.nan if value is None else value for name, value in found.items()}
     if given is None or given == "":
         return math.nan if kind in (int, float) else None

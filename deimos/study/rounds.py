@@ -1,4 +1,4 @@
-"""Attackers that the policies of a study meet beside those of its cells."""
+"""Attackers that the policies of a study meet in addition to those of its cells."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from deimos.study.tables import check_table
 
 @dataclass(frozen=True, kw_only=True)
 class AttackRound:
-    """Attackers that some policies of a study meet beside those of its cells."""
+    """Attackers that some policies of a study meet in addition to those of its cells."""
 
     attackers: tuple[str, ...]
     """Their names, at least 1."""

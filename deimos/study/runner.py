@@ -20,7 +20,7 @@ TAIL_BYTES = 400
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a study stands."""
+    """How far a study is."""
 
     total: int
     """Cells."""
@@ -31,9 +31,9 @@ class Progress:
     running: dict[str, tuple[float, float]]
     """Cells that are being worked on, with the shares of training and of evaluation that are done."""
     share: float
-    """Of the study that is done, in [0, 1]; cells count alike."""
+    """Share of the study that is done, in [0, 1]; cells count alike."""
     seconds_left: float | None
-    """Estimate from what was done so far [s]; ``None`` before anything was."""
+    """Estimate from what was done so far [s]; ``None`` at the start."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Runner:
     workers: int
     """Cells at a time, at least 1."""
     seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """What training and all else of a cell are expected to take; one that is not there takes as long for both."""
+    """What training and everything else of a cell are expected to take [s]; by default the same for both."""
     _before: dict[str, tuple[float, float]] = field(default_factory=dict)  # shares of open cells that were done before
     _begun: set[str] = field(default_factory=set)  # cells begun here
     _active: set[str] = field(default_factory=set)
@@ -60,11 +60,11 @@ class Runner:
     _killed: bool = False
 
     def run(self, report: Callable[[Progress], None], stopped: Callable[[], bool]) -> Progress:
-        """Work until every cell is finished or given up, or until ``stopped()``; returns where the study stands then.
+        """Work until every cell is finished or given up, or until ``stopped()``; returns how far the study is then.
 
         Args:
             report: Called a few times per second.
-            stopped: Asked as often; true lets the running cells write their checkpoints and end.
+            stopped: Called as often; true lets the running cells write their checkpoints and end.
 
         Raises:
             RunError: If another process works on the study.
@@ -87,7 +87,7 @@ class Runner:
                 for job in jobs:
                     job.result()  # raises what was raised there
                 return progress
-            finally:  # nothing is left here but after an error or a second Ctrl-C
+            finally:  # something is left here only after an error or a second Ctrl-C
                 self._stopping = self._killed = True
                 self.engine.kill()
 
@@ -112,7 +112,7 @@ class Runner:
             self._failed[cell.name] = errors[-1]
 
     def _shares(self, cell: Cell) -> tuple[float, float]:
-        """What is done of a cell's training, by the end of its ``timing.csv``, and of its rows of evaluations."""
+        """Shares done of a cell's training, by the end of its ``timing.csv``, and of its rows of evaluations."""
         run = self.study.cell_path(cell) / "run"
         rows = len(cell.goal_periods) * len({"naive", *cell.config.eval.attackers, *self.study.added(cell)})
         try:
@@ -120,11 +120,11 @@ class Runner:
                 file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
                 trained = int(file.read().decode().split("\n")[-2].split(",")[0])  # of the last whole line
         except (OSError, IndexError, ValueError):
-            trained = 0  # none is whole yet
+            trained = 0  # no line is whole yet
         try:
             evaluated = len(read_evaluation(RunFolder(run)))
         except RunError:
-            evaluated = 0  # whoever works on it says what is wrong
+            evaluated = 0  # its worker reports what is wrong
         return min(1.0, trained / cell.config.iterations), min(1.0, evaluated / rows)
 
     def _progress(self, cells: list[Cell], seconds: float) -> Progress:

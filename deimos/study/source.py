@@ -1,4 +1,4 @@
-"""What code a cell's numbers come from: a commit where one says it, else a hash of the sources."""
+"""The code that a cell's numbers come from: a commit if one identifies it, else a hash of the sources."""
 
 import hashlib
 import importlib
@@ -25,7 +25,7 @@ class Code:
     """The code of this process."""
 
     commit: str
-    """The commit that is checked out; empty where this is no checkout or git is missing."""
+    """The commit that is checked out; empty where this is not a checkout or git is missing."""
     changed: tuple[str, ...]
     """Source files that differ from it, or that it does not have."""
     sources: str
@@ -33,12 +33,12 @@ class Code:
 
     @property
     def name(self) -> str:
-        """The commit or, where that does not say all, the sources."""
+        """The commit or, where that is not the whole code, the sources."""
         return self.commit if self.commit and not self.changed else self.sources
 
 
 def code() -> Code:
-    """The code of this process, as it lies on the disk now."""
+    """The code of this process, as it is on the disk now."""
     folders = {name: Path(importlib.import_module(name).__path__[0]) for name in PACKAGES}
     files = {f"{name}/{path.relative_to(folder)}": path for name, folder in folders.items() for path in _files(folder)}
     home = Path(deimos.__file__).resolve().parent.parent
@@ -48,7 +48,7 @@ def code() -> Code:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of a package; those of packages inside, in a wheel, are theirs."""
+    """The files of a package, except those of packages that a wheel has inside it."""
     inner = {folder / name.rpartition(".")[2] for name in PACKAGES if name != "deimos"}
     return [
         path for path in sorted(folder.rglob("*"))
@@ -75,9 +75,9 @@ def import_plugins(names: Iterable[str]) -> None:
     """Import modules that register selectors, attackers or environments; those of the working directory too.
 
     Raises:
-        RunError: If one is not there or is broken.
+        RunError: If one is missing or broken.
     """
-    if os.getcwd() not in map(os.path.abspath, sys.path):  # as ``python -m`` has it, a script of an environment not
+    if os.getcwd() not in map(os.path.abspath, sys.path):  # ``python -m`` adds it, an installed script does not
         sys.path.append(os.getcwd())
     for name in names:
         try:
@@ -88,7 +88,7 @@ def import_plugins(names: Iterable[str]) -> None:
 
 
 def hashes(plugins: Sequence[str], files: Files) -> dict[str, str]:
-    """What a cell's numbers depend on beside its configuration and the code: plugins and files by their SHA-256.
+    """What a cell's numbers depend on besides its configuration and the code: plugins and files by their SHA-256.
 
     Args:
         plugins: Modules, which must be imported; a package counts with all its modules.
@@ -105,7 +105,7 @@ def hashes(plugins: Sequence[str], files: Files) -> dict[str, str]:
 
 
 def _source(module: str) -> bytes:
-    """The source of an imported module, of a package that of all its modules."""
+    """The source of an imported module; of a package, that of all its modules."""
     path = Path(str(sys.modules[module].__file__))
     inner = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
     return b"".join(each.read_bytes() for each in inner)

@@ -1,8 +1,8 @@
-"""Statistics of populations of runs. The unit is one trained policy; robots and episodes are no replicates.
+"""Statistics of populations of runs. The unit is one trained policy; robots and episodes are not replicates.
 
 Samples are float arrays of shape (n,), one value per policy, n at least 2, without NaN; ``ValueError`` otherwise. Every
-interval is two-sided, at ``LEVEL`` unless said; every bootstrap draws ``resamples`` (``None``: ``RESAMPLES``) by its
-``seed``.
+interval is two-sided, at ``LEVEL`` unless stated; every bootstrap draws ``resamples`` (``None``: ``RESAMPLES``) with
+its ``seed``.
 """
 
 import math
@@ -29,7 +29,7 @@ class Interval:
     """An estimate with its interval, which has NaN as its ends where there is none; formats as its numbers do."""
 
     estimate: float
-    """Of the samples themselves."""
+    """Estimate from the samples themselves."""
     low: float
     """Lower end."""
     high: float
@@ -80,7 +80,7 @@ def distribution(
     This is the stratified bootstrap, with one sample per stratum (method or task). ``paired`` samples have the same
     length, and their values are drawn together.
     """
-    with np.errstate(invalid="ignore"):  # scipy's own interval, which is not used, where a value is infinite
+    with np.errstate(invalid="ignore"):  # from scipy's own interval, which is not used, where a value is infinite
         return stats.bootstrap(
             [_checked(x) for x in samples], lambda *x, axis: statistic(*x), vectorized=True,
             n_resamples=resamples or RESAMPLES, method="percentile", rng=np.random.default_rng(seed), paired=paired,
@@ -128,7 +128,7 @@ def student(x: Array) -> Interval:
 def share(holds: NDArray[np.bool_]) -> Interval:
     """Share of the policies that something holds for, with its exact interval [1]_.
 
-    The bootstrap has none where it holds for all or for none.
+    The bootstrap has no interval where it holds for all or for none.
 
     Args:
         holds: One truth value per policy, shape (n,), n at least 1.
@@ -144,7 +144,7 @@ def share(holds: NDArray[np.bool_]) -> Interval:
 def share_of_pairs(x: Array, y: Array) -> Interval:
     """P(X > Y) of values that belong together, ties counting half, with the exact interval of ``share``.
 
-    Ties are lost at its lower end and won at its upper one.
+    Ties count as lost at its lower end and as won at its upper one.
     """
     x, y = _checked(x), _checked(y)
     lost, won = share(x > y), share(x >= y)
@@ -154,7 +154,7 @@ def share_of_pairs(x: Array, y: Array) -> Interval:
 def probability_of_improvement(
     pairs: Sequence[tuple[Array, Array]], *, resamples: int | None = None, seed: int = 0
 ) -> Interval:
-    """P(X > Y), ties counting half, averaged over tasks, of which each has a pair: U / (n m) of Mann and Whitney [1]_.
+    """P(X > Y), ties counting half, averaged over tasks, each with a pair: U / (n m) of Mann and Whitney [1]_.
 
     References:
         .. [1] Agarwal et al., arXiv:2108.13264, section 4.3.
@@ -216,7 +216,7 @@ def detectable_share(n: int, alpha: float = 0.05) -> float:
 
 
 def detectable_mean(x: Array) -> float:
-    """Smallest mean that ``student`` tells from 0 with a power of 80 %, of normal samples of ``x``'s size and spread.
+    """Smallest mean that ``student`` tells from 0 with a power of 80 %, in normal samples of ``x``'s size and spread.
 
     By the noncentral t distribution [1]_.
 

@@ -1,4 +1,4 @@
-"""Checks of what a file of tables says; each message names the key, what it must be and what it was."""
+"""Checks of the contents of a file of tables; each message names the key, what it must be and what it was."""
 
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -36,7 +36,7 @@ def shown(value: Any) -> str:
 def check_table(
     what: str, table: dict, kinds: Mapping[str, tuple[type, type | None]], others: Collection[str] = ()
 ) -> None:
-    """Raise ``RunError`` for a key that a table does not have, or a value of another kind."""
+    """Raise ``RunError`` for a key that is not known, or a value of another kind."""
     check_keys(what, table, {*kinds, *others})
     for key in kinds.keys() & table.keys():
         check_kind(key, table[key], *kinds[key])

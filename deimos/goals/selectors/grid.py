@@ -18,7 +18,7 @@ class Config(SelectorConfig):
     """Goals by the weights of grid cells, which rise around every cell whose goals are tracked well."""
 
     bins: int = 8
-    """Cells along every component of a goal, at least 2. Every group of components has a grid of its own."""
+    """Cells along every component of a goal, at least 2. Every group of components has its own grid."""
     start: float = 0.5
     """Share of the range whose cells have weight 1 at the start, in (0, 1]; the others have weight 0."""
     growth: float = 0.2
@@ -118,8 +118,8 @@ class Grid(GoalSelector):
         """Raise the weights around the cells of goals that were tracked well."""
         done = interactions.resolved(self._learnt_at)
         self._learnt_at = interactions.now
-        if bool((max_over_ranks(self._seen) > 0).all()):
-            self._half.copy_(self._seen)
+        if bool((max_over_ranks(self._seen) > 0).any()):
+            self._half.copy_(self._seen.masked_fill(self._seen == 0, 1.0))  # what never varies is always in one cell
             self.fitted = True
         row = {}
         for i, group in enumerate(self._groups):

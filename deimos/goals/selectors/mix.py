@@ -42,8 +42,11 @@ class Mix(Delegate):
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
         """See ``GoalSelector.propose``."""
-        own = self.current.propose(rows, state, goal, candidates, draws)
-        free = draws[:, 3] < self.config.share
+        share = self.config.share
+        free, others = draws[:, 3] < share, draws.clone()
+        # Where the method chooses, the fourth number is not uniform; it is scaled to be, for methods that use it.
+        others[:, 3] = ((draws[:, 3] - share) / max(1.0 - share, 1e-6)).clamp_(min=0.0)
+        own = self.current.propose(rows, state, goal, candidates, others)
         anything = uniform_proposal(candidates, draws[:, 0]).goal
         return replace(
             own,

@@ -48,7 +48,8 @@ class Swapped(director.Director):
     def ranking(self, state: Tensor, goal: Tensor, candidates: Tensor, score: Tensor, draws: Tensor) -> Tensor:
         """See ``FearSelector.ranking``."""
         other = picks.uniformly(draws[:, 3], self._count.clamp(max=len(self._state)))
-        return self.score(self._state[other], self._goal[other], candidates)
+        swapped = self.score(self._state[other], self._goal[other], candidates)
+        return super().ranking(state, goal, candidates, swapped, draws)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``."""

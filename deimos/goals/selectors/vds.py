@@ -52,7 +52,7 @@ class Config(SelectorConfig):
     epochs: int = 5
     """Passes over every critic's data, at least 1."""
     minibatches: int = 4
-    """Parts that its data are split into, in an order of its own, at least 1."""
+    """Parts that its data are split into, in its own order, at least 1."""
     clip: float = 0.2
     """How far a value may move in one update, positive; infinite for no clipping."""
     max_grad_norm: float = 1.0
