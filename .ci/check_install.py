@@ -1,4 +1,4 @@
-"""Whether what is installed is one package, from which everything imports, and leaves a foreign ``kernels`` alone."""
+"""Check that exactly one package is installed, has everything, and leaves a foreign ``kernels`` alone."""
 
 import base64
 import hashlib

@@ -1,6 +1,6 @@
 """Weights & Biases itself, offline: `python .ci/check_logs.py` (extra wandb).
 
-A run is killed some iterations after its last checkpoint and resumed; the files that `wandb sync` would send hold every
+A run is killed some iterations after its last checkpoint and resumed; the files that `wandb sync` would send have every
 iteration once, with the numbers of progress.csv, and the clips of the policy.
 """
 
@@ -19,7 +19,7 @@ from wandb.proto.wandb_internal_pb2 import Record
 from deimos.run import training
 from deimos.run.folder import RunFolder
 
-SAVED, KILLED, END = 3, 6, 9  # iterations of the last checkpoint, of the kill and in all
+SAVED, KILLED, END = 3, 6, 9  # iterations: of the last checkpoint, of the kill and in all
 FILMED = [3, 6, 9]  # iterations with a video
 RUN = f"""
 import os, signal, sys
@@ -39,13 +39,13 @@ config = TrainConfig(
 )
 training.train(*training.start(config, Path(sys.argv[1])), report)
 """
-BLOCK, HEADER = 32768, 7  # of LevelDB's log format, in which wandb keeps its records
+BLOCK, HEADER = 32768, 7  # of LevelDB's log format, in which wandb stores its records
 
 
 def records(path: Path) -> Iterator[Record]:
-    """The records of a file of wandb's."""
+    """The records of a wandb file."""
     data = path.read_bytes()
-    place, parts = HEADER, b""  # its own header is as long
+    place, parts = HEADER, b""  # the file's header is as long
     while place + HEADER <= len(data):
         if BLOCK - place % BLOCK < HEADER:  # the rest of a block is padding
             place += BLOCK - place % BLOCK

@@ -1,6 +1,6 @@
 """A study on a Ray cluster of two machines, both on this one: `python .ci/check_ray.py` (extras study and cluster).
 
-A worker is killed, then a whole machine; the study finishes with the table of one that ran here, no cell is recorded as
+A worker is killed, then a whole machine; the study finishes with the table of a local one, no cell is recorded as
 failed, and a second run starts nothing.
 """
 
@@ -36,7 +36,7 @@ env = { kind = "particle", variant = "directional", goal_period = 10, max_speed 
 
 
 def table(study: StudyFolder) -> list[list[tuple[str, str]]]:
-    """The results without what depends on the clock, in a fixed order."""
+    """The results without timings, in a fixed order."""
     rows = [[(name, repr(value)) for name, value in row.items() if name != "fps"] for row in study.results().rows]
     return sorted(rows)
 
@@ -64,7 +64,7 @@ def wait_until(what: str, condition, seconds: float = 900.0) -> None:  # noqa: A
 
 
 def parent(process: int) -> int:
-    """The process that began a process."""
+    """The parent of a process."""
     return int(Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[1])
 
 
@@ -84,7 +84,7 @@ def main() -> None:
         wait_until("two cells at a time", lambda: len(train_in(there)) == 2)
         victim, name = next(iter(train_in(there).items()))
         wait_until("a first checkpoint", (there.path / "cells" / name / "run" / "checkpoint.pt").exists)
-        os.kill(parent(victim), signal.SIGKILL)  # Ray's worker; what it had begun ends with it
+        os.kill(parent(victim), signal.SIGKILL)  # Ray's worker; its children end with it
         wait_until(
             "the cell goes on elsewhere", lambda: name in train_in(there).values() and victim not in train_in(there)
         )

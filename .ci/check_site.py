@@ -1,6 +1,6 @@
 """Fail if a page of a built site fetches anything from another host: ``python .ci/check_site.py FOLDER``.
 
-Links that a reader may follow are no matter; scripts, styles, fonts, pictures and frames are.
+Links that a reader may follow are ignored; scripts, styles, fonts, pictures and frames count.
 """
 
 import re
@@ -13,14 +13,14 @@ ELSEWHERE = re.compile(r"^\s*(\w+:)?//")
 
 
 class _Fetches(HTMLParser):
-    """Collects what a page fetches from other hosts."""
+    """Collects the addresses that a page fetches from other hosts."""
 
     def __init__(self) -> None:
         super().__init__()
         self.found: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Look at the addresses of a tag that fetches, and at styles."""
+        """Look at the addresses that a tag fetches, and at styles."""
         for name, value in attrs:
             if tag in FETCHES and name in ("src", "href", "srcset", "data", "poster") and ELSEWHERE.match(value or ""):
                 self.found.append(f"<{tag} {name}={value}>")
@@ -29,12 +29,12 @@ class _Fetches(HTMLParser):
 
 
 def fetched_by_style(text: str) -> list[str]:
-    """Addresses of other hosts that a style sheet fetches."""
+    """Addresses on other hosts that a style sheet fetches."""
     return re.findall(r"(?:url\(|@import)\s*['\"]?((?:\w+:)?//[^'\")\s]+)", text)
 
 
 def fetched(path: Path) -> list[str]:
-    """What a file of a site fetches from other hosts."""
+    """The addresses that a file of a site fetches from other hosts."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".css":
         return fetched_by_style(text)
@@ -46,7 +46,7 @@ def fetched(path: Path) -> list[str]:
 
 
 def main(folder: Path) -> int:
-    """Print what is fetched; returns the exit code."""
+    """Print the fetched addresses; returns the exit code."""
     paths = [path for path in sorted(folder.rglob("*")) if path.suffix in (".html", ".css")]
     if not any(path.name == "index.html" for path in paths):
         print(f"There is no site in {folder}.")

@@ -1,1 +1,1 @@
-"""How fast everything is, beside what else there is: ``python -m benchmarks``."""
+"""How fast everything is, compared with the alternatives: ``python -m benchmarks``."""

@@ -60,19 +60,19 @@ class BenchOptions:
     ]
     """What to measure."""
     against: str = "HEAD"
-    """The other commit of ``commits``: this checkout's training beside it, in processes of their own."""
+    """The other commit for ``commits``: it is trained alternately with this checkout, in separate processes."""
     json: Path | None = None
     """Write all numbers to this file too."""
     rounds: int = 7
-    """Rounds that a ratio is the median of, at least 1."""
+    """Rounds over which ratios are medians, at least 1."""
     threads: int = 0
     """CPU threads, at least 0; 0 takes one per core."""
     device: str = "auto"
-    """Where to measure; auto takes the GPU where there is one."""
+    """Where to measure; auto takes the GPU if there is one."""
     engine: EngineName = "auto"
     """Physics of the robots of ``table41``; auto is warp (mujoco-warp) on a GPU and native on a CPU."""
     seconds: float = math.inf
-    """``table41`` begins no round after so many [s], positive. With ``json`` the same command continues the table."""
+    """``table41`` starts no round after this time [s], positive. With ``json`` the same command continues the table."""
 
     def __post_init__(self) -> None:
         check_positive("seconds", self.seconds)
@@ -83,10 +83,10 @@ class BenchOptions:
 
 
 def run(options: BenchOptions) -> dict[str, Any]:
-    """Measure, print a table per subject, and write the JSON file if asked for.
+    """Measure, print a table per subject, and write the JSON file if one is given.
 
     Raises:
-        RunError: If CUDA is asked for and there is none.
+        RunError: If CUDA is requested but not available.
     """
     device = resolve_device(options.device)
     torch.set_num_threads(options.threads or cores())
@@ -151,7 +151,7 @@ def measure_particle(rounds: int, device: torch.device) -> dict[str, Any]:
 
 
 def measure_legged(name: str, rounds: int, device: torch.device) -> dict[str, Any]:
-    """The step of a legged environment beside the bare simulator, and its column of the thesis's Table 4.1."""
+    """The step of a legged environment against the bare simulator, and its column of the thesis's Table 4.1."""
     results: dict[str, Any] = {"env": quad.measure_env(name, device, rounds)}
     quad.print_env(name, results["env"])
     results["training"] = quad.measure_training(name, device, 3 * rounds)
@@ -160,14 +160,14 @@ def measure_legged(name: str, rounds: int, device: torch.device) -> dict[str, An
 
 
 def measure_engines(rounds: int, device: torch.device) -> dict[str, Any]:
-    """The engines of the legged environments beside each other."""
+    """The engines of the legged environments, compared."""
     results = engines.measure(device, rounds)
     engines.show(results)
     return results
 
 
 def measure_engine_training(rounds: int, device: torch.device) -> dict[str, Any]:
-    """Training on either engine."""
+    """Training on each engine."""
     result = engine_training.measure(device, rounds)
     engine_training.show(result)
     return {"training": result}
@@ -182,14 +182,14 @@ def measure_stability(rounds: int, device: torch.device) -> dict[str, Any]:
 
 
 def measure_terrain(rounds: int, device: torch.device) -> dict[str, Any]:
-    """The making of terrains."""
+    """Building terrains."""
     results = terrain.measure(device, rounds)
     terrain.show(results)
     return results
 
 
 def measure_director(rounds: int, device: torch.device) -> dict[str, Any]:
-    """The Director in other people's loops."""
+    """The Director in other training loops."""
     results = director.measure(device, rounds)
     director.show(results)
     return results

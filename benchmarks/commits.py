@@ -1,4 +1,4 @@
-"""This checkout beside another commit: whole training runs in turn, compared by the times that they write down.
+"""This checkout against another commit: alternating whole training runs, compared by the times that they log.
 
 The two versions share nothing but the command line, so any commit since 0.1.0 can be measured in the same run.
 """
@@ -18,9 +18,9 @@ from deimos.checks import RunError
 from deimos.run.folder import RunFolder
 
 HOME = Path(__file__).resolve().parent.parent
-WARM = 3  # iterations at the start of a run that are not counted: kernels are compiled and memory is found there
+WARM = 3  # iterations at the start of a run that are not counted: kernels are compiled and memory is allocated there
 JOBS = {
-    # The main job, shortened; and so many worlds that the step of the environment lies in memory, not in caches.
+    # The main job, shortened; and so many worlds that the environment's step works in memory, not in caches.
     "2000 worlds": ["--num-envs", "2000", "--env-steps", "960"],
     "65536 worlds": ["--num-envs", "65536", "--env-steps", "192", "--ppo.epochs", "1"],
 }
@@ -30,7 +30,7 @@ def measure(commit: str, rounds: int, threads: int) -> dict[str, Any]:
     """``compare`` with another commit of this repository.
 
     Raises:
-        RunError: If there is no such commit, or a run fails.
+        RunError: If the commit does not exist, or a run fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         other = Path(folder) / "other"
@@ -46,7 +46,7 @@ def compare(other: Path, rounds: int, threads: int, jobs: dict[str, list[str]] =
 
     Args:
         other: Folder of the other checkout.
-        rounds: Runs of each and of each job, in turn, that the figures are medians of.
+        rounds: Alternating runs of each checkout and job, over which figures are medians.
         threads: CPU threads of a run.
         jobs: Options of ``train.py`` by name.
     """

@@ -1,4 +1,4 @@
-"""What ``deimos.GoalDirector`` costs in somebody else's loop, per step of its worlds."""
+"""What ``deimos.GoalDirector`` costs in another training loop, per step of its worlds."""
 
 import contextlib
 import io
@@ -23,7 +23,7 @@ CRASHES = 0.001  # per world and step
 DRAWN, OBSERVED = "candidates drawn", "their clock"
 WAYS = ("uniform", "p25", "rnd", f"p25, {DRAWN}", f"p25, {OBSERVED}")
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-WARM_UP = 100  # periods at most until a fear network has learnt
+WARM_UP = 100  # at most so many periods until a fear network has learnt
 
 
 def measure(
@@ -34,11 +34,11 @@ def measure(
 
     Args:
         device: Where.
-        rounds: Rounds of T steps that a figure is the median of.
+        rounds: Rounds of T steps over which figures are medians.
         sizes: Numbers of worlds.
         period: T, in steps.
-        ways: Methods, on the Director's own clock with candidates from the loop, unless ``DRAWN`` or ``OBSERVED`` is
-            said behind.
+        ways: Methods, on the Director's own clock with candidates from the loop, unless ``DRAWN`` or ``OBSERVED``
+            follows the name.
     """
     rows = []
     for num_envs in sizes:
@@ -53,7 +53,7 @@ def measure(
 
 
 class Timed(GoalDirector):
-    """Counts the seconds that its steps take."""
+    """A Director that adds up the seconds that its steps take."""
 
     seconds = 0.0
 
@@ -66,10 +66,10 @@ class Timed(GoalDirector):
 
 
 def share_of_rsl_rl(iterations: int, num_envs: int = 4096) -> float:
-    """Share of the time of rsl_rl's iterations, at its defaults on a CPU, that a Director's steps take.
+    """Share of an rsl_rl iteration, at its defaults on a CPU, that a Director's steps take.
 
     Args:
-        iterations: How many are timed; twice as many, but at least 8, come first, so that fear has been learnt.
+        iterations: How many are timed; twice as many, but at least 8, run before that, so that fear has been learnt.
         num_envs: Carts of the example.
     """
     from rsl_rl.runners import OnPolicyRunner
@@ -89,10 +89,10 @@ def share_of_rsl_rl(iterations: int, num_envs: int = 4096) -> float:
 
 
 def share_of_sb3(iterations: int, num_envs: int = 64, num_steps: int = 2048) -> float:
-    """Share of the time of Stable-Baselines3's iterations of PPO, at its defaults, that a Director's steps take.
+    """Share of an iteration of Stable-Baselines3's PPO, at its defaults, that a Director's steps take.
 
     Args:
-        iterations: How many are timed; one comes first, so that fear has been learnt.
+        iterations: How many are timed; one runs before that, so that fear has been learnt.
         num_envs: Worlds of the example, CartPole.
         num_steps: Steps of a rollout.
     """
@@ -112,7 +112,7 @@ def share_of_sb3(iterations: int, num_envs: int = 64, num_steps: int = 2048) -> 
 
 
 SHARES = {"rsl_rl, 4096 worlds": share_of_rsl_rl, "Stable-Baselines3, 64 worlds": share_of_sb3}
-"""By whose iterations they are: what measures the share of them that a Director's steps take."""
+"""By learner: the function that measures the share of its iterations that a Director's steps take."""
 
 
 def periods(way: str, num_envs: int, period: int, device: torch.device) -> Callable[[], None]:

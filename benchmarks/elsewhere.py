@@ -1,8 +1,7 @@
-"""The Director in somebody else's loop: Stable-Baselines3's PPO on a cart that follows goals and must not crash.
+"""The Director in a foreign training loop: Stable-Baselines3's PPO on a cart that follows goals and must not crash.
 
-``python -m benchmarks.elsewhere`` trains and attacks a population of policies, one row each in a table that it goes on
-with where it was interrupted, and prints what came out. What is measured, and how it is judged, is declared in
-``docs/lab/elsewhere.md``.
+``python -m benchmarks.elsewhere`` trains and attacks a population of policies, one row each in a table that an
+interrupted run continues, and prints the results. Measurements and analysis are declared in ``docs/lab/elsewhere.md``.
 """
 
 import csv
@@ -35,14 +34,14 @@ METHODS = {"uniform": ("uniform", 0.0), "p75": ("p75", 0.0), "p25": ("p25", 0.0)
 """Goal selector, and what a crash costs in multiples of the largest reward of a step."""
 
 SHOWN = {"worst": "crashes, worst case", "uniform_goals": "crashes, uniform goals", "reward": "reward of a step"}
-"""Columns of the table, and what they are."""
+"""Columns of the table, and their types."""
 
 Choose = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
 """Next goals, shape (n, 1), from the states and the goals of the worlds that are due, shapes (n, 4) and (n, 1)."""
 
 
 def train(method: str, seed: int, steps: int) -> PPO:
-    """A policy of Stable-Baselines3's PPO at its defaults but for 32 worlds of 64 steps, and minibatches of 256."""
+    """Train Stable-Baselines3's PPO at its defaults except for 32 worlds of 64 steps, and minibatches of 256."""
     selector, penalty = METHODS[method]
     box = np.array([-LARGEST]), np.array([LARGEST])
     director = GoalDirector(selector, PERIOD, goal_box=box, learn_every=64, total_steps=steps // 32, seed=seed)
@@ -57,30 +56,30 @@ def train(method: str, seed: int, steps: int) -> PPO:
 
 @dataclass
 class Outcomes:
-    """What became of the goals that were chosen for the worlds of an evaluation."""
+    """Outcomes of the goals chosen in the worlds of an evaluation."""
 
     inputs: np.ndarray
     """State, goal and next goal at the choice, shape (n, 6)."""
     world: np.ndarray
-    """Where, shape (n,)."""
+    """World of each choice, shape (n,)."""
     crashed: np.ndarray
     """Whether the cart crashed within T steps, bool, shape (n,)."""
     reward: float
     """Mean goal-matching reward of a step."""
 
     def rate(self, parity: int | None = None) -> float:
-        """Share of the goals that ended in a crash, in worlds of even (0) or odd (1) number or in all.
+        """Share of the goals that ended in a crash, in even-numbered (0), odd-numbered (1) or all worlds.
 
-        1 where no cart lived to see a goal that was chosen for it.
+        1 if no cart survived until a goal was chosen for it.
         """
         crashed = self.crashed if parity is None else self.crashed[self.world % 2 == parity]
         return float(crashed.mean()) if len(crashed) else 1.0
 
 
 def play(policy: PPO, choose: Choose, seed: int) -> Outcomes:
-    """Run a policy's most likely actions while somebody chooses its goals; first goals are uniform and do not count.
+    """Run a policy's most likely actions under goals from ``ask``; first goals are uniform and do not count.
 
-    gymnasium's ``CartPoleVectorEnv`` begins a world anew on the step after its end, whatever the action.
+    gymnasium's ``CartPoleVectorEnv`` resets a world on the step after its end, whatever the action.
     """
     envs, rng = gymnasium.make_vec("CartPole-v1", WORLDS, "vector_entry_point"), np.random.default_rng(seed)
     state, goal = envs.reset(seed=seed)[0], np.zeros((WORLDS, 1), np.float32)
@@ -92,7 +91,7 @@ def play(policy: PPO, choose: Choose, seed: int) -> Outcomes:
         due = np.flatnonzero((clock == PERIOD) & ~done)
         if len(due):
             chosen = choose(state[due], goal[due], rng)
-            if step + PERIOD <= STEPS:  # of later ones only the crashes would be known at the end
+            if step + PERIOD <= STEPS:  # of later goals only the crashes would be known at the end
                 pending[due] = np.concatenate([state[due], goal[due], chosen], axis=1)
             goal[due], clock[due] = chosen, 0
         action = policy.predict(np.concatenate([state, goal], axis=1), deterministic=True)[0]
@@ -124,7 +123,7 @@ def across(state: np.ndarray, goal: np.ndarray, rng: np.random.Generator) -> np.
 
 
 def most_feared(learnt: Outcomes, seed: int) -> Choose | None:
-    """Who asks for the most feared of 100 uniform goals; ``None`` where no goal, or every one, ended in a crash."""
+    """Attack with the most feared of 100 uniform goals; ``None`` if no goal, or every one, ended in a crash."""
     fear = Fear(FearConfig(epochs=20, minibatches=32), 4, 1, torch.device("cpu"), seed)
     fear.fit_rows(*map(torch.as_tensor, (learnt.inputs, learnt.crashed, np.ones_like(learnt.inputs[:, 0]))))
 
@@ -139,7 +138,7 @@ def most_feared(learnt: Outcomes, seed: int) -> Choose | None:
 def judge(policy: PPO, seed: int) -> dict[str, float]:
     """One policy under uniform goals and under attackers.
 
-    The worst attacker is chosen by the crashes in worlds of even number and reported by those in worlds of odd number.
+    The worst attacker is chosen by the crashes in even-numbered worlds and reported by those in odd-numbered worlds.
     """
     naive = play(policy, anywhere, 10_000 + seed)
     attackers = {"beyond": beyond, "across": across, "argmax": most_feared(naive, seed) or anywhere}
@@ -152,18 +151,18 @@ def judge(policy: PPO, seed: int) -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Train Stable-Baselines3's PPO under goals of several selectors, attack the policies, and print what came out."""
+    """Train Stable-Baselines3's PPO under goals of several selectors, attack the policies, and print the results."""
 
     seeds: tuple[int, ...] = tuple(range(10))
-    """A policy of every method for each; those in the table already are not trained again."""
+    """A policy of every method for each; those already in the table are not trained again."""
     steps: int = 150_000
-    """Steps of a training, at least 1."""
+    """Training steps, at least 1."""
     table: Path = Path("docs/results/elsewhere.csv")
     """Rows, one per policy."""
 
 
 def fill(options: Options) -> None:
-    """Train and judge what is missing in the table; a row is written when it is known."""
+    """Train and evaluate the policies that the table lacks; each row is written when it is finished."""
     for seed in options.seeds:
         for method in METHODS:
             if (method, seed) not in {(row["method"], int(row["seed"])) for row in rows(options.table)}:
@@ -178,7 +177,7 @@ def fill(options: Options) -> None:
 
 
 def rows(table: Path) -> list[dict[str, str]]:
-    """The rows of the table, none where there is no table yet."""
+    """The rows of the table; none if there is no table yet."""
     if not table.exists():
         return []
     with table.open(newline="") as file:

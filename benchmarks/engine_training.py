@@ -1,4 +1,4 @@
-"""How fast a robot's training is on either engine, and how fast it could be if learning cost its products alone."""
+"""How fast a robot trains on each engine, and how fast it could if learning cost only its matrix products."""
 
 import statistics
 from collections.abc import Callable
@@ -17,10 +17,10 @@ from deimos.sim.legged.config import LocomotionConfig
 
 
 def measure(device: torch.device, rounds: int, num_envs: int = 1024) -> dict[str, Any]:
-    """Frames per second of the preset ``quad`` under Uniform, an iteration of each in turn.
+    """Frames per second of the preset ``quad`` under Uniform, alternating iterations of each engine.
 
-    ``limit`` is the ratio that there would be if the update took its floating-point operations at the speed of a large
-    matrix product on as many threads, and everything else as long as it does.
+    ``limit`` is the ratio that would result if the update ran its floating-point operations at the speed of a large
+    matrix product on as many threads, and everything else took as long as it does.
 
     Raises:
         ValueError: If the device is not the CPU, which the native engine is for.

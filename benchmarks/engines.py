@@ -1,4 +1,4 @@
-"""How fast the two engines of legged robots step on a CPU, beside each other and beside the bare native engine."""
+"""How fast the two engines of legged robots step on a CPU, compared with each other and with the bare native engine."""
 
 import statistics
 import time
@@ -20,18 +20,18 @@ from deimos.sim.legged.task import Locomotion
 
 WALKER = Path(__file__).parent.parent / "docs" / "results" / "quad_flat"
 WORLDS, PERIOD = 512, 100
-STEPS = 4  # control steps of a turn
-SETTLE = 50  # control steps before anything is timed: robots that have landed walk
+STEPS = 4  # control steps of a round
+SETTLE = 50  # control steps before anything is timed: robots walk once they have landed
 Seconds = dict[str, list[tuple[float, float]]]
-"""Of every piece of work, in every round: on the clock, and of all cores together."""
+"""Seconds of every piece of work in every round: wall-clock, and CPU time of all cores."""
 
 
 class Walkers:
-    """Robots that the committed policy walks, on one engine.
+    """Robots under the committed walking policy, on one engine.
 
     Args:
         engine: Name of the engine.
-        ground: What they walk on.
+        ground: The ground that they walk on.
         num_envs: How many.
         device: Where.
     """
@@ -48,7 +48,7 @@ class Walkers:
 
     @torch.no_grad()
     def step(self) -> tuple[float, float]:
-        """One control step of all; gives the seconds of ``env.step``, policy and goals apart."""
+        """Run one control step of all; returns the seconds of ``env.step``, without policy and goals."""
         action = self._policy.scaled(self.env.obs)
         begin = time.perf_counter(), time.process_time()
         step = self.env.step(action)
@@ -57,14 +57,14 @@ class Walkers:
         return end[0] - begin[0], end[1] - begin[1]
 
     def bare(self) -> tuple[float, float]:
-        """One control step of the engine alone, under the last targets."""
+        """Run one control step of only the engine, under the last targets."""
         begin = time.perf_counter(), time.process_time()
         self.env.physics.bare_step()
         return time.perf_counter() - begin[0], time.process_time() - begin[1]
 
 
 def measure(device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[str, Any]:
-    """Microseconds of a robot's control step, on the clock and of all cores, on flat and on rough ground.
+    """Microseconds per control step of a robot, wall-clock and of all cores, on flat and on rough ground.
 
     Raises:
         ValueError: If the device is not the CPU, which the native engine is for.
@@ -76,7 +76,7 @@ def measure(device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[s
         native, warp = (Walkers(engine, ground, num_envs, device) for engine in ("native", "warp"))
         work |= {f"native, {ground}": native.step, f"bare native, {ground}": native.bare}
         work |= {f"mujoco-warp, {ground}": warp.step}
-    threads = torch.get_num_threads()  # the native engine's; while worlds are stepped torch has one, as in training
+    threads = torch.get_num_threads()  # the native engine's; torch has one during steps, as in training
     torch.set_num_threads(1)
     seconds = _in_turn(work, rounds)
     torch.set_num_threads(threads)
@@ -98,7 +98,7 @@ def measure(device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[s
 
 
 def _in_turn(work: dict[str, Callable[[], tuple[float, float]]], rounds: int) -> Seconds:
-    """``STEPS`` steps of everything in every round; one more round comes first and is not counted."""
+    """``STEPS`` steps of everything in every round; one more round runs first and is not counted."""
     seconds: Seconds = {name: [] for name in work}
     for _ in range(rounds + 1):
         for name, step in work.items():

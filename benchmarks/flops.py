@@ -1,4 +1,4 @@
-"""Floating-point operations of matrix products, from the sizes of networks: what an iteration cannot cost less than."""
+"""Floating-point operations of matrix products, from the sizes of networks: a lower bound on an iteration's cost."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -9,7 +9,7 @@ from deimos.goals.selectors import rnd, vds
 from deimos.learn.ppo import PPOConfig
 from deimos.sim.env import Env
 
-TRAINING = 3  # passes that learning from a row takes: forward, by the weights, by the inputs
+TRAINING = 3  # passes to learn from a row: forward, gradient of the weights, gradient of the inputs
 
 
 def forward(inputs: int, hidden: Sequence[int], outputs: int) -> float:
@@ -19,7 +19,7 @@ def forward(inputs: int, hidden: Sequence[int], outputs: int) -> float:
 
 
 def scoring(context: int, goal: int, hidden: Sequence[int], outputs: int, count: int) -> float:
-    """Operations of a network for ``count`` candidate goals of one context, whose first layer's share is made once."""
+    """Operations of a network for ``count`` candidate goals of one context, whose first-layer part is computed once."""
     each = forward(context + goal, hidden, outputs) - 2.0 * context * hidden[0]
     return 2.0 * context * hidden[0] + count * each
 
@@ -31,7 +31,7 @@ def of_learner(ppo: PPOConfig, env: Env) -> float:
 
 
 def of_selector(selector: SelectorConfig, ppo: PPOConfig, env: Env) -> float:
-    """Operations that a goal selector adds to an iteration; negative where it takes the critic's work away.
+    """Operations that a goal selector adds to an iteration; negative if it replaces the critic's work.
 
     Selectors without networks add none.
     """

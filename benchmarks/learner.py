@@ -1,4 +1,4 @@
-"""A minibatch of the learner beside one large matrix product: how much of what a CPU can do its networks reach."""
+"""A minibatch of the learner against one large matrix product: which share of a CPU's speed the networks reach."""
 
 import os
 import statistics
@@ -44,11 +44,11 @@ CASES = (
     Case("ten critics, [64, 64]", 12, (64, 64), 0, 10, "relu", 12_000),
 )
 Work = dict[str, tuple[Callable[[], Any], float]]
-"""By name, what to do and its operations."""
+"""By name, the work to do and its number of operations."""
 
 
 def operations(case: Case) -> float:
-    """Floating-point operations of a minibatch, forwards and backwards, without losses and activations."""
+    """Floating-point operations of a minibatch, forward and backward, without losses and activations."""
     total = 0
     for outputs, count in ((case.actions, int(case.actions > 0)), (1, case.critics)):
         products = [a * b for a, b in pairwise((case.inputs, *case.hidden, outputs))]
@@ -57,7 +57,7 @@ def operations(case: Case) -> float:
 
 
 def update(case: Case, kernel: bool) -> Callable[[], object]:
-    """A minibatch's gradients of PPO's surrogate and value loss."""
+    """The gradients of PPO's surrogate and value loss on a minibatch."""
     generator = torch.Generator().manual_seed(0)
     sizes = case.hidden, case.activation
     x = torch.randn(case.inputs, case.rows, generator=generator).t()
@@ -71,7 +71,7 @@ def update(case: Case, kernel: bool) -> Callable[[], object]:
     work.append((critics, x, ValueLoss(torch.randn(case.critics, 3, case.rows, generator=generator), 0.2)))
     for nets, _, _ in work:
         nets._kernel = nets._kernel if kernel else None
-    threads = 1 if kernel else torch.get_num_threads()  # the kernel's own threads want no others beside them
+    threads = 1 if kernel else torch.get_num_threads()  # the kernel's own threads should have no others to compete with
 
     def learn() -> None:
         with on_threads(threads):
@@ -81,10 +81,10 @@ def update(case: Case, kernel: bool) -> Callable[[], object]:
 
 
 def large_products() -> Work:
-    """The large product, by the libraries that torch has for it."""
+    """The large product, by each of torch's libraries for it."""
     a = torch.randn(LARGE, LARGE)
     found: Work = {"large product, torch.mm": (lambda: torch.mm(a, a), 2.0 * LARGE**3)}
-    linear = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch: only compared with
+    linear = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch: only used for comparison
     if linear is not None and torch.backends.mkldnn.is_available():
         found["large product, oneDNN"] = (lambda: linear(a, a, None, "none", [], ""), 2.0 * LARGE**3)
     return found
@@ -92,7 +92,7 @@ def large_products() -> Work:
 
 @contextmanager
 def busy_core(busy: bool) -> Iterator[None]:
-    """Another program that never waits, on one of the cores that this process may use."""
+    """Another program that never waits, on one of this process's cores."""
     if not busy:
         yield
         return
@@ -109,10 +109,10 @@ def busy_core(busy: bool) -> Iterator[None]:
 def measure(rounds: int, cases: Sequence[Case] = CASES) -> list[dict[str, Any]]:
     """Milliseconds, GFLOP/s and share of the best large product of the same round, for every case, kernel and torch.
 
-    Threads are torch's number. Every case is also timed beside a busy core.
+    The number of threads is torch's. Every case is also timed next to a busy core.
 
     Args:
-        rounds: Rounds, everything in turn, that figures are medians of.
+        rounds: Rounds, alternating everything, over which figures are medians.
         cases: What to measure.
     """
     rows = []
@@ -135,11 +135,11 @@ def measure(rounds: int, cases: Sequence[Case] = CASES) -> list[dict[str, Any]]:
 
 
 def _rates(work: Work, rounds: int) -> dict[str, list[float]]:
-    """GFLOP/s of everything in every round; one more comes first and is not counted."""
+    """GFLOP/s of everything in every round; one more round runs first and is not counted."""
     rates: dict[str, list[float]] = {name: [] for name in work}
     for i in range(rounds + 1):
         for name, (function, count) in work.items():
-            time.sleep(0.02)  # until the threads of OpenMP, which wait in a loop, have fallen asleep
+            time.sleep(0.02)  # until OpenMP's threads, which wait in a loop, are asleep
             function()  # in training one minibatch follows another: caches are warm
             begin = time.perf_counter()
             function()

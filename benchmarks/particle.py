@@ -1,4 +1,4 @@
-"""How fast Particle Gym steps, beside the same step in eager torch and in NumPy."""
+"""How fast Particle Gym steps, compared with the same step in eager torch and in NumPy."""
 
 import statistics
 from collections.abc import Callable
@@ -24,10 +24,10 @@ OPERATIONS_PER_STEP = 52
 
 def measure_env(num_envs: int, device: torch.device, rounds: int) -> dict[str, float]:
     """Throughput of the bare kernel, of ``env.step``, and of the same step in eager torch and in NumPy."""
-    config = particle.Config(goal_period=10**9)  # no events: a step is nothing but a step
+    config = particle.Config(goal_period=10**9)  # no events: nothing but the step is timed
     env = config.build(num_envs, device, seed=0)
     action = torch.zeros(num_envs, 3, device=device)
-    steps = max(2, 1_000_000 // num_envs)  # few enough that no particle leaves the cube at rest
+    steps = max(2, 1_000_000 // num_envs)  # few enough that no particle, starting at rest, leaves the cube
 
     def repeat(function: Callable[[], Any]) -> Callable[[], None]:
         def work() -> None:

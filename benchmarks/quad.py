@@ -1,4 +1,4 @@
-"""How fast the legged environments step beside the bare simulator, and how fast they train under every selector."""
+"""How fast the legged environments step, against the bare simulator, and how fast they train under every selector."""
 
 import statistics
 from collections.abc import Callable
@@ -20,18 +20,18 @@ from deimos.sim.legged.task import Locomotion
 from reproduction.thesis import TABLE_4_1
 
 WORLDS = 512
-PERIOD = 100  # T of the training that is timed: a fifth of the presets', so that selectors choose five times as often
+PERIOD = 100  # T of the timed training: a fifth of the presets', so that selectors choose five times as often
 METHODS_TIMED: dict[str, SelectorConfig] = {name: method(name) for name in ("uniform", "p25", "rnd", "vds", "cl")} | {
     "vds, own shares": vds.Config(data="share", epochs=3)
 }
-STEPS = 4  # control steps of a turn
+STEPS = 4  # control steps of a round
 SETTLE = 50  # control steps before anything is timed: robots that have landed touch the ground with all feet
 
 
 def measure_env(name: str, device: torch.device, rounds: int, num_envs: int = WORLDS) -> dict[str, Any]:
-    """Control steps per second of ``env.step`` and of mujoco-warp's captured substeps alone, on flat and rough ground.
+    """Control steps per second of ``env.step`` and of only mujoco-warp's captured substeps, on flat and rough ground.
 
-    Both run in the same environment in turn, so that the robots of both are in the same poses.
+    Both alternate in the same environment, so that robots are in the same poses for both.
     """
     config = preset(name).env
     assert isinstance(config, LocomotionConfig)
@@ -68,7 +68,8 @@ def measure_training(name: str, device: torch.device, rounds: int, num_envs: int
     """A legged column of Table 4.1: an environment's preset with fewer worlds and a shorter T.
 
     The clocks of the goals are staggered, so that selectors have the same work in every iteration. A fear network
-    learns and chooses once it has seen robots that fall and robots that do not: before anything is timed with this T.
+    learns and chooses once it has seen robots that fall and robots that do not; with this T, that is before anything is
+    timed.
     """
     base = preset(name)
     env = base.env.with_goal_period(PERIOD)

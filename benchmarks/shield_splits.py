@@ -1,4 +1,4 @@
-"""``python -m benchmarks.shield_splits RUN``: does a shield keep what it promises, over many calibrations?
+"""``python -m benchmarks.shield_splits RUN``: does a shield's guarantee hold, over many calibrations?
 
 Crashes of a policy under uniform goals, one from each world, are split at random many times: a shield is calibrated on
 one part and tested on the rest.
@@ -24,12 +24,12 @@ from deimos.run.folder import RunFolder
 from deimos.run.shield import collect
 from deimos.run.training import read_config
 
-TESTED = 1000  # crashes that a split is tested on at least
+TESTED = 1000  # least number of crashes that a split is tested on
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitOptions:
-    """Calibrate a run's shield many times, and count how often it lets more through than it should."""
+    """Calibrate a run's shield many times, and count how often it lets through more than it should."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -40,13 +40,13 @@ class SplitOptions:
     splits: int = 200
     """Random splits, at least 1."""
     worlds: int = 20_000
-    """Worlds of a batch, at least 1; batches go on until there are enough crashes."""
+    """Worlds of a batch, at least 1; batches are run until there are enough crashes."""
     most: int = 20
-    """Batches after which it gives up, at least 1."""
+    """Largest number of batches, at least 1."""
     steps: int = 1000
     """Steps of every world, at least 2 T."""
     json: Path | None = None
-    """Write what was found to this file too."""
+    """Write the results to this file too."""
 
     def __post_init__(self) -> None:
         check_range("alpha", self.alpha, 1e-6, 1 - 1e-6)
@@ -62,7 +62,7 @@ def split(score: Tensor, alpha: float, calibration: int, splits: int, guarantee:
         alpha: Largest miss rate.
         calibration: Crashes of the n that each shield is calibrated on.
         splits: Random splits.
-        guarantee: What is promised.
+        guarantee: The guarantee.
     """
     random = torch.Generator().manual_seed(0)
     rates = []

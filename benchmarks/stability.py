@@ -30,8 +30,8 @@ def measure(device: torch.device, world_steps: int = WORLD_STEPS, num_envs: int 
     """Let the committed policy explore rough ground, with pushes, noise, levels and resets as in training.
 
     Returns:
-        World-steps, those that were invalid and their share, crashes, seconds, and mean
-        level and the process's memory [MiB] at ``REPORTS`` moments.
+        World-steps, invalid ones and their share, crashes, seconds, and mean level and the process's memory [MiB] at
+        ``REPORTS`` moments.
 
     Raises:
         SimulationError: If too many world-steps are invalid, or an action is not finite.
@@ -65,7 +65,7 @@ def measure(device: torch.device, world_steps: int = WORLD_STEPS, num_envs: int 
 
 
 def measure_builds(count: int = BUILDS) -> tuple[list[float], list[float]]:
-    """Make and drop environments on rough ground: memory of the process [MiB] after each, and its CPU time [s]."""
+    """Build and drop environments on rough ground: memory of the process [MiB] after each, and its CPU time [s]."""
     config, memory, seconds = quad.Config(terrain="rough"), [], []
     for _ in range(count):
         begin = time.process_time()
@@ -76,7 +76,7 @@ def measure_builds(count: int = BUILDS) -> tuple[list[float], list[float]]:
 
 
 def _memory() -> float:
-    """Memory of this process [MiB]: what it holds now, or where the system does not say, the most that it has held."""
+    """Memory of this process [MiB]: its current use or, if the system does not report that, its peak use."""
     status = Path("/proc/self/statm")
     if status.exists():
         return int(status.read_text().split()[1]) * resource.getpagesize() / 2**20

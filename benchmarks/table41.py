@@ -1,8 +1,8 @@
 """The thesis's Table 4.1: how fast each method trains in its five environments, all of them in one run.
 
-A round lets every method of every environment train for as long as each of its worlds needs to get a goal, one after
-another, so that whatever else the machine does falls on all alike. Speeds are medians over rounds, and what can be
-compared with the thesis is their ratios to Uniform's, each within a round.
+In a round every method of every environment trains for as long as each of its worlds needs to get a goal, one after
+another, so that other load on the machine affects all alike. Speeds are medians over rounds; comparable with the thesis
+are their ratios to Uniform's, each within a round.
 """
 
 import json
@@ -32,8 +32,8 @@ TITLES = {"p25": "DEIMOS (p25)", "rnd": "RND", "uniform": "Uniform", "vds": "VDS
 """The table's methods, in the thesis's order."""
 ROBOTS = 256
 PERIOD = 100  # T of the robots: a fifth of the presets', so that selectors choose five times as often
-WARM_UP = 2  # iterations before anything is timed, and as many more as a fear network needs to learn at all
-MOST = 20  # goals of every world that it may take to
+WARM_UP = 2  # iterations before anything is timed, and as many more as a fear network needs until its first fit
+MOST = 20  # goals of every world that this may take
 
 Round = dict[str, Any]
 """``seconds`` of every environment and method, the ``load`` of the host before it, and the ``cores`` that it had."""
@@ -44,19 +44,19 @@ class Column:
     """An environment of the table."""
 
     config: TrainConfig
-    """What is trained; its method does not count."""
+    """What is trained; its method is ignored."""
     methods: tuple[str, ...]
     """Names of the methods, ``uniform`` among them."""
 
     @property
     def iterations(self) -> int:
-        """Of a turn: where goals fall due in all worlds at once, as many as it takes until they do."""
+        """Iterations of a turn: if goals fall due in all worlds at once, as many as it takes until they do."""
         due_at_once = not getattr(self.config.env, "stagger_goals", True)
         return math.ceil(self.config.env.goal_period / self.config.ppo.num_steps) if due_at_once else 1
 
     @property
     def transitions(self) -> int:
-        """Of a turn."""
+        """World-steps of a turn."""
         return self.iterations * self.config.num_envs * self.config.ppo.num_steps
 
 
@@ -84,15 +84,15 @@ def measure(
     table: Mapping[str, Column], rounds: int, device: torch.device, *, seconds: float = math.inf,
     keep: Callable[[list[Round]], None] = lambda rounds: None, known: list[Round] | None = None,
 ) -> list[Round]:  # fmt: skip
-    """Time rounds until there are enough of them, or time is up.
+    """Time rounds until there are enough of them or time is up.
 
     Args:
         table: The environments and methods.
-        rounds: How many rounds are wanted, those that are known included.
+        rounds: How many rounds are wanted, including the known ones.
         device: Where.
-        seconds: No round begins so long after the call [s], but for a first one.
-        keep: Told all rounds after each.
-        known: Rounds of former calls.
+        seconds: No round except the first starts later than this after the call [s].
+        keep: Called with all rounds after each.
+        known: Rounds of earlier calls.
 
     Returns:
         All rounds, the known ones first.
@@ -121,7 +121,7 @@ def measure(
 
 
 def _warm_up(trainer: Trainer) -> None:
-    """Train until memory has been found and fear, if there is any, has learnt."""
+    """Train until memory has been allocated and fear, if any, has learnt."""
     afraid = fear_selector(trainer.loop.selector)
     while trainer.iteration < WARM_UP or (afraid and not afraid.fear.fitted):
         if trainer.iteration * trainer.config.ppo.num_steps > MOST * trainer.config.env.goal_period:
@@ -139,7 +139,7 @@ def _turn(trainer: Trainer, column: Column, device: torch.device) -> float:
 
 
 def continued(path: Path | None, results: dict[str, Any]) -> list[Round]:
-    """The rounds that a file holds already; none if it is not there.
+    """The rounds in a file; none if it does not exist.
 
     Raises:
         RunError: If they belong to another commit, device, engine or number of threads.
@@ -159,7 +159,7 @@ def run(results: dict[str, Any], rounds: int, device: torch.device, path: Path |
     """Measure the table, print it, and keep every round in a file, so that the same command continues it.
 
     Args:
-        results: What the rounds of one table have in common; ``table41`` is added.
+        results: The entries that the rounds of one table have in common; ``table41`` is added.
         rounds: See ``measure``.
         device: Where.
         path: The file; ``None`` for none.
@@ -183,7 +183,7 @@ def run(results: dict[str, Any], rounds: int, device: torch.device, path: Path |
 
 
 def speeds(table: Mapping[str, Column], rounds: list[Round]) -> list[dict[str, Any]]:
-    """For every environment and method the frames per second and their ratio to Uniform's, both over rounds.
+    """Frames per second of every environment and method, and their ratio to Uniform's, both over rounds.
 
     Returns:
         ``environment``, ``method``, ``fps`` (median), and the quartiles ``low``, ``ratio`` and ``high`` of the ratio.
@@ -199,7 +199,7 @@ def speeds(table: Mapping[str, Column], rounds: list[Round]) -> list[dict[str, A
 
 
 def show(table: Mapping[str, Column], rounds: list[Round]) -> None:
-    """Print the table in frames per second and as ratios beside the thesis's, and how busy the host was."""
+    """Print the table in frames per second and as ratios next to the thesis's, and how busy the host was."""
     found = {(row["environment"], row["method"]): row for row in speeds(table, rounds)}
     fps = Table("method", *table, title="Frames per second in training, all worlds together", title_justify="left")
     ratios = Table(

@@ -1,7 +1,7 @@
-"""How fast terrains are made.
+"""How fast terrains are built.
 
-The machine may be shared and noisy. Mesh and rays are therefore measured in turn, round after round, and a figure is
-the median of the rounds.
+The machine may be shared and noisy. Therefore mesh and rays are measured alternately, round after round, and a figure
+is the median of the rounds.
 """
 
 import statistics
@@ -21,12 +21,12 @@ from benchmarks.timing import in_turn, wide_console
 
 
 def measure(device: torch.device, rounds: int, grids: Sequence[Grid] | None = None) -> dict[str, Any]:
-    """Seconds that mesh and ray casts of each preset take, by the median of some rounds, and the memory used.
+    """Seconds that mesh and ray casts of each preset take, as medians of some rounds, and the memory used.
 
     Args:
-        device: Of the ray casts.
-        rounds: Rounds that a figure is the median of.
-        grids: In place of the presets, in their order.
+        device: Where rays are cast.
+        rounds: Rounds over which figures are medians.
+        grids: Grids to use in place of the presets, in their order.
     """
     build(presets.preset("go1", levels=1, columns=1), device=str(device))  # compiles the kernel
     rows = []
@@ -49,7 +49,7 @@ def measure(device: torch.device, rounds: int, grids: Sequence[Grid] | None = No
 
 
 def peak_memory() -> float | None:
-    """Most memory that this process has held so far [MiB], where the system tells."""
+    """Peak memory of this process so far [MiB], if the system reports it."""
     try:
         import resource
     except ImportError:  # Windows

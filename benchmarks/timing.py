@@ -1,7 +1,7 @@
-"""Times of things that are compared.
+"""Timing of things that are compared.
 
-The machine may be shared and noisy. What is compared is therefore measured in turn, round after round,
-and a ratio is the median of the rounds' ratios.
+The machine may be shared and noisy. Therefore things to be compared are measured alternately, round after round, and a
+ratio is the median of the rounds' ratios.
 """
 
 import statistics
@@ -14,7 +14,7 @@ from rich.console import Console
 
 
 def in_turn(work: dict[str, Callable[[], Any]], rounds: int, device: torch.device) -> dict[str, list[float]]:
-    """Seconds of every piece of work in every round; one more round comes first and is not counted."""
+    """Seconds of every piece of work in every round; one more round runs first and is not counted."""
     seconds: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(rounds + 1):
         for name, function in work.items():
@@ -27,12 +27,12 @@ def in_turn(work: dict[str, Callable[[], Any]], rounds: int, device: torch.devic
 
 
 def ratio(slow: list[float], fast: list[float]) -> float:
-    """Median over rounds of how many times as long the first takes."""
+    """Median over rounds of how many times as long the first takes as the second."""
     return statistics.median(a / b for a, b in zip(slow, fast, strict=True))
 
 
 def wide_console() -> Console:
-    """A console for tables: what goes to a file or a pipe is not cut to the width of a terminal."""
+    """A console for tables: output to a file or a pipe is not cut to the width of a terminal."""
     console = Console()
     return console if console.is_terminal else Console(width=120)
 

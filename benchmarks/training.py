@@ -1,4 +1,4 @@
-"""How fast training is under every goal selector, beside Uniform, beside rsl_rl and beside the thesis's Table 4.1."""
+"""How fast training is under every goal selector, compared with Uniform, rsl_rl and the thesis's Table 4.1."""
 
 import contextlib
 import io
@@ -21,24 +21,24 @@ from deimos.run.trainer import TrainConfig, Trainer
 METHODS_TIMED: dict[str, SelectorConfig] = {
     name: method(name) for name in ("uniform", "p25", "rnd", "learnability", "plr", "grid", "vds", "vds-auxiliary")
 } | {"vds, own shares": vds.Config(data="share", epochs=3)}
-"""What is timed: a method of each kind, and VDS with the price of each of its options."""
-OFTEN = 4  # times as many rounds for methods that differ from Uniform by less than a round does from the next
+"""The methods that are timed: one of each kind, and VDS with the cost of each of its options."""
+OFTEN = 4  # times as many rounds for methods that differ from Uniform by less than rounds differ from each other
 
 
 def measure_training(
     config: TrainConfig, methods: Mapping[str, SelectorConfig], thesis: Mapping[str, int], device: torch.device,
     rounds: int, *, length: int | None = None, warm_up: int = 4, beside_rsl_rl: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Training speed of every method on one environment, iteration by iteration in turn.
+    """Training speed of every method on one environment, alternating iteration by iteration.
 
     Args:
-        config: What to train; its method does not count.
+        config: What to train; its method is ignored.
         methods: Selectors by name, ``uniform`` among them.
         thesis: Thousands of frames per second in the thesis, by name.
         device: Where.
-        rounds: Rounds that a ratio is the median of.
+        rounds: Rounds over which ratios are medians.
         length: Iterations of a round; ``None`` for as many as it takes for every world to get at least one goal. 1 is
-            enough where goals fall due at a different time in every world.
+            enough if goals fall due at a different time in every world.
         warm_up: How often every world gets a goal before anything is timed, so that fear networks see both classes.
         beside_rsl_rl: Whether to time rsl_rl's own loop on the same environment too, if it is installed.
     """
@@ -88,14 +88,14 @@ def measure_training(
 def measure_in_groups(
     config: TrainConfig, thesis: Mapping[str, int], device: torch.device, rounds: int, *, everything: bool
 ) -> dict[str, Any]:
-    """``measure_training`` of ``METHODS_TIMED``: the cheap methods in more rounds, VDS by itself beside Uniform.
+    """``measure_training`` of ``METHODS_TIMED``: the cheap methods in more rounds, VDS separately with Uniform.
 
     Args:
         config: What to train.
         thesis: Thousands of frames per second in the thesis, by name.
         device: Where.
         rounds: Rounds for VDS; the others get ``OFTEN`` times as many.
-        everything: Whether to time all methods, and rsl_rl, or those of the thesis alone.
+        everything: Whether to time all methods and rsl_rl, or only those of the thesis.
     """
     methods = {name: selector for name, selector in METHODS_TIMED.items() if everything or name in thesis}
     dear = {name: selector for name, selector in methods.items() if isinstance(selector, vds.Config)}
@@ -107,7 +107,7 @@ def measure_in_groups(
 
 
 def machine(device: torch.device) -> dict[str, float]:
-    """What bounds everything here: large matrix products, and copies of memory by one core."""
+    """The bounds on everything here: large matrix products, and copies of memory by one core."""
     a = torch.randn(2048, 2048, device=device)
     big, copy = (torch.zeros(2**24, device=device) for _ in range(2))
     threads = torch.get_num_threads()

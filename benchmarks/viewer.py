@@ -1,4 +1,4 @@
-"""What ``deimos view`` sends at real time, and what it costs a training beside it; without a browser."""
+"""What ``deimos view`` sends in real time, and what it costs a training run next to it; without a browser."""
 
 import asyncio
 import os
@@ -22,28 +22,28 @@ from benchmarks.timing import wide_console
 from deimos.checks import RunError
 
 ROBOT = HOME / "docs" / "results" / "quad_flat"
-VERSION = 120  # bytes of what a page and the viewer tell each other of their versions, before anything else
+VERSION = 120  # bytes of the versions that a page and the viewer exchange before anything else
 TRAINING = ["--num-envs", "2000", "--env-steps", "960", "--threads", "1"]
 
 
 class Page:
-    """What a browser does for the page, but for drawing it: it loads the model, takes control, receives states.
+    """What a browser does for the page, except drawing it: it loads the model, takes control, receives states.
 
     Args:
-        port: Of the viewer, on 127.0.0.1.
+        port: Port of the viewer, on 127.0.0.1.
     """
 
     def __init__(self, port: int) -> None:
         self._address = f"127.0.0.1:{port}"
         self.states: list[tuple[float, bytes]] = []
-        """When each state frame arrived [s], and what is in it."""
+        """When each state frame arrived [s], and its content."""
         self.drawn = 0
         """Messages of the panel."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def get(self, path: str) -> tuple[dict[str, str], bytes]:
-        """Load a file: its headers, in lower case, and what is in it."""
+        """Load a file: its headers, in lower case, and its content."""
         with urllib.request.urlopen(f"http://{self._address}{path}", timeout=60) as answer:
             return {name.lower(): value for name, value in answer.headers.items()}, answer.read()
 
@@ -66,7 +66,7 @@ class Page:
         from websockets.asyncio.client import connect
 
         options: dict[str, Any] = {"max_size": None, "ping_interval": None, "compression": None}
-        # The viewer talks to pages of its own version alone, and tells it to whoever asks.
+        # The viewer talks only to pages of its own version, and tells its version to any client that asks.
         async with connect(f"ws://{self._address}/ui?sid=asks", **options) as asking:
             await asking.send(bytes(VERSION))
             version = await asking.recv()
@@ -98,7 +98,7 @@ class Page:
 
 @contextmanager
 def serving(run: Path) -> Iterator[int]:
-    """``deimos view`` in a process of its own; gives its port.
+    """Start ``deimos view`` in a separate process; returns its port.
 
     Raises:
         RunError: If it does not start.
@@ -122,12 +122,12 @@ def serving(run: Path) -> Iterator[int]:
 
 
 def measure(rounds: int, seconds: float = 20.0, options: list[str] | None = None) -> dict[str, Any]:
-    """State frames per second for one Go1, the viewer's processor time, and a training's speed beside it and alone.
+    """State frames per second for one Go1, the viewer's processor time, and training speed next to it and alone.
 
     Args:
-        rounds: Trainings of each kind, in turn.
+        rounds: Alternating training runs of each kind.
         seconds: How long frames are counted [s], positive.
-        options: Of ``train.py``; by default the main job, shortened, on one thread.
+        options: Options of ``train.py``; by default the main job, shortened, on one thread.
     """
     with serving(ROBOT) as port, Page(port) as page:
         sent = _frames_per_second(page, seconds)

@@ -12,7 +12,7 @@ LARGEST = 0.8  # goals are leans in [-LARGEST, LARGEST] [rad]; the motor can hol
 
 
 class Balance(gym.Wrapper):
-    """Pendulum-v1 that starts upright, ends when it has fallen over, and has a place for a goal in its observation."""
+    """Pendulum-v1 that starts upright, ends when it has fallen over, and has a slot for a goal in its observation."""
 
     def __init__(self) -> None:
         super().__init__(gym.make("Pendulum-v1"))
@@ -25,19 +25,19 @@ class Balance(gym.Wrapper):
         return np.append(obs, np.float32(0.0)), info
 
     def step(self, action: np.ndarray) -> tuple:
-        """The pendulum has fallen when it is below the horizontal."""
+        """End the episode when the pendulum is below the horizontal."""
         obs, reward, _, truncated, info = self.env.step(action)
         return np.append(obs, np.float32(0.0)), reward, bool(obs[0] < 0), truncated, info
 
 
 def controller(obs: np.ndarray) -> np.ndarray:
-    """Torques [Nm] that hold the lean at the end of the observation, within what the motor can do; a policy's place."""
+    """Torques [Nm] that hold the observation's lean, within the motor's limits; stands in for a policy."""
     angle, lean = np.arctan2(obs[:, 1], obs[:, 0]), obs[:, 3]
     return np.clip(-15.0 * (angle - lean) - 4.0 * obs[:, 2] - 5.0 * np.sin(lean), -2.0, 2.0)[:, None]
 
 
 def main() -> None:
-    """Let the Director ask for leans, and say which of them it has learnt to fear."""
+    """Let the Director ask for leans, and print which of them it has learnt to fear."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--num-envs", type=int, default=64)

@@ -1,8 +1,8 @@
-"""A Director as a command term of Isaac Lab: its velocity commands are those that a robot is likely to fall over.
+"""A Director as a command term of Isaac Lab: its velocity commands are those that are likely to make a robot fall.
 
 In a velocity task: ``commands.base_velocity = DirectedVelocityCfg(**vars(commands.base_velocity))``; train as usual.
-The package does not run without Isaac Sim: our tests run this against a stub of its command manager and of its
-environment, written after the source of 2.3.2.
+Isaac Lab does not run without Isaac Sim: our tests run this against a stub of its command manager and its environment,
+written after the source of 2.3.2.
 """
 
 import math
@@ -35,6 +35,6 @@ class DirectedVelocity(DirectedCommand, UniformVelocityCommand):
 
 @configclass
 class DirectedVelocityCfg(UniformVelocityCommandCfg):
-    """What makes one."""
+    """Configuration of the term."""
 
     class_type: type = DirectedVelocity

@@ -1,10 +1,10 @@
-"""A Director in mjlab's own training: its Go1 follows the velocities that it is likely to fall over."""
+"""A Director in mjlab's own training: its Go1 follows velocities that are likely to make it fall."""
 
 import argparse
 import math
 from dataclasses import asdict
 
-import mjlab.tasks  # noqa: F401 - it registers the tasks
+import mjlab.tasks  # noqa: F401 - registers the tasks
 import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
@@ -38,7 +38,7 @@ class DirectedVelocityCfg(UniformVelocityCommandCfg):  # noqa: D101
 
 
 def main() -> None:
-    """Train, and say which forward velocities the robot has to fear as it stands."""
+    """Train, and print the fear of forward velocities in the robot's current state."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=300)
     parser.add_argument("--num-envs", type=int, default=4096)

@@ -1,4 +1,4 @@
-"""A Director in rsl_rl's own training loop, on carts that are not Deimos': follow a speed, stay on the track."""
+"""A Director in rsl_rl's own training loop, on carts that are not part of Deimos: follow a speed, stay on the track."""
 
 import argparse
 
@@ -11,7 +11,7 @@ from deimos import GoalDirector
 
 
 class Carts(VecEnv):
-    """Carts on a track of 2 m. An action accelerates [m/s^2]; the goal is a speed [m/s]; off the track is a crash."""
+    """Carts on a 2 m track. An action accelerates [m/s^2]; the goal is a speed [m/s]; leaving the track is a crash."""
 
     def __init__(self, director: GoalDirector, num_envs: int = 256) -> None:
         self.num_envs, self.num_actions, self.max_episode_length, self.device, self.cfg = num_envs, 1, 500, "cpu", {}
@@ -34,7 +34,7 @@ class Carts(VecEnv):
 
 
 def main() -> None:
-    """Train, and say which speeds the policy has to fear close to the end of the track."""
+    """Train, and print the fear of goal speeds close to the end of the track."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--resume", help="a checkpoint to go on from, as this leaves in carts.pt")

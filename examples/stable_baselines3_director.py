@@ -1,4 +1,4 @@
-"""A Director in Stable-Baselines3's PPO: a cart with a pole follows places, some beyond the end of its track."""
+"""A Director in Stable-Baselines3's PPO: a cart with a pole follows positions, some beyond its track."""
 
 import argparse
 
@@ -14,7 +14,7 @@ LARGEST = 3.0  # [m]; the track ends at 2.4 m
 
 
 class GoalCart(gym.ObservationWrapper):
-    """CartPole-v1 with a place for a goal behind its four observations. A crash is rewarded by -1, all else by 0."""
+    """CartPole-v1 with a slot for a goal after its four observations. The reward is -1 for a crash and 0 otherwise."""
 
     def __init__(self) -> None:
         super().__init__(gym.make("CartPole-v1", sutton_barto_reward=True))
@@ -22,17 +22,17 @@ class GoalCart(gym.ObservationWrapper):
         self.observation_space = gym.spaces.Box(-high, high)
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """The Director writes the goal."""
+        """Add the slot; the Director writes the goal."""
         return np.append(observation, np.float32(0.0))
 
 
 def closeness(obs: np.ndarray, reward: np.ndarray) -> np.ndarray:
-    """1 at the goal, 0 at the greatest distance that there is."""
+    """1 at the goal, 0 at the largest possible distance."""
     return 1.0 - np.abs(obs[:, 0] - obs[:, 4]) / (2.4 + LARGEST)
 
 
 def main() -> None:
-    """Train, and say which places a cart has to fear that stands near the right end of its track."""
+    """Train, and print the fear of goal positions for a cart near the right end of its track."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--num-envs", type=int, default=32)

@@ -1,9 +1,9 @@
 """Every attacker on Uniform policies of each variant of Particle, and on two planted policies: docs/lab/attackers.md.
 
     python -m reproduction.attackers_table runs/attackers                                  # after particle_pool
-    python -m reproduction.attackers_table runs/attackers --variants directional --show    # prints what there is
+    python -m reproduction.attackers_table runs/attackers --variants directional --show    # prints the existing results
 
-What was killed continues when the command is given again.
+After an interruption the same command continues.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def planted(variant: str) -> dict[str, Policy]:
 
 
 def measure(root: Path, variant: str) -> None:
-    """Train and evaluate the policies of a variant, as far as they are missing."""
+    """Train and evaluate the missing policies of a variant."""
     for seed in SEEDS:
         config = replace(VARIANTS[variant], method="uniform", seed=seed, eval=attacks(variant))
         finished(config, root / f"{variant}-s{seed}")
@@ -57,7 +57,7 @@ def _file(variant: str, name: str) -> str:
 
 
 def read(root: Path, variant: str) -> tuple[list[list[dict]], dict[str, list[dict]]]:
-    """Rows of the Uniform policies, and of the planted ones by name, as far as they are there."""
+    """Rows of the Uniform policies, and of the planted ones by name, as far as they exist."""
     folders = [RunFolder(root / f"{variant}-s{seed}") for seed in SEEDS]
     policies = [
         _newest(each.read_json("evaluation.json")) for each in folders if (each.path / "evaluation.json").exists()
@@ -73,7 +73,7 @@ def _newest(rows: list[dict]) -> list[dict]:
 
 
 def show(variant: str, policies: list[list[dict]], known: dict[str, list[dict]]) -> None:
-    """Print a line per attacker: what it did to every policy, and to how many of them it was the worst."""
+    """Print a line per attacker: its effect on every policy, and for how many of them it was the worst."""
     if not policies:
         return
     chosen = Counter(found["attacker"] for found in worst(policies))
@@ -106,7 +106,7 @@ def interval(row: dict) -> str:
 
 
 def known_or_dash(value: float | None) -> str:
-    """Three digits, or a dash for what nobody knows; files have no NaN."""
+    """Three digits, or a dash for an unknown value; files have no NaN."""
     return "-" if value is None or math.isnan(value) else f"{value:.3f}"
 
 

@@ -1,10 +1,10 @@
-"""Every method beside one, over the variants of the hypotheses: a table of tests that nobody corrected.
+"""Every method against one, over the variants of the hypotheses: a table of uncorrected tests.
 
     python -m reproduction.beside FOLDER --rival uniform --seeds 0-9
 
-Of each method the mean rate of crashes per interaction under the worst attacker and the score, Uniform's = 1, variants
-counting alike, with 95 % bootstrap intervals; by how many percentage points its rate is lower than the rival's; and the
-one-sided p-value of H1's test, uncorrected: exploratory.
+For each method: the mean rate of crashes per interaction under the worst attacker and the score, Uniform's = 1,
+variants counting equally, with 95 % bootstrap intervals; by how many percentage points its rate is lower than the
+rival's; and the one-sided p-value of H1's test (uncorrected, exploratory).
 """
 
 import argparse

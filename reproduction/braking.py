@@ -1,11 +1,11 @@
-"""Does crashing pay? A controller that brakes before the wall beside one that does not, by reward.
+"""Does crashing pay? A controller that brakes before the wall against one that does not, by reward.
 
     python -m reproduction.braking
 
-Particles follow a velocity, from the same states: those in which a particle that does not mind the wall crashes within
-T steps. One brakes, one brakes for these T steps and never again, one does not brake. What counts in training is the
-discounted return, which a crash ends. The mean reward per step over all steps counts what comes after a crash too,
-when the particle is back at the origin, far from every wall.
+Particles follow a velocity, from the same states: those in which a particle that ignores the wall crashes within T
+steps. One brakes, one brakes for these T steps and never again, one does not brake. Training maximises the discounted
+return, which a crash ends. The mean reward per step over all steps also counts what follows a crash, when the particle
+is back at the origin, far from every wall.
 """
 
 import argparse
@@ -28,8 +28,8 @@ TASKS = {
 }  # fmt: skip
 """Rewards of a velocity, by name."""
 WORLDS = 4000
-PERIODS = 4  # goals that a particle that does not brake has followed before states are taken
-LONG = 1000  # steps that a discounted return is summed over; later ones weigh less than 0.01 %
+PERIODS = 4  # goals that a non-braking particle has followed before states are taken
+LONG = 1000  # steps over which a discounted return is summed; later ones weigh less than 0.01 %
 
 
 BRAKES = {"brakes": (True, True), "brakes once": (True, False), "never brakes": (False, False)}
@@ -38,12 +38,12 @@ BRAKES = {"brakes": (True, True), "brakes once": (True, False), "never brakes": 
 
 @dataclass(frozen=True)
 class Gain:
-    """What a controller gains from some states, means over them."""
+    """What a controller gains from some states, as means over them."""
 
     discounted: float
     """Sum of discounted rewards until a crash."""
     per_step: float
-    """Mean reward per step over all steps, those after a crash included."""
+    """Mean reward per step over all steps, including those after a crash."""
 
 
 def gains(task: Config, worlds: int = WORLDS, discount: float = TrainConfig().ppo.discount) -> dict[str, Gain]:
@@ -51,7 +51,7 @@ def gains(task: Config, worlds: int = WORLDS, discount: float = TrainConfig().pp
 
     Args:
         task: A task with velocity goals.
-        worlds: How many states are looked at, at least 1.
+        worlds: Number of states, at least 1.
         discount: gamma, in [0, 1].
 
     Returns:

@@ -1,4 +1,4 @@
-"""The claims C1 to C37 of the thesis's chapter 4, clause by clause, each with the line that says so.
+"""The claims C1 to C37 of the thesis's chapter 4, clause by clause, each with the line that states it.
 
 A clause about a group of methods compares averages over the group; where the thesis sets a method against a few others
 by name, there is a clause for each. C37 is the earlier workshop paper's.
@@ -54,7 +54,7 @@ def _say(
 
 
 def _more(measure: Measure, first: str, second: str) -> Ordered:
-    """One group of methods has more than another; names with blanks between them."""
+    """One group of methods has more than another; names are separated by blanks."""
     return Ordered(measure, versus(first.split(), second.split()))
 
 
@@ -264,7 +264,7 @@ QUAD_ARM = (
 
 
 def _hump(best: str, environments: Sequence[str]) -> list[Clause]:
-    """The best p, inside, is better than either end."""
+    """The best p, in the interior, is better than either end."""
     words = "improve until the best"
     return _say(666, words, environments, [_more(measure, end, best) for measure in (NAIVE, ATTACKED) for end in ENDS],
                 [_more(measure, best, end) for measure in (SCORE, ATTACKED_SCORE) for end in ENDS],

@@ -1,11 +1,11 @@
-"""The kinds of tests that clauses are made of. The unit is one trained policy; every test is one of permutation.
+"""The kinds of tests that clauses are made of. The unit is one trained policy; every test is a permutation test.
 
 ``Ordered`` compares methods by P(X > Y), or by their spread; ``Alike`` asks within which ratio two are equivalent;
-``Mostly`` looks at each policy by itself; ``Highest`` at the best policies alone; ``Matters`` at how much hangs on the
-method; ``Best`` chooses the methods on half of the seeds and has another test on the others.
+``Mostly`` looks at each policy separately; ``Highest`` only at the best policies; ``Matters`` at how much depends on
+the method; ``Best`` chooses the methods on half of the seeds and applies another test on the others.
 
-Where policies of one seed began with the same one, it is a block: methods are compared within blocks, labels are
-permuted within them, and resamples are of blocks.
+If policies of one seed started from the same policy, the seed is a block: methods are compared within blocks, labels
+are permuted within them, and resamples are of blocks.
 """
 
 import math
@@ -23,7 +23,7 @@ from reproduction.claims import ALPHA, LEAST, LEAST_BASES, Finding, Test
 from reproduction.measures import Evidence, Measure, Numbers, Place
 
 SETTLED_RATIO = 1.5  # an equivalence is settled within this ratio,
-SETTLED_SHARE = 0.05  # or, of what has no ratios, within this share of the score's range from 0 to 1
+SETTLED_SHARE = 0.05  # or, for quantities without ratios, within this share of the score's range from 0 to 1
 RESAMPLES = 2000
 
 
@@ -77,7 +77,7 @@ class Ordered:
         )  # fmt: skip
 
     def _detectable(self, samples: Mapping[str, Array], pairs: Sequence[tuple[str, str]], paired: bool) -> float:
-        """In blocks what independent policies would show, but nothing where even n of n signs are not significant."""
+        """In blocks as for independent policies, but nothing if even n of n signs are not significant."""
         sizes = [sum(len(samples[name]) for name in dict.fromkeys(side)) for side in zip(*pairs, strict=True)]
         if paired and len(pairs) == 1 and math.isinf(stats.detectable_share(sizes[0])):
             return math.inf
@@ -91,10 +91,10 @@ class Ordered:
 
 @dataclass(frozen=True)
 class Alike:
-    """Policies of two methods are alike: within which ratio, or difference, neither has more than the other.
+    """Policies of two methods are alike: the ratio, or difference, within which neither has more than the other.
 
     The ratio r is the smallest for which both P(X > r Y) and P(Y > r X) are significantly below 1/2: two one-sided
-    tests [1]_ of level 5 %. It is what separates a policy of the one from one of the other, as often as not.
+    tests [1]_ of level 5 %. Half of the time it separates a policy of one from a policy of the other.
 
     References:
         .. [1] Schuirmann, *A comparison of the two one-sided tests procedure and the power approach*,
@@ -117,11 +117,11 @@ class Alike:
 
     @property
     def settled(self) -> float:
-        """The margin within which it is settled, as a difference of what ``values`` gives."""
+        """The margin within which it is settled, as a difference of the results of ``values``."""
         return math.log(SETTLED_RATIO) if self.measure.ratio else SETTLED_SHARE
 
     def values(self, x: Array) -> Array:
-        """What differences are taken of."""
+        """The values whose differences are taken."""
         return np.log(x + self.measure.floor) if self.measure.ratio else x
 
     def find(self, evidence: Evidence, place: Place) -> Finding | None:
@@ -151,7 +151,7 @@ class Alike:
         )  # fmt: skip
 
     def _reachable(self, blocks: int) -> tuple[float, float]:
-        """Smallest p-values for and against in so many blocks: where no policy differs, and where all do alike."""
+        """Smallest p-values for and against in so many blocks: if no policy differs, and if all differ alike."""
         same, sides = np.zeros(blocks), _sides_in_blocks
         p_for, _ = self.p_values(same, same, sides=sides)
         return float(p_for), float(self.p_values(same + 2 * self.settled, same, sides=sides)[1])
@@ -159,7 +159,7 @@ class Alike:
     def p_values(
         self, x: Array, y: Array, permutations: int | None = None, *, sides: "Sides | None" = None
     ) -> tuple[Array, Array]:
-        """p-values for and against of being settled, of ``values`` of shape (..., n); ``sides`` as ``_sides``."""
+        """p-values for and against being settled, for ``values`` of shape (..., n); ``sides`` as in ``_sides``."""
         sides = sides or _sides
         above, below = sides(x, y, self.settled, permutations)
         if self.at_most:
@@ -172,12 +172,12 @@ Sides = Callable[[Array, Array, float, int | None], tuple[Array, Array]]
 
 
 def _sides(x: Array, y: Array, margin: float, permutations: int | None = None) -> tuple[Array, Array]:
-    """p-values of x being above y + margin as often as not, and below."""
+    """p-values for x being above y + margin more often than not, and for being below."""
     return permutation.p_values([x, y + margin], [(0, 1)], "superiority", permutations=permutations)
 
 
 def _sides_in_blocks(x: Array, y: Array, margin: float, permutations: int | None = None) -> tuple[Array, Array]:
-    """The same of values that belong together, shapes (n,)."""
+    """The same for paired values, shapes (n,)."""
     order = permutation.superiority_in_blocks([(0, 1)])
     more, less = permutation.p_values_in_blocks([x, y + margin], order, permutations=permutations)
     return np.asarray(more), np.asarray(less)
@@ -200,7 +200,7 @@ class Mostly:
 
     measure: Measure
     methods: tuple[str, ...]
-    """See ``Test``; their policies are taken together."""
+    """See ``Test``; their policies are pooled."""
 
     def __str__(self) -> str:
         return f"{self.measure.name}: for most policies of {', '.join(self.methods)}"
@@ -232,9 +232,9 @@ class Mostly:
 
 @dataclass(frozen=True)
 class Highest:
-    """The highest value of all belongs to a method: how many of its policies lie above all of another's [1]_.
+    """The highest value of all belongs to a method: how many of its policies are above all of another's [1]_.
 
-    It must reach above each of the others; one that reaches above it, by Bonferroni's rule, is enough against it. The
+    It must exceed each of the others; a single one that exceeds it, by Bonferroni's rule, is enough against it. The
     number is that of its policies above all others', or, negative, of the others' above all of its own.
 
     References:
@@ -290,11 +290,10 @@ def _on_top(n: int, m: int, count: Array | int) -> Array:
 
 @dataclass(frozen=True)
 class Matters:
-    """More hangs on the method in one measure than in another.
+    """One measure depends more on the method than another.
 
-    It is the share of the variance of ranks that lies between methods: omega^2 [1]_, not biased by the number of
-    methods, of the policies that have both. Under the null hypothesis every policy might as well have its two ranks
-    exchanged.
+    The number is the share of the variance of ranks between methods: omega^2 [1]_, not biased by the number of methods,
+    over the policies that have both. Under the null hypothesis every policy might as well have its two ranks exchanged.
 
     References:
         .. [1] Hays, *Statistics for Psychologists*, 1963, chapter 12.
@@ -323,7 +322,7 @@ class Matters:
         ranks = scipy_stats.rankdata(values, axis=-1)
         interval, error = self._interval(ranks, sizes, paired)
         reach = float(scipy_stats.norm.ppf(1 - ALPHA / 2) + scipy_stats.norm.ppf(POWER)) * error
-        if paired and math.isinf(stats.detectable_share(sizes[0])):  # blocks are exchanged as signs are flipped
+        if paired and math.isinf(stats.detectable_share(sizes[0])):  # blocks are exchanged like signs are flipped
             reach = math.inf
         return Finding(
             effect="difference in omega^2", interval=interval, no_difference=0.0, p_for=p_for, p_against=p_against,
@@ -335,13 +334,13 @@ class Matters:
     ) -> tuple[Array, Array]:
         """One-sided p-values for and against, of values of shape (studies, 2, policies).
 
-        If they are ``paired``, sizes are equal, and the policies of a block are exchanged together; where there are not
+        If they are ``paired``, sizes are equal, and the policies of a block are exchanged together; if there are no
         more ways to do so than ``permutations``, the p-values are exact.
         """
         ranks = scipy_stats.rankdata(values, axis=-1)
         number = sizes[0] if paired else sum(sizes)
         if paired and 2**number <= permutations:
-            swapped = np.array([*product((False, True), repeat=number)])[:, None]  # the first of them is their own
+            swapped = np.array([*product((False, True), repeat=number)])[:, None]  # the first of them is the identity
         else:
             swapped = np.random.default_rng(0).random((permutations + 1, 1, number)) < 0.5
             swapped[0] = False
@@ -367,7 +366,7 @@ class Matters:
 
 
 def omega_squared(values: Array, sizes: Sequence[int]) -> Array:
-    """Unbiased share of the variance between groups that lie one after another along the last axis; over the others."""
+    """Unbiased share of the variance between consecutive groups along the last axis; over the others."""
     groups = np.split(values, np.cumsum(sizes)[:-1], axis=-1)
     total = ((values - values.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)
     within = sum(((x - x.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1) for x in groups)
@@ -380,14 +379,14 @@ def omega_squared(values: Array, sizes: Sequence[int]) -> Array:
 class Best:
     """A test between the best of some methods and the best of others.
 
-    They are those with the lowest mean on every other seed, and tested on the rest.
+    The best are those with the lowest mean on every other seed; they are tested on the rest.
     """
 
     measure: Measure
     directors: tuple[str, ...]
     rivals: tuple[str, ...]
     then: Callable[[str, str], Test]
-    """Of the two that were chosen."""
+    """The test of the two that were chosen."""
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -414,9 +413,9 @@ class Best:
 
 
 def samples_of(measure: Measure, evidence: Evidence, place: Place, methods: Sequence[str]) -> dict[str, Array]:
-    """The samples of the methods that have enough policies; in blocks, of those blocks that all of them have.
+    """The samples of the methods that have enough policies; in blocks, only of the blocks that all of them have.
 
-    Methods that lack blocks which a verdict needs take no part beside two or more that have them.
+    Methods that lack blocks needed for a verdict are excluded if two or more others have them.
     """
     return _enough({name: measure(evidence, place, name) for name in methods}, evidence.paired(place, methods))
 
@@ -442,5 +441,5 @@ def versus(first: Sequence[str], second: Sequence[str]) -> tuple[tuple[str, str]
 
 
 def falling(methods: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """All pairs of an order, of which the first has more: Jonckheere and Terpstra's."""
+    """All pairs of an order, whose first has more, as in the Jonckheere-Terpstra test."""
     return tuple((a, b) for i, a in enumerate(methods) for b in methods[i + 1 :])

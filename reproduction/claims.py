@@ -1,9 +1,9 @@
 """Claims of the thesis as lists of clauses, and their verdicts, which can go either way.
 
-A clause is one comparison with one number. It *holds* where a test rejects its opposite, *does not hold* where it
-rejects the clause itself, and is *undecided* otherwise, also where one of the two is out of reach. Either verdict is
-wrong in at most 5 % of all studies, as ``python -m reproduction.verdicts`` measures. Nothing is corrected over clauses,
-but where one of several is enough.
+A clause is one comparison with one number. It *holds* if a test rejects its opposite, *does not hold* if the test
+rejects the clause itself, and is *undecided* otherwise, including when one of the two is out of reach. Either verdict
+is wrong in at most 5 % of all studies, as ``python -m reproduction.verdicts`` measures. Nothing is corrected over
+clauses, except where one of several is enough.
 """
 
 import math
@@ -16,40 +16,40 @@ from deimos.study.stats import Interval
 from reproduction.measures import Evidence, Place
 
 ALPHA = 0.05
-LEAST = 3  # policies of a method, below which it takes no part
-LEAST_BASES = 5  # that policies branched off, below which a number is an estimate without a verdict (legged.md)
+LEAST = 3  # policies of a method, below which it is excluded
+LEAST_BASES = 5  # bases that policies branched off, below which a number is an estimate without a verdict (legged.md)
 Verdict = Literal["holds", "does not hold", "undecided"]
 VERDICTS: tuple[Verdict, ...] = ("holds", "does not hold", "undecided")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What the test of a clause found in one place."""
+    """The result of a clause's test in one place."""
 
     effect: str
-    """Name of the number that is measured; the more of it, the more does the clause hold."""
+    """Name of the measured number; the higher it is, the more the clause holds."""
     interval: Interval
-    """The number with its 95 % interval; of an equivalence 90 %, that of two one-sided tests."""
+    """The number with its 95 % interval; for an equivalence the 90 % interval, that of two one-sided tests."""
     no_difference: float
-    """The number where nothing differs."""
+    """The number if nothing differs."""
     p_for: float
-    """p-value against the clause being false: at most 5 % where it holds."""
+    """p-value against the clause being false: at most 5 % if it holds."""
     p_against: float
-    """p-value against the clause being true: at most 5 % where it does not hold."""
+    """p-value against the clause being true: at most 5 % if it does not hold."""
     detectable: float
-    """Smallest effect that the test finds with a power of 80 %; infinite where it can find none."""
+    """Smallest effect that the test finds with a power of 80 %; infinite if it can find none."""
     n: Mapping[str, int]
     """Policies of every method."""
     equivalent_within: float | None = None
-    """Of an equivalence: the smallest ratio, or difference, within which it holds at 95 %."""
+    """For an equivalence: the smallest ratio, or difference, within which it holds at 95 %."""
     chosen: str = ""
-    """Of a choice made on other seeds: what was chosen."""
+    """For a choice made on other seeds: what was chosen."""
     reachable: tuple[float, float] = (0.0, 0.0)
     """Smallest p-values, for and against, that any policies in so few blocks can have."""
 
     @property
     def verdict(self) -> Verdict:
-        """What it says; nothing where only one of two verdicts could be reached, whatever the policies had done."""
+        """The verdict; none if only one of the two verdicts could have been reached, whatever the policies did."""
         if max(self.reachable) > ALPHA:
             return "undecided"
         if self.p_for <= ALPHA:
@@ -62,13 +62,13 @@ class Test(Protocol):
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Those that take part."""
+        """Those that it compares."""
 
     def __str__(self) -> str:
-        """What it compares, in words."""
+        """A description of the comparison."""
 
     def find(self, evidence: Evidence, place: Place) -> Finding | None:
-        """What it finds; ``None`` where there are no data for it."""
+        """Its result; ``None`` if there are no data for it."""
 
 
 @dataclass(frozen=True)
@@ -76,25 +76,25 @@ class Clause:
     """One comparison that a claim makes."""
 
     line: int
-    """Of the thesis's text, where it says so; 0 where it is the workshop paper's."""
+    """Line of the thesis's text that states it; 0 if the workshop paper does."""
     words: str
-    """Some of its words there, by which ``python -m reproduction.lines`` finds the line again."""
+    """Some of its words there, by which ``python -m reproduction.lines`` finds the line."""
     test: Test
     """How it is tested."""
     environments: tuple[str, ...]
-    """Where it is said to hold."""
+    """The places where it is said to hold."""
     periods: tuple[int, ...] = ()
-    """The T [steps] at which it is; empty for every one."""
+    """The T [steps] at which it is said to hold; empty for all."""
     once: bool = False
-    """Whether it is about training, which all T of an environment share: one of them is enough."""
+    """Whether it is about training, which all T of an environment share, so that one of them is enough."""
 
     @property
     def text(self) -> str:
-        """What it says, as it is tested."""
+        """The clause in words, as it is tested."""
         return str(self.test)
 
     def places(self, evidence: Evidence) -> list[Place]:
-        """Where it can be tested."""
+        """The places where it can be tested."""
         own = [evidence.places(name)[: 1 if self.once else None] for name in self.environments]
         found = [place for places in own for place in places]
         return [place for place in found if not self.periods or place.period in self.periods]
@@ -107,11 +107,11 @@ class Claim:
     id: str
     """C1 to C37."""
     text: str
-    """In short."""
+    """The claim in short."""
     clauses: tuple[Clause, ...]
-    """What it says, comparison by comparison."""
+    """Its clauses, comparison by comparison."""
     one_is_enough: bool = False
-    """Whether it says that some of its clauses hold, not which: p-values for them are corrected by Holm's rule."""
+    """Whether it says only that some of its clauses hold, not which: their p-values are corrected by Holm's rule."""
     note: str = ""
     """What is not tested, and why."""
 
@@ -125,7 +125,7 @@ class Result:
     place: Place
     """Where."""
     finding: Finding
-    """What was found."""
+    """The finding."""
 
     @property
     def verdict(self) -> Verdict:
@@ -134,7 +134,7 @@ class Result:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Methods that the clause speaks of and that have too few policies; none where it chose among them."""
+        """Methods of the clause that have too few policies; none if it chose among them."""
         if self.finding.chosen:
             return ()
         return tuple(name for name in self.clause.test.methods if name not in self.finding.n)
@@ -147,13 +147,13 @@ class Outcome:
     claim: Claim
     """The claim."""
     results: tuple[Result, ...]
-    """Of every clause that there are data for, wherever it can be tested."""
+    """Results of every clause with data, wherever it can be tested."""
     without_data: tuple[Clause, ...] = ()
-    """Clauses that there are no data for anywhere."""
+    """Clauses without data anywhere."""
 
     @property
     def counts(self) -> Counter[Verdict]:
-        """How many of its results say what."""
+        """How many of its results have each verdict."""
         return Counter(each.verdict for each in self.results)
 
     @property
@@ -192,7 +192,7 @@ def test(claim: Claim, evidence: Evidence) -> Outcome:
 
 
 def _find(test: Test, evidence: Evidence, place: Place) -> Finding | None:
-    """What a test finds; of few bases it is an estimate, for which nothing speaks and nothing against it."""
+    """The result of a test; with few bases it is an estimate, with no evidence for or against it."""
     found = test.find(evidence, place)
     if found is not None and evidence.paired(place) and min(found.n.values()) < LEAST_BASES:
         return replace(found, p_for=1.0, p_against=1.0, detectable=math.inf)

@@ -23,15 +23,15 @@ class Coverage:
     """Share of simulated populations whose 95 % interval contains the truth."""
 
     statistic: str
-    """What is estimated."""
+    """The statistic."""
     interval: str
-    """How."""
+    """The interval."""
     normal: float
     """In normal populations."""
     lognormal: float
     """In populations whose logarithm is normal with a standard deviation of 1."""
     bimodal: float
-    """In populations of which 45 % are 0, and the others lognormal."""
+    """In populations of which 45 % are 0 and the others lognormal."""
 
 
 def simulate(n: int = 10, populations: int = 2000, resamples: int = 2000, seed: int = 0) -> list[Coverage]:
@@ -41,7 +41,7 @@ def simulate(n: int = 10, populations: int = 2000, resamples: int = 2000, seed: 
         n: Policies in a population.
         populations: How many are simulated.
         resamples: Bootstrap resamples of each.
-        seed: Of it all.
+        seed: Random seed.
     """
     spread = permutation.log_spread_ratio([(0, 1)])
     kinds: list[tuple[str, str, Callable[[Array, Array, int], Interval], Callable[[str], float]]] = [

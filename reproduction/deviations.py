@@ -1,4 +1,4 @@
-"""What a reader must know of our choices: how they were made, and where they differ from the thesis."""
+"""What a reader must know about our choices: how they were made, and where they differ from the thesis."""
 
 from collections.abc import Sequence
 
@@ -25,7 +25,7 @@ PARTICLE_DEVIATIONS = [
     ("RND", "whitened on uniform candidates; `rnd-raw` is not", "silent", "tames RND"),
     ("evaluation", "mean actions", "silent", "fewer crashes"),
 ]  # fmt: skip
-"""What, in Particle Gym, the thesis's, and the likely effect."""
+"""Choice, Particle Gym's, the thesis's, and the likely effect."""
 LEGGED_PILOTS = (
     "How the choices were made: what is compared was declared before the first cell (reproduction/legged.md). The "
     "robots' settings are presets that were made to walk under Uniform goals within minutes of a core "
@@ -57,11 +57,11 @@ LEGGED_DEVIATIONS = [
     ("evaluation", "mean actions; friction 1, no pushes, payload, noise or time-outs; two robots on every tile of the "
      "ground (mujoco-warp: one), which they keep", "no randomization of friction, pushes and terrain", "fewer crashes"),
 ]  # fmt: skip
-"""The same of robots."""
+"""The same for robots."""
 
 
 def blocks(environments: Sequence[str]) -> list[Block]:
-    """The section on pilots and deviations, of those of Particle Gym, of robots, or of both."""
+    """The section on pilots and deviations, for Particle Gym, robots, or both."""
     legged = [name for name in environments if name.startswith(LEGGED)]
     found: list[Block] = ["## Pilots and deviations"]
     for there, pilots, deviations in (

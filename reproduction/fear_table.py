@@ -1,11 +1,11 @@
-"""How well does fear rank goals within a context, late in training, by what it learns from? Prints a table.
+"""How well does fear rank goals within a context, late in training, depending on its data? Prints a table.
 
-    python -m reproduction.fear_table runs/fear_table.csv                                 # 60 trainings
+    python -m reproduction.fear_table runs/fear_table.csv                                 # 60 training runs
     python -m reproduction.fear_table runs/try.csv --seeds 1000 --methods p75 p75-literal --variants directional
 
 Every method is trained in every variant with every seed. At five points of the last quarter a copy of the run is
 audited: the exact outcomes of 50 candidates in each of at most 200 contexts with both outcomes, from clones. A run that
-is in the file already is not trained again.
+is already in the file is not trained again.
 """
 
 import argparse
@@ -28,18 +28,18 @@ from deimos.sim.envs import particle
 from deimos.study.audits import points
 
 METHODS = ("p25-literal", "p25-threshold", "p25", "p75-literal", "p75-threshold", "p75")
-VARIANTS = {"directional": 2000, "absolute": 5000}  # and the steps of a training, as in the thesis
-CONTEXTS = 200  # with both outcomes, at most, at every point
-BAR, FLOOR = 0.8, 0.7  # what the mean over seeds shall reach, and what hardly any point shall be below
+VARIANTS = {"directional": 2000, "absolute": 5000}  # and the steps of a training run, as in the thesis
+CONTEXTS = 200  # with both outcomes, at most so many at every point
+BAR, FLOOR = 0.8, 0.7  # aims: for the mean over seeds, and the value that hardly any point should be below
 
 
 def measure(name: str, variant: str, seed: int) -> dict[str, object]:
-    """Train once, and audit the fear network on the way.
+    """Train once, and audit the fear network along the way.
 
     Returns:
-        ``auroc`` and ``contexts`` at every point, the first NaN where no context had both outcomes; ``waited``, the
+        ``auroc`` and ``contexts`` at every point, the former NaN if no context had both outcomes; ``waited``, the
         rollouts from the first crash of an interaction to the first fit; ``fitted``, the share of the rollouts since
-        then that fear was fitted in; and ``percentile``, the mean dose that was delivered.
+        then in which fear was fitted; and ``percentile``, the mean delivered dose.
     """
     config = TrainConfig(
         env=particle.Config(variant=variant), selector=method(name), seed=seed, env_steps=VARIANTS[variant],
@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def read(path: Path) -> list[dict[str, str]]:
-    """The rows that there are."""
+    """The rows in the file."""
     if not path.exists():
         return []
     with path.open(newline="") as file:

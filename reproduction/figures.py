@@ -1,4 +1,4 @@
-"""What the thesis's methods look like, and the figure of claim C25: outcomes over the delivered dose of fear."""
+"""Colours of the thesis's methods, and the figure of claim C25: outcomes over the delivered dose of fear."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ STYLE = Style(
         "baselines": _BASELINES,
     },
     everywhere="uniform",
-    colours=_BY_FEAR | {  # the others are Okabe and Ito's
+    colours=_BY_FEAR | {  # the others are from Okabe and Ito
         "uniform": "#000000", "rnd": "#D55E00", "vds": "#CC79A7", "cl": "#56B4E9", "vds+p75": "#009E73",
         "learnability": "#E69F00",
     } | dict(zip(_LITERAL, _DIRECTOR_COLOURS, strict=True)) | {
@@ -45,12 +45,12 @@ STYLE = Style(
 
 
 def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figures:
-    """The figures of every study; beside the delivered dose, Uniform policies under shifted goals where there are rows.
+    """The figures of every study; next to the delivered dose, Uniform policies under shifted goals if there are rows.
 
-    Where methods branched off common bases, those of ``legged_figures`` in place of boxes and bands.
+    If methods branched off common bases, those of ``legged_figures`` replace boxes and bands.
 
     Args:
-        data: The study's.
+        data: Data of the study.
         environment: Its name.
         shifted: Rows of ``reproduction.shifted_goals``.
     """
@@ -65,13 +65,13 @@ def figures(data: Data, environment: str, shifted: Sequence[Row] = ()) -> Figure
     found |= legged_figures.figures(data, environment)
     return {
         name: (f"{caption} {legged_figures.ORIGIN}", figure) for name, (caption, figure) in found.items()
-        # A few policies have no profile; what one setting of several was not asked for needs no place in its section.
+        # A few policies have no profile; a setting's section needs no place for figures that it was not asked for.
         if figure is not None and not name.startswith("profile-")
     }  # fmt: skip
 
 
 def dose_response(data: Data, environment: str, period: int, shifted: Sequence[Row]) -> "Figure":
-    """What a shift of goals in training does under uniform goals, and what it does to a Uniform policy in itself."""
+    """The effect of shifted goals in training, under uniform goals, and their effect on a Uniform policy itself."""
     names = [name for name in data.methods(environment) if data.delivered(environment, name)]
     hard = outcomes.attacked(data, environment, period)
     figure, axes = subplots(2, 2, (WIDTH, 4.8), sharex=True, sharey="row")
@@ -96,7 +96,7 @@ def dose_response(data: Data, environment: str, period: int, shifted: Sequence[R
 
 
 def _over_shift(axes: "Axes", rows: Sequence[Row], metric: str) -> None:
-    """A line for each policy, through the rules by rising percentile, by learnt fear and by exact fear."""
+    """Draw a line for each policy through the rules by rising percentile, by learnt fear and by exact fear."""
     unit = 1 if metric == "score" else 100
     for fear, colour, marker in (("learnt", "#000000", "o"), ("exact", "#D55E00", "^")):
         own = [row for row in rows if row["fear"] == fear]

@@ -3,7 +3,7 @@
     python -m reproduction.hypotheses FOLDER
 
 H1: the best p is safer than Uniform. H2: it is safer than Uniform with the better crash penalty, at a score that is not
-lower by 5 %. H3: over the delivered dose score and safety rise at one end and fall at the other. What is best was
+lower by 5 %. H3: over the delivered dose, score and safety rise at one end and fall at the other. The best ones were
 chosen on seeds 0 to 9; H1 and H2 are tested on seeds 10 to 29. Safety is the mean rate of crashes per interaction under
 the worst attacker, over policies.
 """
@@ -32,27 +32,27 @@ PERMUTATIONS = 9999
 RESAMPLES = 4000
 
 Samples = Mapping[str, Array]
-"""Of one method: by variant, one value per policy."""
+"""Values of one method: by variant, one per policy."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a hypothesis comes to."""
+    """The answer to a hypothesis."""
 
     name: str
     """H1 to H3."""
     text: str
-    """What was tested."""
+    """The hypothesis that was tested."""
     p: float
     """One-sided p-value."""
     effect: Interval | None
     """By how much the mean rate of crashes per interaction is lower, with its 95 % interval.
 
-    Of H3 the slope that is the least certain."""
+    For H3, the least certain slope."""
     detectable: float
     """Smallest effect that is found with a power of 80 % at the first step of Holm's rule."""
     condition: bool = True
-    """Whether what else the hypothesis asks for is so."""
+    """Whether the hypothesis's further condition is met."""
     note: str = ""
     """The condition in numbers."""
     corrected: float = 1.0
@@ -60,7 +60,7 @@ class Answer:
 
     @property
     def holds(self) -> bool:
-        """Whether the data say that it is true."""
+        """Whether the data support it."""
         return self.condition and self.corrected <= ALPHA
 
 
@@ -68,7 +68,7 @@ def primary(evidence: Evidence) -> list[Answer]:
     """The answers to H1, H2 and H3; one without data counts as a p-value of 1.
 
     Args:
-        evidence: Of the study, with the names that its methods have there.
+        evidence: Evidence of the study, with its own names of methods.
     """
     early, late = evidence.only(CHOOSING), evidence.only(TESTING)
     best, penalty = (safest(early, names) for names in (CANDIDATES, PENALTIES))
@@ -82,7 +82,7 @@ def primary(evidence: Evidence) -> list[Answer]:
 
 
 def samples(evidence: Evidence, measure: Measure, method: str | None) -> dict[str, Array]:
-    """A measure's values of a method by variant; none unless it has enough policies in each."""
+    """A measure's values for a method by variant; none unless it has enough policies in each."""
     found = {
         place.environment: np.array([*measure(evidence, place, method or "").values()])
         for name in VARIANTS for place in evidence.places(name)[:1]
@@ -91,7 +91,7 @@ def samples(evidence: Evidence, measure: Measure, method: str | None) -> dict[st
 
 
 def safest(evidence: Evidence, names: Iterable[str]) -> str | None:
-    """The method with the lowest mean rate, variants counting alike; ``None`` where there are no data."""
+    """The method with the lowest mean rate, variants counting equally; ``None`` if there are no data."""
     rates = {name: _mean(own) for name in names if (own := samples(evidence, ATTACKED, name))}
     return min(rates, key=rates.__getitem__) if rates else None
 
@@ -101,7 +101,7 @@ def _mean(values: Samples) -> float:
 
 
 def safer(name: str, evidence: Evidence, best: str | None, rival: str | None) -> Answer:
-    """Whether a method has a lower mean rate than another: labels permuted within variants, one-sided."""
+    """Test whether a method has a lower mean rate than another: labels permuted within variants, one-sided."""
     text = f"{best or 'the best p'} is safer than {rival or 'the better penalty'}"
     own, others = (samples(evidence, ATTACKED, method) for method in (best, rival))
     if not own or not others:
@@ -116,9 +116,9 @@ def safer(name: str, evidence: Evidence, best: str | None, rival: str | None) ->
 
 
 def permuted(pairs: Sequence[tuple[Array, Array]], seed: int = 0) -> tuple[float, float]:
-    """Permutation test of the first samples' means being higher, averaged over strata, labels permuted within each.
+    """Permutation test that the first samples' means are higher, averaged over strata, labels permuted within each.
 
-    Exact where the two samples of each stratum come from one population.
+    Exact if the two samples of each stratum come from one population.
 
     Returns:
         The one-sided p-value, and the standard deviation of the difference under permutation.
@@ -136,7 +136,7 @@ def _reach(deviation: float) -> float:
 
 
 def _no_worse(answer: Answer, evidence: Evidence, best: str | None, rival: str | None) -> Answer:
-    """The same on the condition that the score is not lower by 5 %."""
+    """The same under the condition that the score is not lower by 5 %."""
     own, others = (samples(evidence, SCORE, method) for method in (best, rival))
     if not own or not others:
         return replace(answer, condition=False, note="score: no data")
@@ -148,10 +148,10 @@ def _no_worse(answer: Answer, evidence: Evidence, best: str | None, rival: str |
 
 
 def hump(evidence: Evidence) -> Answer:
-    """Whether parabolas through score and safety over the delivered dose rise at its lowest and fall at its highest.
+    """Test whether parabolas of score and safety over the delivered dose rise at its lowest and fall at its highest.
 
-    One parabola for all variants, each with a level of its own; policies are resampled within methods and variants.
-    All four slopes must have their sign (an intersection-union test): the largest of their p-values counts.
+    One parabola for all variants, each with its own intercept; policies are resampled within methods and variants. All
+    four slopes must have their sign (an intersection-union test): the largest of their p-values counts.
     """
     text = "score and safety rise over the lowest delivered dose and fall over the highest"
     groups: list[Array] = []  # (variant, dose, score, safety) of the policies of a method, shape (4, n)
@@ -181,7 +181,7 @@ def hump(evidence: Evidence) -> Answer:
 
 
 def slopes(policies: Array, ends: Array) -> Array:
-    """Slopes per percentile towards the inside at both ends of the dose, of score and of safety.
+    """Inward slopes per percentile of score and of safety, at both ends of the dose.
 
     Args:
         policies: Variant, dose, score and safety, shape (4, studies, n).

@@ -1,11 +1,11 @@
-"""Train the policies that the legged studies branch off, and the networks of the attacker ``pooled`` that they meet.
+"""Train the policies that the legged studies branch off, and the networks of the attacker ``pooled`` used on them.
 
-    python -m reproduction.legged_bases runs/legged_bases    # eight; again to continue what was killed
+    python -m reproduction.legged_bases runs/legged_bases    # eight; repeat it to continue after a kill
     python -m reproduction.legged_bases runs/legged_bases --robots quad
 
-A base is trained under Uniform, in two stages, of which the second begins with the first one's networks; studies branch
-off the second. Its policy is judged under uniform goals before anything branches off. The pool of a base is made from
-the other bases of its robot, so no policy has taught its own attacker. A file that exists is not written again.
+A base is trained under Uniform, in two stages, the second starting from the first one's networks; studies branch off
+the second. Its policy is evaluated under uniform goals before anything branches off. The pool of a base is made from
+the other bases of its robot, so no policy has trained its own attacker. A file that exists is not written again.
 """
 
 import argparse
@@ -39,13 +39,13 @@ class Bases:
     """The bases of a robot."""
 
     seeds: tuple[int, ...]
-    """Of no other run; the first base has the first."""
+    """Seeds that no other run uses; the first base has the first."""
     stages: tuple[tuple[str, int], ...]
     """Presets and transitions, one after the other."""
     period: int
-    """T of their training [steps]."""
+    """T in their training [steps]."""
     judged: tuple[int, ...]
-    """The T that they are judged at [steps]."""
+    """The T of their evaluations [steps]."""
 
 
 ROBOTS: Mapping[str, Bases] = {
@@ -53,7 +53,7 @@ ROBOTS: Mapping[str, Bases] = {
     "quad": Bases(
         (7001, 7002, 7003, 7004, 7005), (("quad-walk", 4_000_000), ("quad-rough", 6_000_000)), LONG, (SHORT, LONG)
     ),
-    # As the presets have it (docs/lab/quad_arm.md), whose goals of two seconds make it walk and reach.
+    # As in the presets (docs/lab/quad_arm.md), whose goals of two seconds make it walk and reach.
     "quad_arm": Bases(
         (7101, 7102, 7103), (("quad-arm-walk", 4_030_464), ("quad-arm-reach", 6_144_000)), SHORT, (SHORT,)
     ),
@@ -66,7 +66,7 @@ def base_name(robot: str, index: int) -> str:
 
 
 def base_config(bases: Bases, stage: int, index: int) -> TrainConfig:
-    """A stage of a base: its preset under Uniform, with goals of the bases' T and episodes of at least two."""
+    """A stage of a base: its preset under Uniform, with goals of the bases' T and episodes of at least two goals."""
     name, transitions = bases.stages[stage]
     config = preset(name)
     env = replace(
@@ -79,7 +79,7 @@ def base_config(bases: Bases, stage: int, index: int) -> TrainConfig:
 
 
 def base(robot: str, index: int, root: Path) -> Path:
-    """Train a base, or go on with it, and judge it; gives the folder that is kept of it."""
+    """Train a base, or continue it, and evaluate it; returns the folder that is kept."""
     bases = ROBOTS[robot]
     kept = KEPT_IN / base_name(robot, index)
     if not kept.exists():
@@ -98,7 +98,7 @@ def base(robot: str, index: int, root: Path) -> Path:
 
 
 def judge(folder: Path, periods: tuple[int, ...]) -> list[dict]:
-    """The rows of a base under uniform goals, for each T; they are kept in its folder."""
+    """The rows of a base under uniform goals, for each T; they are stored in its folder."""
     run, device = RunFolder.open(folder), torch.device("cpu")
     env = training.read_config(run).env
     naive = replace(ATTACKS, attackers=())

@@ -1,9 +1,9 @@
-"""What goal selection does to policies that walk already: methods compared in pairs, base by base (legged.md).
+"""The effect of goal selection on policies that already walk: methods compared in pairs, base by base (legged.md).
 
-    python -m reproduction.legged_contrasts FOLDER    # of the merged studies; the report of the folder has it too
+    python -m reproduction.legged_contrasts FOLDER    # of the merged studies; the folder's report includes this
 
 The contrasts of p75, vds+p75 and penalty-30 against uniform at T2 are primary; all others are exploratory, and those of
-Quad+arm, of another engine and of T10 in training are estimates of a few bases.
+Quad+arm, of another engine and of T10 in training are estimates from a few bases.
 """
 
 import argparse
@@ -45,12 +45,12 @@ from reproduction.thesis import LEGGED, LEGGED_METHODS, PARTICLE
 REFERENCE = "uniform"
 PRIMARY = ("p75", "vds+p75", "penalty-30")
 CORE_HOURS = {"quad": 1.7, "quad_arm": 0.4}
-"""What one more method takes on all bases of a robot (legged.md)."""
+"""Cost of one more method on all bases of a robot (legged.md)."""
 WITH_PARTICLE = "rnd beside Particle Gym's, whose rows are docs/results/particle_[a-f]: to be merged into the folder"
 LONGER_HOURS = {"quad": 3.2, "quad_arm": 0.7}
-"""What the evaluation of its policies at T10 takes."""
+"""Cost of evaluating its policies at T10."""
 WALKS = 0.3
-"""Least score at T2 of a base that walks."""
+"""Lowest score at T2 at which a base counts as walking."""
 TITLES = {
     ("quad", 100): "Quad at T2", ("quad", 500): "Quad at T10, trained at T2",
     ("quad_long", 100): "Quad at T2, trained at T10", ("quad_long", 500): "Quad at T10, trained at T10",
@@ -58,13 +58,13 @@ TITLES = {
     ("quad_warp", 100): "Quad at T2, trained and evaluated on mujoco-warp",
     ("quad_arm", 100): "Quad+arm at T2", ("quad_arm", 500): "Quad+arm at T10",
 }  # fmt: skip
-"""Of the places where methods are compared, in order."""
+"""The places where methods are compared, in order."""
 ENGINES = {
     "quad": "native", ON_WARP: "native, judged on mujoco-warp", "quad_warp": "mujoco-warp",
 }  # fmt: skip
 """Environments of Quad by the engine of training and evaluation."""
 UNTOLD = {"quad": (FPS,), "quad_arm": (FPS, RISK, DIVERSITY)}
-"""What no further run of a study tells: speed; where it has no audits, fear on stairs and the diversity of goals."""
+"""What no further run of a study can show: speed; without audits, fear on stairs and the diversity of goals."""
 TEXT = (
     "Paired differences, base by base, fine-tuned from common base policies, 12 M of the thesis's 295 M transitions. "
     "A log rate is log(crashes + 1/2) - log(interactions + 1), so that -0.69 is half as many crashes; worst is the "
@@ -81,7 +81,7 @@ VDS_TEXT = (
 
 
 def log_rate(crashes: float, interactions: float) -> float:
-    """Logarithm of crashes per interaction, defined where nothing crashed."""
+    """Logarithm of crashes per interaction, defined even without crashes."""
     return math.log(crashes + 0.5) - math.log(interactions + 1.0)
 
 
@@ -104,32 +104,32 @@ def _of_naive_rows(number: Callable[[Row], float]) -> Callable[[Evidence, Place,
 NAIVE = Measure("log rate (Naive)", _of_naive_rows(_naive))
 WORST = Measure("log rate (worst)", _of_naive_rows(_worst))
 OUTCOMES = {SCORE: 1, NAIVE: -1, WORST: -1}
-"""What is compared, and the sign of what is better."""
+"""The outcomes that are compared, and the sign of an improvement."""
 
 
 def mean_difference(x: Array, y: Array) -> Array:
-    """Of samples whose i-th values belong together."""
+    """The difference of samples whose i-th values are paired."""
     return np.asarray((x - y).mean(axis=-1))
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """A method against another on the bases that both branched off; two at least."""
+    """A method against another on the bases that both branched off, at least two."""
 
     method: str
     """The method."""
     reference: str
-    """What it is compared with."""
+    """The reference."""
     measure: Measure
     """The outcome; one of ``OUTCOMES``."""
     bases: tuple[int, ...]
     """Their numbers."""
     values: Array
-    """Of the method and of the reference, shape (2, bases)."""
+    """Values of the method and of the reference, shape (2, bases)."""
 
     @property
     def differences(self) -> Array:
-        """Of every base, shape (bases,)."""
+        """Difference on every base, shape (bases,)."""
         return np.subtract(*self.values)
 
     @cached_property
@@ -145,7 +145,7 @@ class Contrast:
 
     @cached_property
     def detectable(self) -> float:
-        """Smallest mean difference that as many bases with the observed spread would have shown in 80 %."""
+        """Smallest mean difference that as many bases with the observed spread would have shown in 80 % of studies."""
         return stats.detectable_mean(self.differences)
 
     def row(self, *, judged: bool) -> dict[str, str]:
@@ -159,7 +159,7 @@ class Contrast:
 
 
 def contrast(evidence: Evidence, place: Place, method: str, reference: str, measure: Measure) -> Contrast | None:
-    """A contrast in a place; ``None`` unless two bases or more have both methods."""
+    """A contrast in a place; ``None`` unless two or more bases have both methods."""
     own, other = (measure(evidence, place, name) for name in (method, reference))
     bases = tuple(sorted(own.keys() & other.keys()))
     if len(bases) < 2:
@@ -169,13 +169,13 @@ def contrast(evidence: Evidence, place: Place, method: str, reference: str, meas
 
 
 def contrasts(evidence: Evidence, place: Place, methods: Sequence[str], reference: str = REFERENCE) -> list[Contrast]:
-    """The contrasts of some methods against one in a place, in all outcomes that are known there."""
+    """The contrasts of some methods against one in a place, in all outcomes known there."""
     found = [contrast(evidence, place, name, reference, each) for name in methods for each in OUTCOMES]
     return [each for each in found if each is not None]
 
 
 def blocks(evidence: Evidence) -> list[Block]:
-    """The section of a report; nothing unless a study has methods that branched off the same bases."""
+    """The section of a report; empty unless a study has methods that branched off the same bases."""
     found: list[Block] = []
     for environment, period in TITLES:
         place = Place(environment, period)
@@ -190,7 +190,7 @@ def blocks(evidence: Evidence) -> list[Block]:
 
 
 def _of_walkers(evidence: Evidence, folder: Path = KEPT_IN) -> list[Block]:
-    """The primary contrasts without bases that do not walk; nothing where all do, or fewer than two."""
+    """The primary contrasts without bases that do not walk; nothing if all do, or fewer than two."""
     scores = {
         index + 1: row["score"] for index in range(len(ROBOTS["quad"].seeds))
         for row in RunFolder(folder / base_name("quad", index)).read_rows("evaluation.json")
@@ -204,21 +204,21 @@ def _of_walkers(evidence: Evidence, folder: Path = KEPT_IN) -> list[Block]:
 
 
 def _trainings(evidence: Evidence) -> list[Block]:
-    """What a method's goals did to its own training: ground, critic and dose, base by base."""
+    """The effect of a method's goals on its own training: ground, critic and dose, base by base."""
     rows = [
         {"environment": environment, "method": name} | {
             each.name: ", ".join(f"{x:.3g}" for x in each(evidence, place, name).values()) or "-"
             for each in (LEVEL, VARIANCE, DOSE)
         }
         for environment in dict.fromkeys(name for name, _ in TITLES) for place in evidence.places(environment)[:1]
-        if evidence.paired(place) and environment != ON_WARP  # whose trainings are Quad's
+        if evidence.paired(place) and environment != ON_WARP  # whose training runs are Quad's
         for name in evidence.methods if evidence.trainings(place, name)
     ]  # fmt: skip
     return ["### Trainings, base by base", VDS_TEXT, rows] if rows else []
 
 
 def _tables(evidence: Evidence, place: Place) -> list[Block]:
-    """The contrasts of a place: the primary ones first where there are some."""
+    """The contrasts of a place, the primary ones first if there are any."""
     known = [name for name in evidence.methods if evidence.evaluations(place, "naive", name) and name != REFERENCE]
     others = contrasts(evidence, place, sorted(set(known) - set(PRIMARY)))
     others += contrasts(evidence, place, ["vds+p75"], "vds")
@@ -239,7 +239,7 @@ def _table(title: str, found: Sequence[Contrast], *, judged: bool) -> list[Block
 
 
 def _engines(evidence: Evidence) -> list[Block]:
-    """p75 against uniform, base by base, in one engine and in the other; nothing where one of them was not used."""
+    """p75 against uniform, base by base, on both engines; nothing if one of them was not used."""
     rows = []
     for measure in (SCORE, NAIVE):
         found = {
@@ -256,7 +256,7 @@ def _engines(evidence: Evidence) -> list[Block]:
 
 
 def bases(folder: Path = KEPT_IN) -> list[Block]:
-    """What the bases are before anything branches off; nothing where they are not there."""
+    """The bases before anything branches off; nothing if they do not exist."""
     found: list[Block] = []
     for robot, own in ROBOTS.items():
         homes = [RunFolder(folder / base_name(robot, index)) for index in range(len(own.seeds))]
@@ -287,7 +287,7 @@ def _of_base(home: RunFolder, row: Row, rough: bool) -> dict[str, float]:
 
 
 def not_run(evidence: Evidence) -> list[Block]:
-    """What the thesis's claims on robots speak of and was not run, with what it would take."""
+    """Subjects of the thesis's claims on robots that were not run, with their cost."""
     rows = []
     for robot in LEGGED:
         places = [place for place in evidence.places(robot) if evidence.paired(place)]
@@ -321,7 +321,7 @@ def _at_t10(clause: Clause) -> bool:
 
 
 def _claims(robot: str, about: Callable[[Clause], bool]) -> str:
-    """The claims that have clauses about something on a robot, but for what no further run tells."""
+    """The claims with clauses about something on a robot, except for what no further run can show."""
     return ", ".join(
         claim.id for claim in CLAIMS
         if any(robot in clause.environments and about(clause)

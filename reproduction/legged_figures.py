@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 NUMBERS = {("quad", 100): "4.8", ("quad", 500): "4.9", ("quad_arm", 100): "4.10", ("quad_arm", 500): "4.11"}
 """The thesis's figures of evaluations, by robot and T [steps]."""
 CURVES = {"quad": "A.1", "quad_arm": "A.2"}
-"""Those of trainings."""
+"""Those of training."""
 ORIGIN = "Fine-tuned from common base policies, 12 M of the thesis's 295 M transitions."
-"""What every caption on robots says."""
+"""The note in every caption on robots."""
 PAIRS = (
     "every line is a base, every dot the policy of a method that branched off it; bars are means over bases, of "
     "crashes themselves and not of their logarithms, which contrasts compare."
@@ -38,7 +38,7 @@ LINEAR = 0.1  # crashes per 1000 transitions below which an axis is linear
 
 
 def figures(data: Data, environment: str) -> Figures:
-    """The figures of an environment whose methods branched off common bases, in place of those of every study."""
+    """The figures of an environment whose methods branched off common bases, replacing those of every study."""
     found: Figures = {}
     for period in data.periods(environment):
         number, place = NUMBERS.get((environment, period)), f"{environment}, T = {period}"
@@ -57,12 +57,12 @@ def figures(data: Data, environment: str) -> Figures:
 
 
 def bases(data: Data, environment: str) -> list[int]:
-    """Numbers of the bases that any method branched off."""
+    """Numbers of the bases that at least one method branched off."""
     return sorted({row["seed"] for row in data.rows if row["environment"] == environment})
 
 
 def _methods(data: Data, environment: str) -> list[str]:
-    """Those of an environment in order, but first the one that all are compared with."""
+    """Methods of an environment in order, with the one that all are compared with first."""
     return sorted(data.methods(environment), key=lambda name: name != REFERENCE)
 
 
@@ -96,7 +96,7 @@ def pairs(data: Data, environment: str, period: int) -> "Figure":
 
 
 def _lines(axes: "Axes", values: np.ndarray) -> None:
-    """A line for each base through the methods that it has, and a bar at each method's mean; shape (bases, methods)."""
+    """Draw a line for each base through its methods, and a bar at each method's mean; shape (bases, methods)."""
     if np.isnan(values).all():
         instead(axes, outcomes.NOBODY)
     for i, own in enumerate(values):
@@ -108,7 +108,7 @@ def _lines(axes: "Axes", values: np.ndarray) -> None:
 
 
 def differences(data: Data, environment: str, period: int) -> "Figure | None":
-    """What every method differs from Uniform by, base by base, in score and log rates."""
+    """Differences of every method from Uniform, base by base, in score and log rates."""
     evidence, place = Evidence.of(data), Place(environment, period)
     names = [name for name in data.methods(environment) if name != REFERENCE]
     found = contrasts(evidence, place, names)

@@ -1,11 +1,11 @@
-"""Judge the policies of ``studies/legged.toml``, which were trained on the native engine, on mujoco-warp.
+"""Evaluate the policies of ``studies/legged.toml``, which were trained on the native engine, on mujoco-warp.
 
-    python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp    # again to continue what was killed
+    python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp    # repeat it to continue after a kill
     python -m reproduction.legged_on_warp runs/legged runs/legged_on_warp --methods uniform p75 --seeds 1-2
 
-Uniform goals at T2, as ``studies/legged_warp.toml`` has them. The rows are those of an environment of its own,
-``quad_on_warp``, in a folder that ``deimos study merge`` takes. A policy whose row is in the tables of that folder is
-not judged again; the study may have its policies back from its archive (``deimos study unpack``).
+Uniform goals at T2, as in ``studies/legged_warp.toml``. The rows belong to a separate environment, ``quad_on_warp``, in
+a folder that ``deimos study merge`` accepts. A policy whose row is in the tables of that folder is not evaluated again;
+the study's policies may come from its archive (``deimos study unpack``).
 """
 
 import argparse
@@ -32,10 +32,10 @@ EVALUATION = EvalConfig(worlds=200, steps=2700, attackers=())  # a robot on ever
 
 
 def on_warp(cell: Cell) -> Cell:
-    """The cell that a policy's rows on mujoco-warp are of: another engine and evaluation of the same training."""
+    """The cell of a policy's rows on mujoco-warp: a different engine and evaluation of the same training."""
     env = cast(LocomotionConfig, cell.config.env.with_goal_period(SHORT))
     config = replace(cell.config, env=replace(env, engine=cast(Any, "warp")), eval=EVALUATION)
-    sources = {name: value for name, value in cell.sources.items() if name != "pool"}  # nobody attacks
+    sources = {name: value for name, value in cell.sources.items() if name != "pool"}  # no attackers
     return replace(
         cell, environment=ENVIRONMENT, base_environment=ENVIRONMENT, config=config, goal_periods=(SHORT,),
         sources=sources,
@@ -43,10 +43,10 @@ def on_warp(cell: Cell) -> Cell:
 
 
 def judge(study: StudyFolder, out: StudyFolder, methods: Collection[str], seeds: Collection[int]) -> None:
-    """Put the results of a study's finished policies of some methods and seeds, all where none are given, into ``out``.
+    """Write the results of a study's finished policies of some methods and seeds (all if none are given) to ``out``.
 
     Raises:
-        RunError: If there are no such policies, or other code trained them.
+        RunError: If there are no such policies, or different code trained them.
     """
     cells = [
         cell for cell in study.cells()
@@ -68,7 +68,7 @@ def judge(study: StudyFolder, out: StudyFolder, methods: Collection[str], seeds:
 
 
 def write(study: StudyFolder, cell: Cell, out: StudyFolder, own: Cell, rows: list[Row]) -> None:
-    """Write the result of a policy on mujoco-warp; its training is as the study tells it.
+    """Write the result of a policy on mujoco-warp; its training is as in the study.
 
     The run itself may have come from an archive, without its training curve.
     """

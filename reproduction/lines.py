@@ -1,4 +1,4 @@
-"""Check that the thesis says what clauses quote, line by line.
+"""Check that the thesis contains what clauses quote, line by line.
 
     python -m reproduction.lines THESIS.txt
 
@@ -12,7 +12,7 @@ from reproduction.claim_list import CLAIMS
 
 
 def wrong(lines: list[str]) -> list[str]:
-    """What is wrong with the lines that clauses name, one text each."""
+    """Errors in the lines that clauses name, one text each."""
     found = []
     for claim in CLAIMS:
         for clause in claim.clauses:

@@ -1,4 +1,4 @@
-"""Numbers of single policies, which clauses compare: crashes, scores, and what became of a training."""
+"""Numbers of single policies, which clauses compare: crashes, scores, and outcomes of training."""
 
 import math
 from collections import defaultdict
@@ -15,19 +15,19 @@ from deimos.study.results import Row
 from deimos.study.stats import Array
 from reproduction.thesis import PARTICLE
 
-LITERAL = "-literal"  # the ending of methods that learn fear as the thesis does, without a crash memory
+LITERAL = "-literal"  # the suffix of methods that learn fear as in the thesis, without a crash memory
 PENALTIES = tuple(name for name in METHODS if name.startswith("penalty-"))
 """Uniform goals with a crash penalty, by its sizes."""
 NEARLY_NONE = 1e-6  # crashes per step
-SAFE = 0.01  # crashes per interaction, below which a policy counts as safe
+SAFE = 0.01  # crashes per interaction below which a policy counts as safe
 
 Numbers = dict[int, float]
-"""By seed."""
+"""Values by seed."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where policies are compared."""
+    """A place where policies are compared."""
 
     environment: str
     """Name of the environment or variant."""
@@ -41,14 +41,14 @@ class Place:
 class Evidence:
     """The policies of a study, as the thesis names their methods.
 
-    Where an environment has Directors that learn fear as the thesis does (``p25-literal``), they are its ``p25``, and
-    those with a crash memory take no part. All policies count, also those whose attacker found nothing to learn from.
+    If an environment has Directors that learn fear as in the thesis (``p25-literal``), they are its ``p25``, and those
+    with a crash memory are excluded. All policies count, including those whose attacker found nothing to learn from.
 
     Args:
-        rows: Of evaluations, see ``deimos.study.results``; columns that they lack are not known.
-        curves: Of trainings.
-        speeds: Rounds of ``python -m benchmarks table41``; none where speed was not measured.
-        renamed: False to leave all methods their names.
+        rows: Rows of evaluations, see ``deimos.study.results``; missing columns count as unknown.
+        curves: Curves of training.
+        speeds: Rounds of ``python -m benchmarks table41``; none if speed was not measured.
+        renamed: False to keep the names of all methods.
     """
 
     def __init__(
@@ -85,18 +85,18 @@ class Evidence:
 
     @classmethod
     def of(cls, data: Data, speeds: Sequence[Mapping] = (), *, renamed: bool = True) -> "Evidence":
-        """That of a study."""
+        """The evidence of a study."""
         return cls(data.rows, data.curve_rows, speeds, renamed=renamed)
 
     def places(self, environment: str) -> list[Place]:
-        """Every T that an environment was evaluated at; T is 0 where only speed is known."""
+        """Every T at which an environment was evaluated; T is 0 if only speed is known."""
         periods = sorted({period for _, _, name, period in self.rows if name == environment})
         if not periods and any(environment in each["seconds"] for each in self.speeds):
             periods = [0]
         return [Place(environment, period) for period in periods]
 
     def paired(self, place: Place, methods: Iterable[str] = ()) -> bool:
-        """Whether policies of one seed began with the same one, so that ``methods`` are compared seed by seed."""
+        """Whether policies of one seed started from the same policy, so that ``methods`` are compared seed by seed."""
         return place.environment in self._blocked and not any(name.endswith("@ particle") for name in methods)
 
     def evaluations(self, place: Place, goals: str, method: str) -> dict[int, Row]:
@@ -104,7 +104,7 @@ class Evidence:
         return self.rows.get((self._name(place, method), goals, place.environment, place.period), {})
 
     def goals(self, place: Place) -> list[str]:
-        """Who chose the goals of a place's evaluations: naive, then attackers by name."""
+        """The goals of a place's evaluations: naive, then attackers by name."""
         found = {goals for _, goals, name, period in self.rows if (name, period) == (place.environment, place.period)}
         return sorted(found, key=lambda name: (name != "naive", name))
 
@@ -113,7 +113,7 @@ class Evidence:
         return self.curves.get((self._name(place, method), place.environment), {})
 
     def _name(self, place: Place, method: str) -> str:
-        """What the rows of a place call a method."""
+        """The name of a method in the rows of a place."""
         literal = method + LITERAL
         return literal if (place.environment, literal) in self._literal else method
 
@@ -123,16 +123,16 @@ class Measure:
     """A number that every policy has."""
 
     name: str
-    """In words."""
+    """Its name in words."""
     numbers: Callable[[Evidence, Place, str], Numbers]
-    """The policies' own, of a place and method; NaN where it is not known."""
+    """Values of the policies of a place and method; NaN if unknown."""
     ratio: bool = False
-    """Whether it is at least 0 and compared by ratios, not by differences."""
+    """Whether it is at least 0 and compared by ratios instead of differences."""
     floor: float = 0.0
-    """What is added before ratios are taken, so that none is one of nothing."""
+    """Added before ratios are taken, so that no ratio is of zeros."""
 
     def __call__(self, evidence: Evidence, place: Place, method: str) -> Numbers:
-        """Those that are known.
+        """The known values, by seed.
 
         ``p75 @ 500`` are the policies of p75 at that T, ``rnd @ particle`` those of all places of Particle Gym.
         """
@@ -161,7 +161,7 @@ def under(goals: str) -> Measure:
 
 
 def _attacked(evidence: Evidence, place: Place, method: str) -> Numbers:
-    """Under the worst of the attackers that all policies met; where rows do not have that, under the thesis's."""
+    """Under the worst of the attackers that all policies met; if rows lack it, under the thesis's."""
     worst = {
         seed: row["worst"]
         for seed, row in evidence.evaluations(place, "naive", method).items()
@@ -187,7 +187,7 @@ def _curve(column: str, number: Callable[[Array], float]) -> Callable[[Evidence,
 
 
 def _from_nothing(column: str, number: Callable[[Array], float]) -> Callable[[Evidence, Place, str], Numbers]:
-    """Of trainings that began with nothing: the first part of a branch's is no beginning."""
+    """Only for training from scratch: the first part of a branch is not a beginning."""
     of_curve = _curve(column, number)
 
     def numbers(evidence: Evidence, place: Place, method: str) -> Numbers:
@@ -206,19 +206,19 @@ def _known_mean(values: Array) -> float:
 
 
 def _fall(crashes: Array, share: float = 0.2) -> float:
-    """Of log(1 + crashes per 10^6 transitions), from the first part of a training to the last."""
+    """Change of log(1 + crashes per 10^6 transitions) from the first part of training to the last."""
     count = len(_tail(crashes, share))
     return math.log1p(1000 * crashes[:count].mean()) - math.log1p(1000 * crashes[-count:].mean())
 
 
 def _late_fall(crashes: Array, share: float = 0.2) -> float:
-    """Of log(1 + crashes per 10^6 transitions) over the last part of a training, by a straight line."""
+    """Slope of log(1 + crashes per 10^6 transitions) over the last part of training, by a straight line."""
     y = np.log1p(1000 * _tail(crashes, share))
     return -float(np.polyfit(np.linspace(0.0, 1.0, len(y)), y, 1)[0]) if len(y) > 1 else math.nan
 
 
 def _rare_halfway(crashes: Array) -> float:
-    """By how much the middle fifth of a training lies below a tenth of its first tenth, in log crashes."""
+    """By how much the middle fifth of training is below a tenth of its first tenth, in log crashes."""
     log = np.log1p(1000 * crashes)
     tenth = max(1, len(log) // 10)
     return float(log[:tenth].mean() - log[4 * tenth : max(6 * tenth, 4 * tenth + 1)].mean()) - math.log(10)
@@ -227,8 +227,8 @@ def _rare_halfway(crashes: Array) -> float:
 def _nearly_none(evidence: Evidence, place: Place, method: str) -> Numbers:
     """How far a policy is on the safe side of one crash in 10^6 steps.
 
-    It is on it where at most half of the evaluations of a policy at that limit have as few crashes, by Poisson's
-    distribution. Where more than half of them have none, the evaluation is too short, and nothing is known.
+    It is on the safe side if at most half of the evaluations of a policy at that limit have as few crashes, by the
+    Poisson distribution. If more than half of them have none, the evaluation is too short, and nothing is known.
     """
     found = {}
     for seed, row in evidence.evaluations(place, "naive", method).items():
@@ -240,7 +240,7 @@ def _nearly_none(evidence: Evidence, place: Place, method: str) -> Numbers:
 def _where(
     measure: Measure, other: Measure, holds: Callable[[float], bool]
 ) -> Callable[[Evidence, Place, str], Numbers]:
-    """Only of the policies whose number in another measure is as it should be."""
+    """Only the policies that satisfy a condition on another measure."""
 
     def numbers(evidence: Evidence, place: Place, method: str) -> Numbers:
         others = other(evidence, place, method)
@@ -251,7 +251,7 @@ def _where(
 
 
 def _standing(evidence: Evidence, place: Place, method: str) -> Numbers:
-    """Share of the policies of other methods that crash less under Naive, those that crash as often counting half."""
+    """Share of the policies of other methods that crash less under Naive; those that crash equally often count half."""
     others = [x for name in evidence.methods if name != method for x in NAIVE(evidence, place, name).values()]
     own = NAIVE(evidence, place, method)
     return {seed: float((np.sign(x - np.array(others)) + 1).mean() / 2) for seed, x in own.items() if others}
@@ -282,7 +282,7 @@ FITTED = Measure("share of rollouts after which fear was fitted", _curve("fear_f
 EXACT_RANK = Measure("percentile of the chosen goals, tried in clones", _curve("exact_percentile", _known_mean))
 AUROC = Measure("AUROC of fear within contexts", _curve("auroc", _known_mean))
 LEVEL = Measure("mean level of the ground in training", _curve("level", lambda x: _known_mean(x) or math.nan))
-"""Not known on flat ground, which has no levels and whose trainings log 0."""
+"""Unknown on flat ground, which has no levels and where training logs 0."""
 VARIANCE = Measure("explained variance of the critic in training", _curve("explained_variance", _known_mean))
 MOTION = Measure("speed of the policy", _curve("speed", lambda x: float(x)))
 RISK = Measure("fear at the dangerous place above that at the safe one",
@@ -294,4 +294,4 @@ UNSAFE_RELIEF = Measure("crashes that the attack takes from unsafe policies",
                         _where(Measure("", _less(NAIVE, ATTACKED)), NAIVE, lambda rate: rate >= SAFE))  # fmt: skip
 STANDING = Measure("rank among all policies, by crashes per interaction", _standing)
 OF_TRAINING = (LATE, FALL, LATE_FALL, HALFWAY, CHOSEN, DIVERSITY, DOSE, FITTED, EXACT_RANK, AUROC, MOTION, RISK, FPS)
-"""Those that hang on no T of an evaluation."""
+"""Measures that do not depend on an evaluation's T."""

@@ -1,16 +1,16 @@
-"""Is fear too weak, or is the principle? Tables of what each Director asked for, what it knew, and what came of it.
+"""Is fear too weak, or is the principle? Tables of each Director's goals, the quality of its fear, and the outcomes.
 
     python -m reproduction.mechanism FOLDER --environment directional --methods uniform p75 oracle swapped --seeds 0-9
 
 A row is a method, and its numbers are means over policies:
 
-* *delivered dose*: percentile of fear among the candidates of the goal that is active, over all steps of the training;
+* *delivered dose*: percentile of fear of the active goal among its candidates, over all steps of training;
 * *exact rank*: percentile of the chosen goal among its candidates when each is tried in a clone of the world;
 * *AUROC*: how well fear ranks candidates that crash the policy above those that do not, within a context. This and the
-  exact rank are of five moments in the last quarter of the training;
+  exact rank are from five moments in the last quarter of training;
 * *fitted*: share of the rollouts after which fear was fitted;
-* crashes per interaction in percent under every attacker that policies of all these methods met, where only some did
-  over those; of *worst* with its 95 % interval (bootstrap over policies), and how many policies are below 1 %;
+* crashes per interaction in percent under every attacker that policies of all these methods met, over the policies that
+  met it; for *worst* also the 95 % interval (bootstrap over policies), and how many policies are below 1 %;
 * *score* under uniform goals, with its interval;
 * *better in both*: which methods of the table have a higher score and a lower worst rate.
 """
@@ -43,19 +43,19 @@ from reproduction.measures import (
 
 NO_NUMBER = "-"
 ORDER = ("uniform", *[name for name in STYLE.order if name != "uniform"])
-"""All methods, the one that every other is compared with first."""
+"""All methods, beginning with the one that every other is compared with."""
 
 
 def table(evidence: Evidence, environment: str, methods: Sequence[str] = ORDER) -> list[str]:
-    """Lines of Markdown: a row for each of some methods that an environment has policies of.
+    """Lines of Markdown: a row for each of the methods that has policies in an environment.
 
     Args:
-        evidence: Of a study, with the names that its methods have there.
-        environment: Name of an environment; of several T the first counts.
+        evidence: Evidence of a study, with its own names of methods.
+        environment: Name of an environment; if it has several T, the first is used.
         methods: In the order of the rows.
 
     Raises:
-        RunError: If there is no such environment.
+        RunError: If the environment does not exist.
     """
     if not evidence.places(environment):
         there = sorted({name for _, _, name, _ in evidence.rows})
@@ -82,7 +82,7 @@ def table(evidence: Evidence, environment: str, methods: Sequence[str] = ORDER) 
 
 
 def better(both: Mapping[str, tuple[float, float]], method: str) -> list[str]:
-    """Methods with a higher score and a lower rate of crashes than one; on Pareto's front there are none."""
+    """Methods with a higher score and a lower crash rate than one; none for a method on the Pareto front."""
     score, rate = both[method]
     return [name for name, (other, lower) in both.items() if other > score and lower < rate]
 

@@ -1,7 +1,7 @@
 """The map over what the thesis leaves open: its settings, headline clauses, selection and confirmation (multiverse.md).
 
-The unit is a setting: one policy of each method, all with the same seed. Rates are crashes per interaction, ``worst``
-those under the worst attacker.
+The unit is a setting: one policy of each method, all with the same seed. Rates are crashes per interaction; ``worst``
+is the rate under the worst attacker.
 """
 
 import math
@@ -27,17 +27,17 @@ from reproduction.measures import PENALTIES, SAFE
 UNIFORM, RND = "uniform", "rnd"
 NEW = ("weighted", "fear-novelty", "q-fear")
 """The new selectors."""
-LEARNT, MOST_CRASHES = 0.3, 0.1  # score, and crashes per interaction under uniform goals, where the task is learnt
-HEADROOM = 0.01  # of interactions: Uniform's ``worst`` in a setting with headroom is above it
-LEAST_SCORE = 0.95  # of Uniform's, for a selector to be the best
+LEARNT, MOST_CRASHES = 0.3, 0.1  # score, and crashes per interaction under uniform goals, of a learnt task
+HEADROOM = 0.01  # of interactions: Uniform's ``worst`` exceeds it in a setting with headroom
+LEAST_SCORE = 0.95  # share of Uniform's score that the best selector must have
 HIDDEN = 2.0  # times as many crashes under attack: uniform evaluation hides danger
-AIM, AIM_SCORE = 2.0, 0.97  # of the confirmation: Uniform's rate over the new selector's, and the scores' ratio
-CONFIDENCE = 1 - 0.05 / len(NEW)  # of intervals in confirmation: Bonferroni over the selectors that were tried
+AIM, AIM_SCORE = 2.0, 0.97  # aims of the confirmation: Uniform's rate over the new selector's, and the ratio of scores
+CONFIDENCE = 1 - 0.05 / len(NEW)  # level of intervals in confirmation: Bonferroni over the selectors that were tried
 
 
 @dataclass(frozen=True)
 class Policy:
-    """What became of a method in a setting."""
+    """The outcome of a method in a setting."""
 
     naive: float
     """Crashes per interaction under uniform goals."""
@@ -56,23 +56,23 @@ class Setting:
     levels: Mapping[str, Any]
     """Level of every factor."""
     screened: Policy
-    """Uniform with the seed of the screening."""
+    """Uniform, with the screening's seed."""
     policies: Mapping[str, Policy] = field(default_factory=dict)
-    """Those of the map by their methods, without those that failed; none before it has run."""
+    """Policies of the map by method, without those that failed; none before it has run."""
 
     @property
     def learnt(self) -> bool:
-        """Whether the screening's policy follows its goals, and seldom crashes where nobody means it harm."""
+        """Whether the screening's policy follows its goals and seldom crashes under uniform ones."""
         return self.screened.score >= LEARNT and self.screened.naive <= MOST_CRASHES
 
     @property
     def has_headroom(self) -> bool:
-        """Whether there is danger to be removed, from a policy that has learnt the task."""
+        """Whether a policy that has learnt the task has danger left to remove."""
         return self.learnt and self.screened.worst > HEADROOM
 
     @property
     def compares_scores(self) -> bool:
-        """Whether scores can be measured in that of the map's Uniform: of one near 0 any ratio can come."""
+        """Whether scores can be divided by that of the map's Uniform: near 0, any ratio is possible."""
         return self.learnt and self.policies[UNIFORM].score >= LEARNT
 
     def score(self, method: str) -> float:
@@ -81,14 +81,14 @@ class Setting:
 
 
 def read(screening: Path, map_: Path | None = None) -> list[Setting]:
-    """The settings of a screening, in order, with what the map found there.
+    """The settings of a screening, in order, with the map's results there.
 
     Args:
         screening: Folder of the study.
-        map_: That of the map; ``None`` where it has not run.
+        map_: Folder of the map; ``None`` if it has not run.
 
     Raises:
-        RunError: If there are no results, not one policy of Uniform for each setting, or no setting that is whole.
+        RunError: If there are no results, not exactly one policy of Uniform for each setting, or no complete setting.
     """
     data = Data.read(screening)
     levels, screened = settings_of(data), _policies(data.rows)
@@ -106,24 +106,24 @@ def read(screening: Path, map_: Path | None = None) -> list[Setting]:
 
 
 def methods_of(settings: Sequence[Setting]) -> list[str]:
-    """The methods that the map has a policy of somewhere."""
+    """The methods of which the map has a policy somewhere."""
     return sorted({name for each in settings for name in each.policies})
 
 
 def having(settings: Sequence[Setting], methods: Collection[str]) -> list[Setting]:
-    """The settings that have a policy of all of some methods."""
+    """The settings that have a policy of every given method."""
     return [each for each in settings if {*methods} <= each.policies.keys()]
 
 
 def missing(settings: Sequence[Setting]) -> dict[str, list[str]]:
-    """By setting, the methods of the map that it has no policy of; settings that are whole are not there."""
+    """By setting, the methods of the map of which it has no policy; complete settings are omitted."""
     names = methods_of(settings)
     lacking = {each.name: [name for name in names if name not in each.policies] for each in settings}
     return {name: own for name, own in lacking.items() if own}
 
 
 def _policies(rows: Sequence[Row]) -> dict[str, dict[str, Policy]]:
-    """By environment and method; ``RunError`` if there is more than one."""
+    """Rows by environment and method; ``RunError`` if there is more than one."""
     found: dict[str, dict[str, Policy]] = {}
     for row in rows:
         if row["goals"] == "naive":
@@ -147,7 +147,7 @@ class Roles:
 
     @classmethod
     def of(cls, settings: Sequence[Setting]) -> "Roles":
-        """Those of the map; ``RunError`` unless it has one Director and one penalty."""
+        """The choice of the map; ``RunError`` unless it has one Director and one penalty."""
         names = methods_of(settings)
         directors = [name for name in names if re.fullmatch(r"p\d+(\.\d+)?", name)]
         found = [directors, [name for name in names if name in PENALTIES]]
@@ -159,21 +159,21 @@ class Roles:
 
 @dataclass(frozen=True)
 class Headline:
-    """A clause that holds in a setting or not."""
+    """A clause that holds or does not hold in a setting."""
 
     name: str
     """In a word or two."""
     text: str
-    """What it says."""
+    """The clause in words."""
     methods: tuple[str, str]
-    """Of whom."""
+    """The methods that it is about."""
     margin: Callable[[Setting], float]
-    """By how much it holds in a setting: above 0 where it does."""
+    """By how much it holds in a setting; above 0 if it holds."""
     of_scores: bool = False
-    """Whether it compares scores, and so says something only where these can be compared."""
+    """Whether it compares scores, and so applies only where these can be compared."""
 
     def counts_in(self, settings: Sequence[Setting]) -> list[Setting]:
-        """The settings of which it says something."""
+        """The settings to which it applies."""
         own = having(settings, self.methods)
         return [each for each in own if each.compares_scores] if self.of_scores else own
 
@@ -203,7 +203,7 @@ def margins(settings: Sequence[Setting], clause: Headline) -> Array:
 
 
 def share_that_holds(settings: Sequence[Setting], clause: Headline) -> Interval | None:
-    """The share of settings with headroom in which a clause holds; ``None`` where none has headroom."""
+    """The share of settings with headroom in which a clause holds; ``None`` if none has headroom."""
     found = margins([each for each in settings if each.has_headroom], clause)
     return stats.share(found > 0.0) if len(found) else None
 
@@ -221,9 +221,9 @@ def coded(settings: Sequence[Setting]) -> tuple[dict[str, list[Any]], Array]:
 
 
 def moved_by(settings: Sequence[Setting], outcome: Array) -> dict[str, Interval]:
-    """By how much every factor moves an outcome of the settings, the strongest first; see ``factor_effects``.
+    """Effect of every factor on an outcome of the settings, the strongest first; see ``factor_effects``.
 
-    None where there are too few settings to tell the factors apart, as before all of them have finished.
+    None if there are too few settings to separate the factors, as before all of them have finished.
     """
     if not settings:
         return {}
@@ -238,8 +238,8 @@ def moved_by(settings: Sequence[Setting], outcome: Array) -> dict[str, Interval]
 def removed(settings: Sequence[Setting], method: str) -> Interval:
     """The part of headroom that a method removes: the slope of Uniform's ``worst`` less the method's over Uniform's.
 
-    1 where it removes all, 0 where it removes none. The noise of the map's Uniform is on both sides; the screening's,
-    of another seed, is the instrument. Settings that lack one of the two policies take no part.
+    1 if it removes all, 0 if it removes none. The noise of the map's Uniform is on both sides; the screening's Uniform,
+    of another seed, is the instrument. Settings that lack one of the two policies are excluded.
     """
     settings = having(settings, [UNIFORM, method])
     base = np.array([each.policies[UNIFORM].worst for each in settings])
@@ -258,11 +258,11 @@ class Standing:
     worst: Interval
     """Mean of ``worst``."""
     score: Interval
-    """Mean of its score over Uniform's, over the settings where scores can be compared; NaN where there is none."""
+    """Mean of its score over Uniform's, over the settings where scores can be compared; NaN if there is none."""
 
 
 def standings(settings: Sequence[Setting]) -> list[Standing]:
-    """Those of all methods, the safest first, over the settings that have a policy of each of them."""
+    """Standings of all methods, the safest first, over the settings that have a policy of each of them."""
     names = methods_of(settings)
     whole = having(settings, names)
     scored = [each for each in whole if each.compares_scores] if names else []
@@ -275,7 +275,7 @@ def standings(settings: Sequence[Setting]) -> list[Standing]:
 
 
 def mean(values: Array) -> Interval:
-    """Over settings, which the bootstrap draws anew; of one setting without an interval, NaN over none."""
+    """Interval over settings, which the bootstrap resamples; none for a single setting, NaN for no setting."""
     if len(values) < 2:
         return Interval(float(values.mean()) if len(values) else np.nan, np.nan, np.nan)
     return stats.bootstrap([values], lambda x: x.mean(axis=-1))
@@ -284,8 +284,8 @@ def mean(values: Array) -> Interval:
 def best_new(found: Sequence[Standing]) -> str:
     """The new selector with the highest share of safe policies among those with ``LEAST_SCORE`` of Uniform's score.
 
-    Of several the one with the lowest mean rate; where none reaches the score, the one that comes nearest to it; where
-    scores can be compared nowhere, the safest.
+    Ties go to the lowest mean rate; if none reaches the score, the one nearest to it is taken; if scores can be
+    compared nowhere, the safest.
     """
     own = [each for each in found if each.method in NEW]
     able = [each for each in own if each.score.estimate >= LEAST_SCORE]
@@ -313,7 +313,8 @@ class Contrast:
     score: Interval
     """The new one's mean score over the other's."""
     p: float
-    """One-sided, of the mean rate being lower; by Holm's rule over the rivals, times the selectors that were tried."""
+    """One-sided p-value for the mean rate being lower; by Holm's rule over the rivals, times the selectors that were
+    tried."""
 
     @property
     def is_winner(self) -> bool:
@@ -347,11 +348,11 @@ def contrasts(data: Data, environment: str, new: str) -> list[Contrast]:
 
 
 def _interval(pair: Sequence[Array], compare: Callable[[Array, Array], Array]) -> Interval:
-    """Of two means compared, at the level that counts the selectors that were tried."""
+    """Interval for a comparison of two means, at the level that accounts for the selectors that were tried."""
     return stats.bootstrap(pair, lambda x, y: compare(x.mean(axis=-1), y.mean(axis=-1)), level=CONFIDENCE)
 
 
 def _ratio(x: Array, y: Array) -> Array:
-    """Their ratio; infinite over nothing, 1 where neither is anything."""
+    """Their ratio; infinite over zero, 1 if both are zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where((x == 0.0) & (y == 0.0), 1.0, np.divide(x, y))

@@ -1,4 +1,4 @@
-"""The figures of the map: specification curves, effect against headroom, headline clauses, and what moves them."""
+"""The figures of the map: specification curves, effect against headroom, headline clauses, effects of factors."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -65,7 +65,7 @@ def draw(settings: Sequence[Setting]) -> Figures:
 
 
 def named(name: str) -> str:
-    """A factor as figures and tables call it: the field without its place, and what it is multiplied by as such."""
+    """A factor's name in figures and tables: the field without its path, and multipliers marked as such."""
     return name.rpartition(".")[2].replace("_", " ")
 
 
@@ -103,7 +103,7 @@ def curve(settings: Sequence[Setting], method: str) -> "Figure":
 
 
 def _matrix(axes: "Axes", levels: dict[str, list[Any]], design: Array) -> None:
-    """Which level every factor has in each setting."""
+    """The level of every factor in each setting."""
     axes.imshow(design.T > 0, cmap="Greys", vmin=-0.15, vmax=1.3, aspect="auto", interpolation="none")
     axes.set_xticks(np.arange(-0.5, len(design)), minor=True)
     axes.set_yticks(np.arange(-0.5, len(levels)), minor=True)
@@ -143,7 +143,7 @@ def over_headroom(settings: Sequence[Setting], methods: Sequence[str]) -> "Figur
 
 
 def slope_named(slope: Interval) -> str:
-    """A slope with its interval, where it has one."""
+    """A slope with its interval, if it has one."""
     if np.isnan(slope.estimate):
         return "unknown"
     return f"{slope:.2f}" if np.isfinite(slope.low) else f"{slope.estimate:.2f} [no interval]"
@@ -171,7 +171,7 @@ def shares(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure 
 
 
 def moves(settings: Sequence[Setting], clauses: Sequence[Headline]) -> "Figure | None":
-    """What moves the margin of every clause."""
+    """The effects of factors on the margin of every clause."""
     columns = 4
     figure, axes = subplots(-(-len(clauses) // columns), columns, (WIDTH, 4.6), sharey=True)
     levels, _ = coded(settings)

@@ -1,4 +1,4 @@
-"""The page of the map: what screening, map and confirmation say, as far as they have run. multiverse.md is the plan."""
+"""The page of the map: results of screening, map and confirmation, as far as they have run (plan: multiverse.md)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ FIGURES = "figures"
 TOO_FEW = "These settings are too few to tell the factors apart."
 STUDY = Path(__file__).parent / "studies" / "multiverse_screening.toml"
 ENOUGH = 16  # settings with headroom: no other round of screening
-OURS = "directional"  # the environment of multiverse_ours.toml: the confirmation that the aim is for
+OURS = "directional"  # the environment of multiverse_ours.toml: the confirmation to which the aim applies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class MultiverseOptions:
     """Write the page of the map over what the thesis leaves open, as far as its studies have run."""
 
     out: tyro.conf.Positional[Path]
-    """Folder of multiverse.html, multiverse.md and figures; made if it is not there."""
+    """Folder of multiverse.html, multiverse.md and figures; created if it does not exist."""
     screening: Path = Path("runs/multiverse_screening")
     """Folder of the screening."""
     map: Path | None = None
@@ -76,7 +76,7 @@ def _ran_from(studies: Sequence[Path]) -> str:
 
 
 def _screened(settings: Sequence[Setting]) -> list[Block]:
-    """Which settings have headroom, and what moves it."""
+    """Settings with headroom, and the factors that affect it."""
     room = sum(each.has_headroom for each in settings)
     learnt = sum(each.learnt for each in settings)
     verdict = "enough" if room >= ENOUGH else "too few: adjust the levels as the plan says"
@@ -111,7 +111,7 @@ def _moves(settings: Sequence[Setting], moved: dict[str, stats.Interval]) -> Blo
 
 
 def _moved_most(settings: Sequence[Setting], clause: multiverse.Headline) -> dict[str, str]:
-    """The factor that moves the margin of a clause most, as the cells of a row."""
+    """The factor with the largest effect on a clause's margin, as the cells of a row."""
     own = clause.counts_in(settings)
     moved = multiverse.moved_by(own, 100 * multiverse.margins(own, clause))
     if not moved:
@@ -124,7 +124,7 @@ def _moved_most(settings: Sequence[Setting], clause: multiverse.Headline) -> dic
 
 
 def _clauses(settings: Sequence[Setting]) -> list[Block]:
-    """In how many settings each clause holds, and what moves it."""
+    """In how many settings each clause holds, and the factors that affect it."""
     room = [each for each in settings if each.has_headroom]
     rows, exploratory = [], []
     for clause in multiverse.headlines(Roles.of(settings)):
@@ -144,7 +144,7 @@ def _clauses(settings: Sequence[Setting]) -> list[Block]:
 
 
 def _missing(settings: Sequence[Setting]) -> list[Block]:
-    """Which cells of the map there are not, and what that means."""
+    """The missing cells of the map, and what that means."""
     if not (lacking := multiverse.missing(settings)):
         return []
     return [
@@ -173,7 +173,7 @@ def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
 
 
 def _why(settings: Sequence[Setting], new: str) -> str:
-    """What made a new selector the best one."""
+    """Why a new selector was chosen as the best."""
     score = next(each.score.estimate for each in multiverse.standings(settings) if each.method == new)
     if np.isnan(score):
         return "the safest; scores can be compared nowhere"

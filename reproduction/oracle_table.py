@@ -1,11 +1,10 @@
-"""How much of what can be feared does a learnt fear network find? Prints the tables of docs/lab/selectors.md.
+"""How many of the dangerous goals does a learnt fear network find? Prints the tables of docs/lab/selectors.md.
 
     python -m reproduction.oracle_table runs/population    # after reproduction.particle_population runs/population
 
-For every policy that was trained in Directional under Uniform goals, a fear network is trained as the Adversary's
-is. Then all candidates of the decisions that 200 worlds come to under Uniform goals are tried in clones, so that every
-rule can be asked what it would have chosen, by the network and by the truth; and three Adversaries choose all goals of
-200 worlds.
+For every policy that was trained in Directional under Uniform goals, a fear network is trained as for the Adversary.
+Then all candidates of the decisions in 200 worlds under Uniform goals are tried in clones, so that every rule can be
+asked what it would have chosen, by the network and by the truth; and three Adversaries choose all goals of 200 worlds.
 """
 
 import argparse
@@ -34,7 +33,7 @@ RULES: dict[str, tuple[picks.Rule, float]] = {
 
 
 class Watcher(GoalSelector):
-    """Uniform goals; on the way it asks what every rule would have chosen, and what would have become of that."""
+    """Uniform goals; it also records what every rule would have chosen, and with what outcome."""
 
     def __init__(self, env: Env, clones: Clones, fear: Fear) -> None:
         self.num_candidates = 100
@@ -51,12 +50,12 @@ class Watcher(GoalSelector):
         return uniform_proposal(candidates, draws[:, 0])
 
     def rate(self, known: str, name: str) -> float:
-        """Share of what a rule would have chosen that would have crashed the policy."""
+        """Share of a rule's choices that would have crashed the policy."""
         return torch.cat(self.crashed[known, name]).float().mean().item()
 
 
 def measure(path: Path) -> tuple[list[list[float]], list[float]]:
-    """Crash rates on the same decisions, by rule and by what is known; and those of three Adversaries."""
+    """Crash rates on the same decisions, by rule and by source of knowledge; and those of three Adversaries."""
     folder = RunFolder.open(path)
     config = read_config(folder)
     policy = load(folder, config).ppo.actor

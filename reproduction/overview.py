@@ -27,15 +27,15 @@ CAPTION = (
 )
 LARGEST_RATIO = 8.0
 PAGE = 9.4  # [inch] of an A4 page that the rows may take
-LEAST_ROWS = 2.4  # heights of a dot that a claim's text needs
+LEAST_ROWS = 2.4  # dot heights that a claim's text needs
 LETTERS = 62  # in a line of a claim's text
 
 
 def standard(finding: Finding, value: float) -> float:
-    """An effect on the axis of the figure, where 0 is no difference, in [-1, 1].
+    """Position of an effect on the axis of the figure, where 0 is no difference, in [-1, 1].
 
     Args:
-        finding: It says what an effect of no difference is: 1/2 of a probability, 1 of a ratio, 0 of a difference.
+        finding: Its value for no difference is used: 1/2 for a probability, 1 for a ratio, 0 for a difference.
         value: The effect or an end of its interval.
     """
     match finding.no_difference:
@@ -52,7 +52,7 @@ def draw(outcomes: Sequence[Outcome], environments: Sequence[str]) -> "Figure | 
     """A row for each claim, a column for each environment, a dot for each clause.
 
     Args:
-        outcomes: Of the claims; those without data have no row.
+        outcomes: Outcomes of the claims; those without data have no row.
         environments: In order.
     """
     tested = [each for each in outcomes if each.results]

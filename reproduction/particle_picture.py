@@ -2,8 +2,8 @@
 
     python -m reproduction.particle_picture FOLDER docs/images
 
-Crashes per interaction under the worst attacker over the score beside Uniform's; means over policies and over the
-variants, Directional and Absolute, which count alike, with 95 % bootstrap intervals.
+Crashes per interaction under the worst attacker over the score relative to Uniform's; means over policies and over the
+variants, Directional and Absolute, which count equally, with 95 % bootstrap intervals.
 """
 
 import argparse
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 NAME = "particle"
 BLOCKS = (("seeds 10 to 29", TESTING), ("every method: seeds 0 to 9", CHOOSING))
 Point = tuple[Interval, Interval]
-"""Score beside Uniform's, and crashes per interaction [%]."""
+"""Score relative to Uniform's, and crashes per interaction [%]."""
 
 
 def points(evidence: Evidence, methods: Iterable[str]) -> dict[str, Point]:
-    """Where those of some methods lie that have policies in both variants."""
+    """Positions of the methods that have policies in both variants."""
     unit = {name: values.mean() for name, values in samples(evidence, SCORE, "uniform").items()}
     found = {}
     for method in methods:
@@ -48,7 +48,7 @@ def _mean(populations: list[Array]) -> Interval:
 
 
 def draw(data: Data) -> "Figure":
-    """A row for each method, above those with fresh seeds, below all on the seeds that chose among them."""
+    """Draw a row for each method: above, those with fresh seeds; below, all on the seeds that chose among them."""
     evidence = Evidence.of(data, renamed=False)
     names = [name for name in data.style.order if name in evidence.methods]
     blocks = [(title, points(evidence.only(seeds), names)) for title, seeds in BLOCKS]
@@ -66,7 +66,7 @@ def draw(data: Data) -> "Figure":
 
 
 def _rows(axes: "Axes", style: Style, found: dict[str, Interval]) -> None:
-    """Means with their intervals, beside Uniform's."""
+    """Means with their intervals, relative to Uniform's."""
     for row, (name, value) in enumerate(found.items()):
         axes.plot([value.low, value.high], [row, row], color=style.colours[name], linewidth=1.4)
         axes.plot(

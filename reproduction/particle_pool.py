@@ -1,10 +1,10 @@
 """Train the policies that the attacker ``pooled`` learns from, and write its network for each variant of Particle.
 
-    python -m reproduction.particle_pool runs/pool    # 30 trainings; writes reproduction/pool/VARIANT.pt
+    python -m reproduction.particle_pool runs/pool    # 30 training runs; writes reproduction/pool/VARIANT.pt
 
-Five methods, from one that avoids dangerous goals to one that seeks them, each with two seeds that no study has: so no
-policy that is judged has taught its attacker. What was killed continues when the command is given again, and a file
-that exists is not written again.
+Five methods, from one that avoids dangerous goals to one that seeks them, each with two seeds that no study uses, so
+that no evaluated policy has trained its own attacker. After an interruption the same command continues, and a file that
+exists is not written again.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from deimos.sim.envs import particle
 from reproduction.runs import finished
 
 POOL = Path(__file__).parent / "pool"
-VARIANTS = {  # with the budgets of the thesis
+VARIANTS = {  # with the thesis's budgets
     "directional": TrainConfig(env=particle.Config(variant="directional"), env_steps=2000, device="cpu", threads=1),
     "absolute": TrainConfig(env=particle.Config(variant="absolute"), env_steps=5000, device="cpu", threads=1),
     "relative": TrainConfig(env=particle.Config(variant="relative"), env_steps=2000, device="cpu", threads=1),

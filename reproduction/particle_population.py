@@ -4,7 +4,7 @@
     python -m reproduction.particle_population runs/population --audit    # adds the audit of the fear network
     python -m reproduction.particle_population runs/pilots --pilots       # the pilots instead: a seed of many settings
 
-Both are studies (``deimos study``): what was killed continues when the command is given again.
+Both are studies (``deimos study``): after an interruption the same command continues.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def audit(root: Path, seed: int) -> list[dict]:
 
 
 def interval(values: np.ndarray) -> Interval:
-    """Median with its percentile bootstrap interval; five seeds cover at most 94 %, and it is all but their range."""
+    """Median with its percentile bootstrap interval; for five seeds it covers at most 94 %, almost their range."""
     return bootstrap([values], lambda x: np.median(x, axis=-1))
 
 
@@ -84,7 +84,7 @@ def print_populations(rows: list[Row]) -> None:
 
 
 def print_audits(rows: list[dict]) -> None:
-    """The table of the audits of fear; nothing where there are none."""
+    """The table of the audits of fear; nothing if there are none."""
     if not rows:
         return
     print("\n| seed | parallel steps | contexts | crash rate | AUROC within contexts | 95 % interval |")
@@ -95,7 +95,7 @@ def print_audits(rows: list[dict]) -> None:
 
 
 def print_pilots(results: Results, environments: list[dict]) -> None:
-    """One row per pilot, by what its table in the study's file says beyond the variant, as the command line has it."""
+    """One row per pilot, named by its settings in the study's file other than the variant, as command-line options."""
     print("| variant | differs by | crashes / 1000 in training, by eighths | against Naive | score |")
     print("|---|---|---|---|---|")
     naive = {row["environment"]: row for row in results.rows if row["goals"] == "naive"}

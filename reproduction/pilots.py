@@ -1,9 +1,9 @@
-"""The pilots of docs/lab/pilots.md: a small, equal budget for every new selector, on settings that no study has.
+"""The pilots of docs/lab/pilots.md: a small, equal budget for every new selector, on settings that no study uses.
 
     python -m reproduction.pilots runs/pilots           # trains what is missing, then prints
-    python -m reproduction.pilots runs/pilots --show    # prints what there is
+    python -m reproduction.pilots runs/pilots --show    # prints the existing results
 
-What was killed continues when the command is given again.
+After an interruption the same command continues.
 """
 
 import argparse
@@ -27,9 +27,9 @@ SETTINGS = {
     "B": particle.Config(variant="relative", max_force=2.0, max_speed=7.0, goal_period=140, goal_range=1600.0),
 }
 INSTEAD = particle.Config(variant="absolute", max_force=2.0, max_speed=7.0, goal_period=140, goal_range=1600.0)
-HEADROOM = 0.01  # crashes per interaction of Uniform under the worst attacker
+HEADROOM = 0.01  # Uniform's crashes per interaction under the worst attacker
 SEEDS = (9101, 9102)
-WORLDS = 1000  # of a training
+WORLDS = 1000  # of a training run
 EVALUATION = EvalConfig(worlds=500, attackers=("argmax", "argmax-long", "scripted"))
 UNIFORM = "uniform"
 SELECTORS: dict[str, dict[str, SelectorConfig]] = {
@@ -47,20 +47,20 @@ KEEPS, COSTS_NOTHING = 0.95, 0.97  # shares of Uniform's score; see the rules in
 
 @dataclass(frozen=True, kw_only=True)
 class Pilot:
-    """A policy and what became of it."""
+    """A policy and its outcomes."""
 
     setting: str
     """Name of the setting."""
     selector: str
-    """Who chose the goals."""
+    """The selector that chose its goals."""
     configuration: str
     """The fields that the pilots vary; empty for Uniform."""
     seed: int
-    """Seed of the training."""
+    """Training seed."""
     worst: float
     """Crashes per interaction under the worst attacker."""
     attacker: str
-    """Which that was."""
+    """The attacker that was worst."""
     rates: dict[str, float]
     """Crashes per interaction under uniform goals and under every attacker."""
     score: float
@@ -68,7 +68,7 @@ class Pilot:
 
 
 def configurations() -> Iterator[tuple[str, str, SelectorConfig]]:
-    """Selector, configuration and what is built from it; Uniform first."""
+    """Selector, configuration and the object built from it; Uniform first."""
     yield UNIFORM, "", uniform.Config()
     for selector, own in SELECTORS.items():
         for configuration, config in own.items():
@@ -103,7 +103,7 @@ def read(root: Path) -> list[Pilot]:
 
 
 def pilot(setting: str, selector: str, configuration: str, seed: int, rows: list[dict]) -> Pilot:
-    """A policy by the rows of its evaluation."""
+    """A policy from the rows of its evaluation."""
     (found,) = worst([rows])
     return Pilot(
         setting=setting, selector=selector, configuration=configuration, seed=seed, worst=found["crash_rate"],
@@ -116,7 +116,7 @@ Table = dict[tuple[str, str], tuple[np.ndarray, float]]
 
 
 def means(pilots: list[Pilot], settings: list[str]) -> Table:
-    """Means over the seeds that every configuration has in every setting; empty where there is no such seed."""
+    """Means over the seeds that every configuration has in every setting; empty if there is no such seed."""
     every = [(selector, configuration) for selector, configuration, _ in configurations()]
     known = {(p.setting, p.selector, p.configuration, p.seed): p for p in pilots}
     seeds = [seed for seed in SEEDS if all((s, *name, seed) in known for s in settings for name in every)]
@@ -134,7 +134,7 @@ def means(pilots: list[Pilot], settings: list[str]) -> Table:
 
 
 def choose(table: Table, selector: str, default: str) -> str:
-    """The configuration of a selector by the rule for defaults."""
+    """The configuration of a selector that the rule for defaults chooses."""
     rates, score = table[selector, default]
     better = [
         (name, own) for (who, name), (own, share) in table.items()
@@ -144,7 +144,7 @@ def choose(table: Table, selector: str, default: str) -> str:
 
 
 def sizes(table: Table) -> tuple[str, str]:
-    """The small and the large penalty by the rules for them; both are configurations."""
+    """The small and the large penalty that their rules choose; both are configurations."""
     own = {name: found for (who, name), found in table.items() if who == "penalty"}
     ordered = list(own)  # ascending
 
@@ -159,7 +159,7 @@ def sizes(table: Table) -> tuple[str, str]:
 
 
 def show(pilots: list[Pilot], file: Path | None) -> None:
-    """Print a line per configuration and setting, both policies in it, and what the rules choose."""
+    """Print a line per configuration and setting, with both policies, and the choices of the rules."""
     settings = ["A", "B-absolute" if any(p.setting == "B-absolute" for p in pilots) else "B"]
     table = means(pilots, settings)
     names = list(dict.fromkeys((p.setting, p.selector, p.configuration) for p in pilots))
@@ -187,7 +187,7 @@ def show(pilots: list[Pilot], file: Path | None) -> None:
 
 
 def write(file: Path, pilots: list[Pilot]) -> None:
-    """Keep all pilots in a table."""
+    """Write all pilots to a table."""
     with file.open("w", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")
         goals = ("naive", *EVALUATION.attackers)

@@ -1,8 +1,8 @@
 """Train a policy that walks on rough ground, and print the tables of docs/lab/quad.md.
 
     python train.py --preset quad-walk --seed 1 --out runs/walk    # five minutes of one core
-    python -m reproduction.quad_rough runs/rough --init-from runs/walk --seed 1    # an hour; again to continue
-    python -m reproduction.quad_rough runs/rough --minutes 0 --figure rough.png    # tables and curves of what is there
+    python -m reproduction.quad_rough runs/rough --init-from runs/walk --seed 1    # an hour; repeat it to continue
+    python -m reproduction.quad_rough runs/rough --minutes 0 --figure rough.png    # tables and curves of that run
     python -m reproduction.quad_rough runs/pilot --init-from runs/walk --minutes 8 --change '{"num_envs": 1024}'
 
 The run is that of ``python train.py --preset quad-rough --init-from RUN``, on one thread and without the evaluation at
@@ -36,7 +36,7 @@ EVALUATION = EvalConfig(worlds=1000, steps=1000, attackers=())  # five robots on
 
 
 class Recorder:
-    """What progress.csv does not hold: rewards and levels of every world, the process's memory and time."""
+    """Data that progress.csv lacks: rewards and levels of every world, the process's memory and time."""
 
     def __init__(self, trainer: training.Trainer, path: Path) -> None:
         self.trainer, self.path = trainer, path
@@ -65,7 +65,7 @@ class Recorder:
 
     @property
     def seconds(self) -> float:
-        """Processor time so far [s]; on a machine that does nothing else the time on its clock."""
+        """Processor time so far [s]; on an otherwise idle machine it equals wall-clock time."""
         return self.before + time.process_time()
 
 
@@ -97,15 +97,16 @@ def table(path: Path) -> str:
 
 
 def evaluate(path: Path) -> dict:
-    """The row of uniform goals on the terrain, with a goal for as long as in training; it is kept in the folder."""
+    """The row of uniform goals on the terrain, each goal lasting as long as in training; it is stored in the folder."""
     folder = RunFolder.open(path)
     return evaluate_run(folder, training.read_config(folder).env, EVALUATION, torch.device("cpu"), again=False)[0]
 
 
 def tiles(row: dict) -> str:
-    """How an evaluation went on every level of every kind of ground, as Markdown.
+    """Results of an evaluation on every level of every kind of ground, as Markdown.
 
-    Shares of the goals that were survived, with the linear tracking in brackets; the means weigh tiles by their worlds.
+    Shares of the goals that robots survived, with linear tracking in parentheses; the means weight tiles by their
+    worlds.
     """
     found = {tuple(name.rsplit(" ", 1)): stratum for name, stratum in row["strata"].items()}
     kinds = [*sorted({kind for kind, _ in found}), "all"]

@@ -1,6 +1,6 @@
-"""From nothing to a robot that walks: train a preset over seeds, and print the tables of docs/lab/quad.md.
+"""From scratch to a walking robot: train a preset over seeds, and print the tables of docs/lab/quad.md.
 
-    python -m reproduction.quad_walk runs/walk --seeds 1 2 3 4 5 --engines native warp    # again to continue
+    python -m reproduction.quad_walk runs/walk --seeds 1 2 3 4 5 --engines native warp    # repeat to continue
     python -m reproduction.quad_walk runs/walk --engines native warp --worlds 512    # the policies in both simulators
     python -m reproduction.quad_walk runs/both --preset quad-arm-walk    # walks and reaches: docs/lab/quad_arm.md
     python -m reproduction.quad_walk runs/pilot --seeds 1 --minutes 3 --change '{"ppo": {"desired_kl": 0.02}}'
@@ -36,7 +36,7 @@ EVALUATION = EvalConfig(worlds=256, steps=1000, attackers=())
 
 
 class Meter:
-    """The processor time of a run, user and system, over all times that it was continued."""
+    """The processor time of a run, user and system, over all its continuations."""
 
     def __init__(self, trainer: training.Trainer, folder: RunFolder, start: float) -> None:
         self.folder, self.start = folder, start
@@ -48,19 +48,19 @@ class Meter:
         self.most = {name: getattr(weights, name) * period for name in ("linear_tracking", "yaw_tracking")}
 
     def __call__(self, row: dict[str, float], fps: float) -> None:
-        """Note an iteration, with its tracking as a share of what perfect tracking gives."""
+        """Record an iteration, with its tracking as a share of perfect tracking."""
         tracking = {name: row[f"reward/{name}"] / most for name, most in self.most.items()}
         kept = {name: row[name] for name in ("iteration", "transitions")}
         self.folder.append_csv(METER, kept | {"seconds": self.seconds} | tracking)
 
     @property
     def seconds(self) -> float:
-        """So far [s], with what it took to build the worlds."""
+        """Time so far [s], including building the worlds."""
         return self.before + time.process_time() - self.start
 
 
 def train(config: TrainConfig, path: Path, minutes: float) -> float:
-    """Train, or continue, until the transitions or ``minutes`` are used up; gives the processor time [s]."""
+    """Train, or continue, until the transitions or ``minutes`` are used up; returns the processor time [s]."""
     start, known = time.process_time(), (path / "config.json").exists()
     trainer, folder = training.resume(path) if known else training.start(config, path, None)
     meter = Meter(trainer, folder, start)
@@ -69,7 +69,7 @@ def train(config: TrainConfig, path: Path, minutes: float) -> float:
 
 
 def evaluate(path: Path, engine: str, worlds: int) -> dict:
-    """The row of uniform goals at T2 on an engine; it is kept in the run's folder."""
+    """The row of uniform goals at T2 on an engine; it is stored in the run's folder."""
     folder = RunFolder.open(path)
     env = cast(LocomotionConfig, training.read_config(folder).env.with_goal_period(GOAL_PERIOD))
     env = replace(env, engine=cast(Any, engine))

@@ -38,8 +38,9 @@ def write(folder: Path, out: Path, speeds: Path | None = None) -> Path:
 
     Args:
         folder: A study's folder, or one of exported tables; ``shifted_goals.csv`` in it is drawn too.
-        out: Where to write; made if it is not there.
-        speeds: File of ``python -m benchmarks table41 --json``, which the claim on speed rests on; ``None`` for none.
+        out: Where to write; created if it does not exist.
+        speeds: File of ``python -m benchmarks table41 --json``, on which the claim on speed is judged; ``None`` for
+            none.
 
     Raises:
         RunError: If there are no results, or a file cannot be read.
@@ -127,7 +128,7 @@ def _finite(number: float, form: str) -> str:
 
 
 def _limits(data: Data) -> list[str]:
-    """Those of every study, and of the tests of claims."""
+    """The notes of every study, and on the tests of claims."""
     pairs = [PAIRED] if any(map(data.paired, data.environments)) else []
     return [
         *report.limits(data),

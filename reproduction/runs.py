@@ -1,4 +1,4 @@
-"""Runs that the commands here train and evaluate; one that was killed goes on when its command is given again."""
+"""Runs that the commands here train and evaluate; after an interruption the same command continues."""
 
 import shutil
 from pathlib import Path
@@ -13,12 +13,12 @@ from deimos.sim.shared import one_stream
 
 
 def finished(config: TrainConfig, path: Path, init_from: Path | None = None) -> tuple[RunFolder, list[dict]]:
-    """Train and evaluate a run on the CPU, from wherever it stands.
+    """Train and evaluate a run on the CPU, from its current state.
 
     Args:
-        config: The run; of one that has begun the stored configuration counts.
+        config: The run; if it has already started, the stored configuration counts.
         path: Its folder.
-        init_from: Folder of a run whose networks it begins with.
+        init_from: Folder of a run whose networks it starts from.
 
     Returns:
         The folder, and the rows of its evaluation: none where ``config.evaluation`` is false.

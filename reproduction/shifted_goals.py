@@ -1,12 +1,12 @@
-"""What does a shift of the goals alone do to the score? Uniform policies under goals of a rising percentile of fear.
+"""How does only shifting the goals affect the score? Uniform policies under goals of a rising percentile of fear.
 
     python -m reproduction.shifted_goals runs/population    # a finished study with Uniform policies; resumes
 
-The policies of a Director were trained on dangerous goals and are judged on uniform ones; here policies that were
-trained on uniform goals are judged on dangerous ones. Nothing learns: a fear network that was trained on the finished
-policy, or the truth from clones of the worlds, ranks the candidates, and the Director's rules choose. The percentile
-that a rule has delivered is measured. The rows, ``shifted_goals.csv``, lie beside those of the study, and its report
-draws them.
+The policies of a Director were trained on dangerous goals and are evaluated on uniform ones; here policies that were
+trained on uniform goals are evaluated on dangerous ones. Nothing learns: a fear network that was trained on the
+finished policy, or the truth from clones of the worlds, ranks the candidates, and the Director's rules choose. The
+percentile that a rule has delivered is measured. The rows, ``shifted_goals.csv``, are stored with those of the study,
+and its report draws them.
 """
 
 import argparse
@@ -41,18 +41,18 @@ RULES: dict[str, tuple[picks.Rule, float]] = {
 LONGER = (
     4  # times the steps of the thesis's Adversary, half of them under its own goals: for policies that seldom crash
 )
-EXACT_CANDIDATES = 25  # N where every candidate is tried in a clone
+EXACT_CANDIDATES = 25  # N when every candidate is tried in a clone
 
 Danger = Callable[[Env, Tensor, Tensor, Tensor, Tensor], Tensor]
-"""Of worlds, rows, states, goals and candidates: how dangerous each candidate is, shape (B, N)."""
+"""From worlds, rows, states, goals and candidates: how dangerous each candidate is, shape (B, N)."""
 
 
 class Ranked(GoalSelector):
-    """A Director's rule over a danger that is given, and the percentile of it that it has delivered.
+    """A Director's rule over a given danger, and the percentile of it that the rule has delivered.
 
     Args:
         env: The worlds whose goals it chooses.
-        danger: What ranks the candidates.
+        danger: The ranking of candidates.
         rule: How it picks; see ``picks.by_rule``.
         percentile: p, in [0, 100]; for the rule ``percentile`` only.
         candidates: N: uniform candidates per decision.
@@ -119,7 +119,7 @@ def evaluate(cell: Cell, run: Path, device: torch.device) -> list[Row]:
 
 
 def read(folder: Path) -> list[Row]:
-    """The rows of a study's folder; none if they were not made."""
+    """The rows of a study's folder; none if they do not exist."""
     return read_table(folder / FILE, COLUMNS)
 
 

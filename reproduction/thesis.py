@@ -1,4 +1,4 @@
-"""The thesis's names and numbers, for whoever compares with it."""
+"""The thesis's names and numbers, for comparison."""
 
 DIRECTORS = ("p10", "p25", "p50", "p75", "p90")
 DIRECTOR_METHODS = ("coop", *DIRECTORS, "antagonist")
@@ -21,4 +21,4 @@ RATIOS_4_1 = {
     place: {name: fps["p25" if name in DIRECTORS else name] / fps["uniform"] for name in (*fps, *DIRECTORS)}
     for place, fps in TABLE_4_1.items()
 }
-"""Speed beside Uniform's; p25's is that of every p."""
+"""Speed relative to Uniform's; p25's is that of every p."""

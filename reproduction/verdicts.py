@@ -1,14 +1,14 @@
 """How often verdicts are wrong, and how often right: every kind of test on simulated studies whose truth is known.
 
-    python -m reproduction.verdicts FILE.json    # measures what the file does not hold yet, then prints its tables
+    python -m reproduction.verdicts FILE.json    # measures what the file lacks, then prints its tables
 
 The first table shows the worst of many kinds of studies, and the largest of many shares is an overestimate. So the
-second one shows every share of wrong verdicts above 5 % once more, measured in other and more studies.
+second one shows every share of wrong verdicts above 5 % again, measured in different and more studies.
 
 Policies come from four populations: ``normal``; ``lognormal``, whose logarithm has a standard deviation of 1;
-``bimodal``, of which 45 % do not crash and the others in some 10 % of their interactions; and ``rows``, the ten Uniform
-policies of Relative under attack of version 0.1.0, with a little noise. Where a clause is neither clearly true nor
-false it is put on the border between both, where both kinds of wrong verdicts are most frequent.
+``bimodal``, of which 45 % do not crash and the others crash in some 10 % of their interactions; and ``rows``, the ten
+Uniform policies of Relative under attack of version 0.1.0, with a little noise. If a clause is neither clearly true nor
+false, it is put on the border between the two, where both kinds of wrong verdicts are most frequent.
 """
 
 import argparse
@@ -37,10 +37,10 @@ ROWS = Path(__file__).parent.parent / "docs/results/particle_0.1.0"
 SIZES = (10, 30)
 PERMUTATIONS = 199  # 5 of 200 are exactly 2.5 %
 POPULATIONS = ("normal", "lognormal", "bimodal", "rows")
-LARGE = 3.0  # odds of X > Y where power is measured: P = 0.75
-AGAIN = ", again"  # marks, in the file, what was measured once more
-SPREAD = 3.0  # ratio of spreads where power is measured
-OTHER_SHAPES = (("bimodal", "normal"), ("rows", "lognormal"))  # populations that differ, but not in what is tested
+LARGE = 3.0  # odds of X > Y when power is measured: P = 0.75
+AGAIN = ", again"  # marks, in the file, what was measured again
+SPREAD = 3.0  # ratio of spreads when power is measured
+OTHER_SHAPES = (("bimodal", "normal"), ("rows", "lognormal"))  # populations that differ, but not in the tested aspect
 
 
 @cache
@@ -65,21 +65,21 @@ def population(name: str) -> Array:
 
 @dataclass(frozen=True)
 class Policies:
-    """Those of one method."""
+    """The policies of one method."""
 
     population: str
     """One of ``POPULATIONS``."""
     odds: float = 1.0
-    """Odds that one of them exceeds one of the population: they are its powers (Lehmann's alternative)."""
+    """Odds that one of them exceeds one of the population, whose powers they are (Lehmann's alternative)."""
     shift: float = 0.0
-    """What is added to each, after that."""
+    """Added to each, after that."""
     factor: float = 1.0
-    """What each is multiplied with, before the shift."""
+    """Each is multiplied by it, before the shift."""
     rates: bool = False
     """Whether they are crashes per interaction, not their logarithms; ``normal`` ones are scores."""
 
     def drawn(self, rng: np.random.Generator, shape: tuple[int, int]) -> Array:
-        """Some of them."""
+        """Draw some of them."""
         own = population(self.population)
         if self.rates and self.population != "normal":
             own = np.exp(own)
@@ -95,22 +95,22 @@ class Scene:
     """Simulated studies of one kind."""
 
     name: str
-    """What is true in them."""
+    """The truth in them."""
     holds: bool | None
-    """Whether the clause does; ``None`` on the border, where both verdicts are wrong."""
+    """Whether the clause holds; ``None`` on the border, where both verdicts are wrong."""
     cast: Cast
-    """Whom the test compares."""
+    """The methods that the test compares."""
 
 
 @cache
 def apart(first: str, second: str) -> float:
-    """What separates the values of one population from those of another, as often as not."""
+    """The difference that separates values of one population from those of another half of the time."""
     a, b = (np.random.default_rng(i).choice(population(name), 20_000) for i, name in enumerate((first, second)))
     return float(np.median(a - b))
 
 
 def scenes(test: Test) -> list[Scene]:
-    """The simulated studies that a test meets."""
+    """The simulated studies for a test."""
     match test:
         case Ordered(spread=False):
             return _ordered(_numbers(test))
@@ -134,7 +134,7 @@ def _numbers(test: Ordered) -> list[tuple[int, int]]:
 
 
 def _places(pairs: Sequence[tuple[int, int]]) -> list[float]:
-    """Of every method: 1 if it is claimed to have more than the others, 0 if less; in an order, by its place."""
+    """For every method: 1 if it is claimed to have more than the others, 0 if less; in an order, by its position."""
     count = 1 + max(max(pair) for pair in pairs)
     wins, losses = ([sum(pair[side] == i for pair in pairs) for i in range(count)] for side in (0, 1))
     return [win / (win + loss) for win, loss in zip(wins, losses, strict=True)]
@@ -147,7 +147,7 @@ def _ordered(pairs: Sequence[tuple[int, int]]) -> list[Scene]:
     mixed = [LARGE ** (1 - 2 * (half.index(i) % 2)) if i in half else 1.0 for i in range(len(places))]
     for one in POPULATIONS if len(pairs) == 1 else ("normal", "rows"):
         found.append(Scene(f"all alike, {one}", None, [Policies(one)] * len(places)))
-        if one == "normal" and half and set(places) == {0.0, 1.0}:  # of the larger side one half is better, one worse
+        if one == "normal" and half and set(places) == {0.0, 1.0}:  # half of the larger side is better, half is worse
             found.append(Scene(f"better and worse ones, {one}", None, [Policies(one, odds) for odds in mixed]))
         for holds, odds in ((True, LARGE), (False, 1 / LARGE)):
             found.append(Scene(f"P = 0.75, {one}", holds, [Policies(one, odds**x) for x in places]))
@@ -170,7 +170,7 @@ def _spread(pairs: Sequence[tuple[int, int]]) -> list[Scene]:
 
 def _alike(test: Alike) -> list[Scene]:
     found = []
-    scale = 1.0 if test.measure.ratio else 0.05  # of scores, whose standard deviation is some 0.05
+    scale = 1.0 if test.measure.ratio else 0.05  # for scores, whose standard deviation is some 0.05
     for one in POPULATIONS:
         for name, holds, margins in (("at the margin", None, 1), ("equal", True, 0), ("5 margins apart", False, 5)):
             cast = [Policies(one, shift=margins * test.settled, factor=scale), Policies(one, factor=scale)]
@@ -205,7 +205,7 @@ def _matters(methods: int) -> list[Scene]:
 
 
 def judged(test: Test, samples: Sequence[Array]) -> tuple[Array, Array]:
-    """p-values for and against of simulated studies, two-sided where the test is, each of shape (studies,)."""
+    """p-values for and against in simulated studies, two-sided if the test is, each of shape (studies,)."""
     match test:
         case Ordered():
             found = test.p_values(samples, _numbers(test), PERMUTATIONS)
@@ -226,7 +226,7 @@ def judged(test: Test, samples: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def kinds() -> dict[str, tuple[Test, list[str]]]:
-    """The kinds of tests that clauses have, by their names: one of each, and the claims that it is in.
+    """The kinds of tests that clauses have, by name: one of each, and the claims that use it.
 
     A test of one group against a larger one is that of the larger against the one, the other way round.
     """
@@ -267,9 +267,9 @@ def measure(test: Test, scene: Scene, n: int, studies: int, seed: Sequence[int])
 
 
 def run(path: Path, studies: int, again: int) -> dict[str, list]:
-    """Measure every scene that a file does not hold; of each the shares of both verdicts.
+    """Measure the shares of both verdicts in every scene that a file lacks.
 
-    Where more than ``ALPHA`` of the studies came to a wrong verdict the scene is measured again, in other studies.
+    If more than ``ALPHA`` of the studies reach a wrong verdict, the scene is measured again, in other studies.
     """
     known: dict[str, list] = json.loads(path.read_text()) if path.exists() else {}
 
@@ -289,7 +289,7 @@ def run(path: Path, studies: int, again: int) -> dict[str, list]:
 
 
 def _wrong(scene: Scene, shares: Sequence[float]) -> tuple[float, float]:
-    """Of the shares in which a clause holds and does not, those that are wrong; 0 of a verdict that is right."""
+    """Shares of wrong verdicts, of those that a clause holds and does not hold; 0 for a verdict that is right."""
     holds, does_not = shares
     return 0.0 if scene.holds else holds, 0.0 if scene.holds is False else does_not
 
@@ -323,7 +323,7 @@ def table(known: dict[str, list], studies: int) -> list[str]:
 
 
 def table_again(known: dict[str, list], studies: int, again: int) -> list[str]:
-    """Lines of Markdown: a row for every share of wrong verdicts above ``ALPHA``, and what other studies gave."""
+    """Lines of Markdown: a row for every share of wrong verdicts above ``ALPHA``, and the result of other studies."""
     lines = ["| test | n | case | wrong verdict | first | again | 95 % |", "|---|---|---|---|---|---|---|"]
     for (name, (test, _)), n in product(kinds().items(), SIZES):
         for scene in scenes(test):

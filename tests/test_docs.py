@@ -28,7 +28,7 @@ PAGES = [
 SUFFIXES = {".py", ".md", ".toml", ".json", ".csv", ".png", ".svg", ".webp"}
 FURTHER_PAGES = {
     "benchmark.md", "cluster.md", "deploy.md", "director.md", "gallery.md", "gpu.md", "integrations.md",
-    "legged.md", "particle.md", "view.md",
+    "legged.md", "multiverse.md", "particle.md", "view.md",
 }  # fmt: skip
 """Those that the budget of all pages leaves out."""
 

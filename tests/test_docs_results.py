@@ -20,6 +20,7 @@ README, PAGE, LEGGED, LEGGED_LAB = (
     " ".join((HOME / name).read_text(encoding="utf-8").split())
     for name in ("README.md", "docs/particle.md", "docs/legged.md", "docs/lab/robots.md")
 )
+STRONGER = ("search", "q-fear")
 LAB = (HOME / "docs" / "lab" / "results.md").read_text(encoding="utf-8").splitlines()
 
 
@@ -65,7 +66,8 @@ def test_the_readme_quotes_the_rows(evidence):
         f"{len(policies)} policies, none left out",
         f"crash on {rate(fresh, under('naive'), 'uniform'):.1f} % of such goals, but on {uniform:.0f} % of the worst",
         f"crash on {attacked.estimate:.1f} % of the worst attacker's goals, at {score.estimate:.2f} of Uniform's score",
-        f"does not help: {penalty:.0f} %",
+        f"does not help ({penalty:.0f} %), nor does VDS, the thesis's strongest rival "
+        f"({rate(fresh, ATTACKED, 'vds'):.0f} %)",
         f"reaches {novel.estimate:.1f} % at {novel_score.estimate:.2f} of the score",
     ], README)  # fmt: skip
 
@@ -87,6 +89,17 @@ def test_the_page_quotes_the_hypotheses(evidence):
         f"| {answers[2].corrected:.1g} | {100 * answers[2].detectable:.2f} |",
         f"at {float(answers[1].note.split()[3]):.2f} of the score",
     ], PAGE)  # fmt: skip
+
+
+def test_stronger_attackers_are_told(evidence):
+    """What ``search`` and ``q-fear`` do to p75 and Uniform on the seeds that met them, in README and page."""
+    search, fear = ([f"{rate(evidence, under(name), own):.0f}" for own in ("p75", "uniform")] for name in STRONGER)
+    last = " and ".join(fear)
+    assert not missing([
+        f"crashes p75's policies on {search[0]} % of its goals and Uniform's on {search[1]} %",
+        f"`q-fear`, which looks beyond one goal, on {last} %",
+    ], README)  # fmt: skip
+    assert f"{search[0]} % of its goals crash p75, {search[1]} % Uniform (`q-fear`: {last} %)" in PAGE
 
 
 def test_the_page_has_the_table_of_the_freeze(evidence):

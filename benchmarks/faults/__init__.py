@@ -1,4 +1,4 @@
-"""Attacks on Deimos, at length: hostile options and files, numbers that are none, kills, memory.
+"""Long attacks on Deimos: hostile options and files, huge and non-finite numbers, kills, memory.
 
-``python -m benchmarks.faults KIND --json FILE``. The tests hold the same properties on a few examples of each kind.
+``python -m benchmarks.faults KIND --json FILE``. The tests check the same properties on a few examples of each kind.
 """

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.faults KIND``: attack, and count what becomes of it; resumable."""
+"""``python -m benchmarks.faults KIND``: attack, and count the outcomes; resumable."""
 
 import contextlib
 import json
@@ -28,16 +28,16 @@ KINDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class FaultOptions:
-    """Attack Deimos. The same command continues what was cut off; exit code 1 says that there were faults."""
+    """Attack Deimos. The same command continues an interrupted round; exit code 1 means that there were faults."""
 
     kind: tyro.conf.Positional[Literal["options", "tomls", "files", "injections", "kills", "memory"]]
     """What to attack with."""
     count: int | None = None
-    """Attacks in all, at least 1. By default as many as were asked for."""
+    """Attacks in all, at least 1. By default the module's ``COUNT``."""
     seed: int = 0
-    """Seed of all attacks, at least 0; the i-th is drawn from (seed, i) alone."""
+    """Seed of all attacks, at least 0; the i-th is drawn only from (seed, i)."""
     json: Path = Path("docs/results/bench_faults.json")
-    """File of the results, to which these are added."""
+    """File of results, to which these are added."""
 
     def __post_init__(self) -> None:
         check_at_least("count", 1 if self.count is None else self.count, 1)
@@ -47,10 +47,10 @@ class FaultOptions:
 
 
 def run(options: FaultOptions) -> dict[str, Any]:
-    """Do the attacks that are left, and print the faults and how many answers of each kind there were.
+    """Run the remaining attacks, and print the faults and the number of answers of each kind.
 
     Returns:
-        What the file holds of this kind: how many attacks were ``done``, how many ``outcomes`` of each kind there were,
+        The file's entry for this kind: how many attacks were ``done``, how many ``outcomes`` of each kind there were,
         and, ``kept``, the attacks that were faults or were measured.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Damaged files of every kind: each is refused in one line that names it, or says what it said before."""
+"""Damaged files of every kind: each is refused in one line that names it, or read with the same contents as before."""
 
 import functools
 import json
@@ -92,14 +92,14 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "policies.zip": ("study", _unpacked),
     "fear.pt": ("study", lambda folder: repr(load_tensors(next(folder.rglob("fear.pt")), "pool", 9, oldest=0))),
 }
-"""Every kind of file, by its name: the folder that it lies in, and what reads it."""
+"""Every kind of file, by its name: its folder, and the function that reads it."""
 EACH = 300
 COUNT = EACH * len(READERS)
 
 
 @functools.cache
 def whole() -> Path:
-    """A folder with a whole file of every kind."""
+    """A folder with an intact file of every kind."""
     place = Path(tempfile.mkdtemp(prefix="deimos-faults-"))
     known_run(place / "run")
     run = RunFolder(place / "run")
@@ -148,7 +148,7 @@ def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
         fault = "not one line"
     elif ended.code == 2 and not any(part in said for part in (path.name, path.parent.name)):
         fault = "the line does not name the file"
-    elif ended.code == 3 and name in SEALED and (path.exists() or name != "policies.zip"):  # a study may have none
+    elif ended.code == 3 and name in SEALED and (path.exists() or name != "policies.zip"):  # a study may lack one
         fault = "other contents were read"
     elif ended.code == 2 and held is not None and path.read_bytes() != held:
         fault = "the damaged file was changed"
@@ -165,7 +165,7 @@ def _said(read: Callable[[Path], Any], folder: Path) -> str:
 
 
 def _answer(read: Callable[[Path], Any], folder: Path, before: str) -> int:
-    """0 if a file says what it said before, 3 if it says something else, 2 if it is refused."""
+    """0 if a file is read with the same contents as before, 3 if with others, 2 if it is refused."""
     try:
         return 0 if _said(read, folder) == before else 3
     except (RunError, ValueError) as error:
@@ -174,7 +174,7 @@ def _answer(read: Callable[[Path], Any], folder: Path, before: str) -> int:
 
 
 def damage(path: Path, rng: np.random.Generator) -> str:
-    """Damage a file in some way, and say how."""
+    """Damage a file in some way; returns a description."""
     data, ways = path.read_bytes(), [_flip, _cut, _fill, _insert, _special, _double]
     ways += [_retype, _retype] if path.suffix == ".json" else []
     return ways[rng.integers(len(ways))](path, data, rng)
@@ -213,7 +213,7 @@ def _double(path: Path, data: bytes, rng: np.random.Generator) -> str:
 
 
 def _special(path: Path, data: bytes, rng: np.random.Generator) -> str:
-    """No regular file, or one that holds something else altogether."""
+    """Replace it by something that is not a regular file, or by entirely different contents."""
     path.unlink()
     way = str(rng.choice(["missing", "empty", "a folder", "a FIFO", "/dev/zero", "a dangling link", "nested", "text"]))
     if way == "a folder":
@@ -228,7 +228,7 @@ def _special(path: Path, data: bytes, rng: np.random.Generator) -> str:
 
 
 def _retype(path: Path, data: bytes, rng: np.random.Generator) -> str:
-    """One value of a JSON file is of another type, or missing."""
+    """Change the type of one value of a JSON file, or remove it."""
     whole = json.loads(data)
     value, key, parent = whole, None, None
     while isinstance(value, dict | list) and value and (parent is None or rng.random() < 0.8):

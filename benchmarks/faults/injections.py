@@ -1,4 +1,4 @@
-"""Numbers that are none, put into a running trainer: caught with the last good checkpoint whole, or harmless."""
+"""Huge and non-finite numbers, put into a running trainer: caught with the last good checkpoint intact, or harmless."""
 
 import os
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ def config(env: str, method: str) -> TrainConfig:
 
 
 def tensors(name: str, value: Any, seen: set[int]) -> Iterator[tuple[str, Tensor]]:
-    """All tensors of floating point that something holds, by name."""
+    """All floating-point tensors that an object holds, by name."""
     if id(value) in seen:
         return
     seen.add(id(value))
@@ -57,7 +57,7 @@ def tensors(name: str, value: Any, seen: set[int]) -> Iterator[tuple[str, Tensor
 
 
 def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
-    """Put a number into a tensor between two iterations, and go on."""
+    """Put a number into a tensor between two iterations, and continue."""
     env, method = ("particle", "quad")[number % 2], METHODS[int(rng.integers(len(METHODS)))]
     draws = rng.integers(2**31, size=3)
     bad, after = NUMBERS[int(rng.integers(len(NUMBERS)))], int(rng.integers(1, 5))
@@ -81,7 +81,7 @@ def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
 
 
 def _go_on(trainer: Trainer, folder: RunFolder, after: int, inject: Any) -> int:
-    """Train on with the injection after an iteration."""
+    """Continue training, with the injection after an iteration."""
     iterate = trainer.iterate
 
     def spoiled() -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Kills at random moments, some within a save: whatever was killed is resumed bit for bit."""
+"""Kills at random moments, some within a save: a killed run resumes bit for bit."""
 
 import os
 import shutil
@@ -23,8 +23,8 @@ from deimos.sim.envs import quad
 SECONDS = 240.0
 PER_METHOD, PER_ENGINE, ENGINES = 6, 10, ("native", "warp")
 SELECTORS = sorted({selector: name for name, (selector, _) in reversed(METHODS.items())}.values())
-"""A method of every selector."""
-SAVES = 4  # the kills of which the first is within a save
+"""One method for every selector."""
+SAVES = 4  # of so many runs one has its first kill within a save
 RUNS = [*((method, None) for method in SELECTORS for _ in range(PER_METHOD)),
         *(("p75", engine) for engine in ENGINES for _ in range(PER_ENGINE))]  # fmt: skip
 COUNT = len(RUNS)
@@ -37,13 +37,13 @@ def _config(method: str, engine: str | None) -> TrainConfig:
 
 
 def train(path: Path, method: str, engine: str | None, kill_at: int = 0) -> None:
-    """Begin or resume a run, with a checkpoint after every iteration.
+    """Start or resume a run, with a checkpoint after every iteration.
 
     Args:
         path: Its folder.
-        method: Who chooses its goals.
-        engine: What simulates Quad; ``None`` for particles.
-        kill_at: Write to the disk, of all its saves, at which the process kills itself; 0 for none.
+        method: The method that chooses its goals.
+        engine: The engine that simulates Quad; ``None`` for particles.
+        kill_at: The disk write, counted over all its saves, at which the process kills itself; 0 for none.
     """
     training.CHECKPOINT_SECONDS = 0.0
     flush, left = os.fsync, [kill_at]
@@ -51,21 +51,21 @@ def train(path: Path, method: str, engine: str | None, kill_at: int = 0) -> None
     def fsync(descriptor: int) -> None:
         left[0] -= 1
         if left[0] == 0:
-            os.ftruncate(descriptor, os.fstat(descriptor).st_size // 2)  # what a disk has of it by then
+            os.ftruncate(descriptor, os.fstat(descriptor).st_size // 2)  # the part that has reached the disk by then
             os.kill(os.getpid(), signal.SIGKILL)
         flush(descriptor)
 
     files.os.fsync = fsync  # type: ignore[attr-defined]
     begun = (path / "checkpoint.pt").exists()
     if not begun:
-        shutil.rmtree(path, ignore_errors=True)  # killed before its first checkpoint: it begins again
+        shutil.rmtree(path, ignore_errors=True)  # killed before its first checkpoint: it starts again
     trainer, folder = training.resume(path) if begun else training.start(_config(method, engine), path)
     training.train(trainer, folder)
 
 
 @cache
 def uninterrupted(method: str, engine: str | None) -> tuple[tuple[bytes, ...], float]:
-    """What a run leaves that nobody kills, and how long it takes [s]."""
+    """The files of an uninterrupted run, and how long it takes [s]."""
     with tempfile.TemporaryDirectory() as place:
         begin = time.monotonic()
         ended = attempt(lambda: train(Path(place) / "run", method, engine), Path(place), SECONDS)
@@ -78,7 +78,7 @@ def _left(run: Path) -> tuple[bytes, ...]:
 
 
 def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
-    """Kill a run one to three times, and compare what it leaves in the end with what it leaves uninterrupted."""
+    """Kill a run one to three times, and compare its final files with those of an uninterrupted run."""
     method, engine = RUNS[number % COUNT]
     expected, seconds = uninterrupted(method, engine)
     kills = []

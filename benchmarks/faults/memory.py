@@ -30,7 +30,7 @@ def iterations(env: str, count: int) -> list[float]:
 
 
 def trainers(env: str, count: int) -> list[float]:
-    """Memory [MiB] after each of many trainers that are made, used and dropped."""
+    """Memory [MiB] after each of many trainers that are built, used and dropped."""
     found = []
     for _ in range(count):
         Trainer(config(env, "p75"), training.resolve_device("cpu")).iterate()
@@ -40,7 +40,7 @@ def trainers(env: str, count: int) -> list[float]:
 
 
 def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
-    """One measurement in a process of its own."""
+    """Run one measurement in a separate process."""
     kind, env = JOBS[number % COUNT]
 
     def work() -> None:

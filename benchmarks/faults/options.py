@@ -37,7 +37,7 @@ COMMANDS = {
     "terrain shape": "terrain shape stairs-up --out ground.npz",
     "terrain grid": "terrain grid --out ground.npz",
 }  # fmt: skip
-"""By the words that their help is asked with: commands that would do."""
+"""Valid commands, by the words with which their help is requested."""
 NUMBERS = [
     "0", "1", "2", "3", "-1", "0.5", "-0.5", "1.5", "-0.0", "2147483647", "2147483648", "4294967296", "1000000000",
     "1" + "0" * 30, "1e9", "1e-300", "1e308", "nan", "inf", "-inf",
@@ -49,7 +49,7 @@ TEXTS = [
 
 
 def known_run(path: Path) -> None:
-    """Train what the commands that need a run work on."""
+    """Train the run that commands work on."""
     config = TrainConfig(
         env=particle.Config(goal_period=8), method="p75", ppo=PPOConfig(hidden=(8,), num_steps=8, minibatches=2),
         eval=EvalConfig(worlds=8, steps=32, adversary_steps=32), evaluation=False, num_envs=16, env_steps=64,
@@ -83,7 +83,7 @@ def known() -> Path:
 
 
 def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
-    """Give a command one to three options that are out of the ordinary."""
+    """Give a command one to three unusual options."""
     words = list(COMMANDS)[number % len(COMMANDS)]
     if "known" in COMMANDS[words]:
         shutil.copytree(known(), place / "known")
@@ -100,7 +100,7 @@ def attack(number: int, rng: np.random.Generator, place: Path) -> Verdict:
 
 
 def _nonsense(place: Path) -> str:
-    """What a command has written that is none of its numbers."""
+    """What is wrong with the files that a command has written."""
     for path in place.glob("run/config.json"):
         if text := re.search(r"NaN|Infinity", path.read_text()):
             return f"{path.name} holds {text[0]}"

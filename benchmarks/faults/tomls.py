@@ -1,4 +1,4 @@
-"""Study files with a mistake: each is refused in one line that names the key, or is another study that is none."""
+"""Study files with a mistake: each is refused in one line that names the key, or is a different valid study."""
 
 import copy
 import tomllib
@@ -14,7 +14,7 @@ from deimos.study import plan
 
 COUNT = 300
 SECONDS = 60.0
-MOST_CELLS = 1000  # that such a small file may ask for
+MOST_CELLS = 1000  # that such a small file may request
 VALUES: list[Any] = [
     0, -1, 1, 10**6, 10**12, 2**31, 2**63 - 1, 0.5, -0.0, 1e308, float("nan"), float("inf"), True, False, "", "x",
     "0-9", "0-999999999", "../..", "/dev/zero", "\u202e", "[/red]", "<script>", "p75", "uniform", "particle", [], [[]],
@@ -54,7 +54,7 @@ def run(read: Any) -> int:
 
 
 def changed(rng: np.random.Generator) -> dict[str, Any]:
-    """The study with one to three keys that are out of the ordinary."""
+    """The study with one to three unusual keys."""
     study = copy.deepcopy(tomllib.loads(STUDY.read_text()))
     for _ in range(rng.integers(1, 4)):
         tables = [*_tables(study)]
@@ -75,7 +75,7 @@ def _tables(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def damaged(rng: np.random.Generator) -> str:
-    """The study's text with something cut out, put in, doubled or nested deeply."""
+    """The study's text with something removed, inserted, doubled or nested deeply."""
     text, (a, b) = STUDY.read_text(), sorted(rng.integers(0, len(STUDY.read_text()), 2))
     depth = int(rng.choice([3, 100, 10_000]))
     ways = [

@@ -1,4 +1,4 @@
-"""One attack in a process of its own, and what became of it."""
+"""One attack in a separate process, and its outcome."""
 
 import os
 import resource
@@ -13,29 +13,29 @@ from typing import Any
 
 import numpy as np
 
-GRACE_SECONDS = 60.0  # that a process has to end after it was asked to
+GRACE_SECONDS = 60.0  # that a process has to end after being asked to
 MEMORY = 6 * 2**30  # bytes that an attack may allocate
 POLL_SECONDS = 0.02
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of an attack."""
+    """The outcome of an attack."""
 
     outcome: str
     """The kind of answer: refused, accepted, the same, caught, ..."""
     what: str
     """The attack."""
     said: str = ""
-    """What was answered."""
+    """The answer."""
     fault: str = ""
-    """What was wrong with that; empty where it is what must be."""
+    """What was wrong with it; empty if it is as it must be."""
     figures: dict[str, Any] = field(default_factory=dict)
     """Numbers that were measured."""
 
 
 Attack = Callable[[int, np.random.Generator, Path], Verdict]
-"""Attacks once: the number of the attack, its draws, and an empty folder of its own."""
+"""Attacks once: takes the number of the attack, its random generator, and an empty folder."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,21 @@ class Ended:
     code: int
     """Its exit code; negative for the signal that ended it."""
     said: str
-    """What it wrote to stderr."""
+    """Its output on stderr."""
     asked: bool
-    """Whether it was asked to end since its time was over."""
+    """Whether it was asked to end because its time was up."""
     hung: bool
-    """Whether it did not do so and was killed."""
+    """Whether it did not end then and was killed."""
 
 
 def attempt(work: Callable[[], Any], place: Path, seconds: float, stop: int = signal.SIGTERM) -> Ended:
-    """Do some work in a copy of this process, which starts at once as everything is loaded.
+    """Do some work in a fork of this process, which starts at once since everything is loaded.
 
     Args:
-        work: Gives the exit code; ``None`` is 0. An error that it raises is a traceback and 1.
+        work: Returns the exit code; ``None`` is 0. An error that it raises is a traceback and 1.
         place: The folder that it works in.
         seconds: When it is asked to end [s].
-        stop: The signal that asks.
+        stop: The signal that asks it to end.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -82,7 +82,7 @@ def attempt(work: Callable[[], Any], place: Path, seconds: float, stop: int = si
 
 
 def _work(work: Callable[[], Any], place: Path) -> int:
-    """What the copy does."""
+    """What the fork does."""
     try:
         os.chdir(place)
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))  # other programs use this machine too
@@ -92,14 +92,14 @@ def _work(work: Callable[[], Any], place: Path) -> int:
         sys.stdout.flush()
         sys.stderr.flush()
         return 0 if code is None else int(code)
-    except BaseException:  # whatever it was, the parent's loop must not go on here
+    except BaseException:  # whatever happened, the parent's loop must not continue here
         traceback.print_exc()
         sys.stderr.flush()
         return 1
 
 
 def judged(what: str, ended: Ended) -> Verdict:
-    """What became of a command: it did what was asked, said in a line why not, or ended when it was asked to."""
+    """The outcome of a command: it did what was asked, said in one line why not, or ended when asked to."""
     lines = [line for line in ended.said.splitlines() if line.strip()]
     last = lines[-1] if lines else ""
     fault = ""

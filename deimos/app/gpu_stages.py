@@ -142,8 +142,8 @@ def waits(device: torch.device, sizes: Sizes) -> dict[str, Any]:
 
 def directed(num_envs: int, device: torch.device) -> Callable[[], None]:
     """A step of other people's loops: under a ``GoalDirector``'s clock, and under that of a command manager."""
-    options: dict[str, Any] = {"num_envs": num_envs, "state_dim": 9, "goal_dim": 3, "device": device, "learn_every": 100}
-    options["goal_box"] = ([-1.0] * 3, [1.0] * 3)
+    options: dict[str, Any] = {"num_envs": num_envs, "state_dim": 9, "goal_dim": 3, "device": device}
+    options |= {"goal_box": ([-1.0] * 3, [1.0] * 3), "learn_every": 100}
     own, theirs = GoalDirector("p75", 10, **options), GoalDirector("p75", max_horizon=10, **options)
     state, never = torch.zeros(num_envs, 9, device=device), torch.zeros(num_envs, dtype=torch.bool, device=device)
     rows = torch.arange(0, num_envs, 7, device=device)

@@ -1,4 +1,4 @@
-"""A shield at run time: an exported fear network decides over every goal. Usage: python shield.py FOLDER."""
+"""A shield at run time: an exported fear network accepts or refuses every goal. Usage: python shield.py FOLDER."""
 
 import json
 import sys
@@ -13,10 +13,10 @@ from deimos.goals.shield import Shield
 folder = Path(sys.argv[1])  # of `deimos export`, after `deimos shield`
 deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
 shield, network = Shield.from_dict(deploy["shield"]), onnxruntime.InferenceSession(folder / "fear.onnx")
-state = np.zeros((1, sum(entry["size"] for entry in deploy["fear"]["state"])), np.float32)  # what the robot measures
-active = np.zeros((1, len(deploy["goal"]["components"])), np.float32)  # what it pursues
+state = np.zeros((1, sum(entry["size"] for entry in deploy["fear"]["state"])), np.float32)  # the robot's measurements
+active = np.zeros((1, len(deploy["goal"]["components"])), np.float32)  # its current goal
 low, high = (np.array([entry[key] for entry in deploy["goal"]["components"]], np.float32) for key in ("low", "high"))
-wanted = high[None]  # what comes next
+wanted = high[None]  # the next goals
 
 
 def score(goals: torch.Tensor) -> torch.Tensor:

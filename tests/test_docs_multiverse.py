@@ -1,0 +1,134 @@
+"""The numbers of the map's page and lab are those of its rows, and its report is what the analysis writes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reproduction import multiverse
+from reproduction.multiverse import UNIFORM, Roles
+from reproduction.multiverse_page import MultiverseOptions, write
+
+DOCS = Path(__file__).parent.parent / "docs"
+RESULTS = DOCS / "results"
+PAGE, LAB, README = (
+    " ".join(path.read_text(encoding="utf-8").split())
+    for path in (DOCS / "multiverse.md", DOCS / "lab" / "multiverse.md", DOCS.parent / "README.md")
+)
+NAMES = {"uniform": "Uniform", "rnd": "RND"}
+
+
+@pytest.fixture(scope="module")
+def settings():
+    """The settings of the map with all policies."""
+    return multiverse.read(RESULTS / "multiverse_screening", RESULTS / "multiverse")
+
+
+@pytest.fixture(scope="module")
+def room(settings):
+    """Those with headroom."""
+    return [each for each in settings if each.has_headroom]
+
+
+def written(interval, digits, by=1.0):
+    """An interval as the pages have it."""
+    low, high = (f"{by * x:.{digits}f}" for x in (interval.low, interval.high))
+    return f"{by * interval.estimate:.{digits}f} [{low}, {high}]"
+
+
+def safer(settings, name):
+    """By how many points a method crashes less than Uniform under the worst attacker, setting by setting."""
+    return 100 * np.array([each.policies[UNIFORM].worst - each.policies[name].worst for each in settings])
+
+
+def test_the_page_has_the_headline_clauses(settings):
+    """Shares of settings with headroom, mean margins over all, and that one share alone excludes one half."""
+    decided, shares = [], {}
+    for clause in multiverse.headlines(Roles.of(settings)):
+        share, margin = multiverse.share_that_holds(settings, clause), multiverse.margins(settings, clause)
+        text = clause.text.replace("rnd ", "RND ").replace("uniform", "Uniform")
+        line = f"| {text} | {written(share, 0, 100)} | {written(multiverse.mean(100 * margin), 1)} |"
+        assert line in PAGE
+        shares[clause.name] = written(share, 0, 100).replace(" [", " % [")
+        decided += [clause.name] if share.low > 0.5 or share.high < 0.5 else []
+    assert decided == ["danger is hidden"]
+    assert f"holds clearly, in {shares['danger is hidden']} of those" in README
+    assert f"p75 is safer in {shares['p is safer']}" in README
+
+
+def test_one_choice_moves_one_headline(settings):
+    """Of the effects of all factors on all clauses, the one whose interval excludes zero."""
+    found = []
+    for clause in multiverse.headlines(Roles.of(settings)):
+        own = clause.counts_in(settings)
+        moved = multiverse.moved_by(own, 100 * multiverse.margins(own, clause))
+        assert len(moved) == 8
+        found += [(clause.name, *each) for each in moved.items() if each[1].low > 0.0 or each[1].high < 0.0]
+    ((clause, factor, effect),) = found
+    assert (clause, factor) == ("p beats a penalty", "env.reward")
+    assert f"by {effect.estimate:.0f} points [{effect.low:.0f}, {effect.high:.0f}]" in PAGE
+
+
+def test_the_page_has_the_methods(settings):
+    """Safe policies, rates, scores and slopes, in the order of the page; and the best new selector."""
+    standings = multiverse.standings(settings)
+    place = -1
+    for each in standings:
+        score, slope = "1", ""
+        if each.method != UNIFORM:
+            score, slope = written(each.score, 2), f"{written(multiverse.removed(settings, each.method), 2)} "
+        name = NAMES.get(each.method, each.method)
+        line = f"| {name} | {written(each.safe, 0, 100)} | {100 * each.worst.estimate:.0f} | {score} | {slope}|"
+        assert PAGE.find(line) > place
+        place = PAGE.find(line)
+    assert multiverse.best_new(standings) == "weighted"
+    able = [each.method for each in standings if each.method in multiverse.NEW and each.score.estimate >= 0.95]
+    assert able == ["weighted"]
+
+
+def test_pages_count_settings(settings, room):
+    """Learnt, safe, with headroom, and where scores are compared."""
+    unlearnt = [each for each in settings if not each.learnt]
+    reciprocal = [each for each in unlearnt if each.levels["env.reward"] == "reciprocal"]
+    assert (len(settings), len(room), len(unlearnt), len(reciprocal)) == (32, 16, 13, 10)
+    assert "finds 16 settings with *headroom*" in PAGE
+    assert "In 13 others it has not learnt the task, ten of them" in PAGE
+    assert f"in {sum(each.learnt and not each.has_headroom for each in settings)} it is safe" in PAGE
+    assert f"over the {sum(each.compares_scores for each in settings)} settings where scores can be compared" in PAGE
+    assert multiverse.most_headroom(settings).name == "map.03"
+
+
+def test_pages_say_how_much_seeds_differ(room):
+    """Two policies of Uniform in every setting with headroom, and the spread of their differences and of methods'."""
+    first, second = (
+        np.array([100 * each.worst for each in own])
+        for own in ([each.screened for each in room], [each.policies[UNIFORM] for each in room])
+    )
+    for name, own in (("screening", first), ("map", second)):
+        assert f"| {name} | {' | '.join(f'{x:.0f}' for x in own)} |" in LAB
+    others = [name for name in multiverse.methods_of(room) if name != UNIFORM]
+    spread = np.std(first - second, ddof=1)
+    spreads = {name: np.std(safer(room, name), ddof=1) for name in others}
+    assert f"standard deviation of {spread:.1f} points" in LAB
+    assert ", ".join(f"{name} {own:.1f}" for name, own in spreads.items()) in LAB
+    low, high = min(spreads.values()), max(spreads.values())
+    assert f"differ by {spread:.0f} points (standard deviation)" in PAGE
+    assert f"of another method and one of Uniform by {low:.0f} to {high:.0f}" in PAGE
+
+
+def test_the_lab_says_what_a_penalty_does_without_headroom(settings, room):
+    """Mean rates over the settings without headroom; and the penalty's advantage over those with it."""
+    rest = [each for each in settings if not each.has_headroom]
+    assert sum(each.levels["env.reward"] == "reciprocal" for each in rest) == 10
+    rates = {name: 100 * np.mean([each.policies[name].worst for each in rest]) for name in multiverse.methods_of(rest)}
+    uniform, penalty = (f"{rates.pop(name):.1f} %" for name in (UNIFORM, "penalty-30"))
+    assert f"crashes Uniform's policies on {uniform} of its goals, penalty-30's on {penalty}" in LAB
+    assert f"{min(rates.values()):.1f} to {max(rates.values()):.1f} %" in LAB
+    assert f"advantage is {written(multiverse.mean(safer(room, 'penalty-30')), 1)}".replace(" [", " points [") in LAB
+
+
+def test_the_report_is_what_the_analysis_writes(tmp_path):
+    """Word for word."""
+    write(MultiverseOptions(out=tmp_path, screening=RESULTS / "multiverse_screening", map=RESULTS / "multiverse"))
+    wanted = (tmp_path / "multiverse.md").read_text(encoding="utf-8")
+    assert (RESULTS / "map" / "multiverse.md").read_text(encoding="utf-8") == wanted
