@@ -20,7 +20,7 @@ def require(
         array: The array to check.
         dtype: The dtype it must hold; ``None`` for that of ``like``.
         shape: The shape it must have; ``None`` for that of ``like``, or any shape without ``like``.
-        like: An array on whose device it must be, and whose dtype and shape it must have unless given.
+        like: An array whose device it must be on, and whose dtype and shape it must have unless given.
     """
     if not isinstance(array, wp.array):
         raise ValueError(f"{name} must be a Warp array, got {type(array).__name__}.")

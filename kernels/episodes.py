@@ -1,12 +1,12 @@
-"""What all environments do alike, to be inlined into their own kernels: clocks, goals, faults, the end of a step.
+"""What all environments share, to be inlined into their own kernels: clocks, goals, faults, the end of a step.
 
 A step kernel moves its worlds, rewards and observes them, and calls ``end_step``; a reset kernel places them and calls
 ``begin_episode``; both call ``write_goal`` for the goal's slot of the observation. Each loops over its worlds::
 
     for env in range(wp.tid(), worlds.num_envs, worlds.num_threads):
 
-On a GPU each thread has one world then. On a CPU, where Warp copies the arguments anew for every thread, one thread has
-them all.
+On a GPU each thread then has one world. On a CPU, where Warp copies the arguments again for every thread, one thread
+has them all.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class Worlds:
     """What every environment has for its worlds; arrays of shape (num_envs,) unless they say otherwise."""
 
     num_envs: int
-    num_threads: int  # that share the worlds
+    num_threads: int  # threads that share the worlds
     goal_period: int  # T: steps that a goal is active
     time_limit: int  # steps of an episode, 0 disables the limit
     stagger: wp.bool  # whether the goal clock of a world's first episode starts at a random step
@@ -36,28 +36,28 @@ class Worlds:
     world_offset: int  # global number of world 0
     goal_start: int  # where the goal starts in the observation
     crash_penalty: float  # what a crash takes from the reward of its step, at least 0
-    goal_scale: wp.array[float]  # (goal_dim,): what the policy sees goals multiplied by
+    goal_scale: wp.array[float]  # (goal_dim,): factors by which the policy sees goals
     # What the host writes before a launch.
     action: wp.array2d[float]  # (num_envs, action_dim)
     mask: wp.array[wp.bool]  # worlds to reset
     first_range: wp.array[float]  # (goal_dim,): half side of the box that first goals come from
-    # All that a bit-exact resume needs of them.
+    # All that a bit-exact resume needs.
     goal: wp.array2d[float]  # (num_envs, goal_dim), in physical units
     goal_clock: wp.array[int]  # steps that the goal has been active
     episode_step: wp.array[int]  # steps since the reset
     episode_count: wp.array[int]  # resets so far
-    goal_count: wp.array[int]  # goals received so far, first goals apart
+    goal_count: wp.array[int]  # goals received so far, without first goals
     obs: wp.array2d[float]  # (num_envs, obs_dim)
-    origin: wp.array2d[float]  # (num_envs, goal_dim), what goals are seen relative to; no rows where they are not
-    # What a step gives back.
-    reward: wp.array[float]  # against the goal that was active, at least 0 but for the penalty of a crash
+    origin: wp.array2d[float]  # (num_envs, goal_dim): what goals are seen relative to; no rows if they are absolute
+    # What a step returns.
+    reward: wp.array[float]  # against the goal that was active, at least 0 except for the penalty of a crash
     tracking: wp.array2d[float]  # (num_envs, num_groups): how well each group of the goal is met, in [0, 1]
     terminated: wp.array[wp.bool]  # crashed
     truncated: wp.array[wp.bool]  # cut off without a crash
     goal_due: wp.array[wp.bool]  # the goal has been active for its whole period, and the state is valid
     invalid: wp.array[wp.bool]  # the action, the goal or the state is not physical
     fault: wp.array[int]  # (3,): invalid world-steps so far, lowest such world, lowest world with a broken action
-    cause: wp.array[int]  # bits of what was wrong with a world when it last was invalid
+    cause: wp.array[int]  # bits of what was wrong with a world when it was last invalid
 
 
 WORLDS = StructTable(Worlds, {
@@ -89,7 +89,7 @@ def make_worlds(
 
 
 def record(kernel: wp.Kernel, worlds: Worlds, *inputs: object, dim: int | tuple[int, ...] | None = None) -> wp.Launch:
-    """Record a kernel whose first argument is ``worlds``, then ``inputs``; over all worlds, or ``dim`` threads."""
+    """Record a kernel with the arguments ``worlds`` and ``inputs``; over all worlds, or ``dim`` threads."""
     dim = worlds.num_threads if dim is None else dim
     return wp.launch(kernel, dim, inputs=[worlds, *inputs], device=worlds.goal.device, record_cmd=True)
 
@@ -190,7 +190,7 @@ def _set_goals(
 
 
 def set_goals(row: wp.array, goal: wp.array, worlds: Worlds) -> wp.Launch:
-    """Record giving the listed worlds a new goal, which starts its clock and shows in their observations.
+    """Record a launch that gives the listed worlds new goals, starts their clocks and shows them in the observations.
 
     Args:
         row: Worlds, int32, shape (n,), each in [0, num_envs) and at most once; below 0 for none.

@@ -1,4 +1,4 @@
-"""Uniform candidates for goals."""
+"""Uniform candidate goals."""
 
 import warp as wp
 
@@ -9,7 +9,7 @@ from .random import Purpose, philox_lanes, unit
 
 
 def _kernel(size: int, module: str | None) -> wp.Kernel:
-    """The kernel whose threads draw ``size`` candidates each, in a Warp module of its own or in that of this file."""
+    """The kernel whose threads draw ``size`` candidates each, in a separate Warp module or in that of this file."""
     words = WORDS[size]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -58,7 +58,7 @@ _draw_candidates, _draw_wide_candidates = _kernel(1, None), _kernel(WIDE, f"{__n
 
 
 def check_candidates(row: wp.array, scale: wp.array, candidate: wp.array, worlds: Worlds) -> None:
-    """Raise ``ValueError`` unless the arrays are as ``draw_candidates`` says."""
+    """Raise ``ValueError`` unless the arrays are as ``draw_candidates`` requires."""
     goal = worlds.goal
     require("row", row, dtype=wp.int32, shape=row.shape, like=goal)
     require("scale", scale, dtype=wp.float32, shape=goal.shape[1:], like=goal)
@@ -67,10 +67,10 @@ def check_candidates(row: wp.array, scale: wp.array, candidate: wp.array, worlds
 
 
 def draw_candidates(row: wp.array, scale: wp.array, candidate: wp.array, worlds: Worlds) -> wp.Launch:
-    """Record drawing independent candidate goals, uniform in a box, for every listed world.
+    """Record a launch that draws independent candidate goals, uniform in a box, for every listed world.
 
-    Candidate k of a world's i-th goal depends on (seed, world, i, k) alone, and on the world's origin where goals are
-    seen from one: asking for fewer candidates gives the first ones of a longer list.
+    Candidate k of a world's i-th goal depends only on (seed, world, i, k), and on the world's origin if goals are
+    relative to one: asking for fewer candidates gives the first ones of a longer list.
 
     Args:
         row: Worlds that need a goal, int32, shape (n,), each in [0, num_envs).
@@ -79,7 +79,7 @@ def draw_candidates(row: wp.array, scale: wp.array, candidate: wp.array, worlds:
         worlds: The worlds; only read.
 
     Returns:
-        The launch. For other rows, change the first axis of its threads alone: on a CPU one of the second draws many
+        The launch. For other rows, change only the first axis of its threads: on a CPU one of the second draws many
         candidates.
 
     Raises:

@@ -1,16 +1,16 @@
 """How work is divided into threads: one number for each on a GPU, many on a CPU.
 
-Warp runs the threads of a CPU one after another and copies the arguments anew for each, so one thread does all there. A
-thread's own arithmetic is scalar; a kernel that does the same to many numbers takes them as vectors on a CPU, and LLVM
-makes vector instructions of their loops.
+Warp runs the threads of a CPU one after another and copies the arguments again for each, so one thread does all there.
+A thread's own arithmetic is scalar; a kernel that does the same to many numbers takes them as vectors on a CPU, and
+LLVM vectorises their loops.
 """
 
 import warp as wp
 
-WIDE = 64  # what LLVM makes the best code of; with 16 or 32 some kernels take five times as long (Zen 5, AVX-512)
+WIDE = 64  # LLVM's best code; with 16 or 32 some kernels take five times as long (Zen 5, AVX-512)
 
 AS_ON_GPU = False
-"""Whether CPUs divide their work as a GPU does: for tests, since what is divided otherwise there would run in none."""
+"""Whether CPUs divide their work as a GPU does: for tests, in which a GPU's division would otherwise never run."""
 
 WORDS = {lanes: wp.types.vector(length=lanes, dtype=wp.uint32) for lanes in (1, WIDE)}
 """Vectors of as many uint32 as there are lanes."""
@@ -27,7 +27,7 @@ def split(count: int, device: wp.Device) -> int:
 
 
 def lanes(count: int, device: wp.Device) -> int:
-    """Numbers of a thread, 1 or ``WIDE``, where each row has ``count``."""
+    """Numbers per thread, 1 or ``WIDE``, if each row has ``count``."""
     return WIDE if is_serial(device) and count >= WIDE // 4 else 1
 
 

@@ -1,12 +1,13 @@
 """Multilayer perceptrons on the threads of a CPU: blocks of rows pass through all layers, and back, within its caches.
 
-A block lies unit by unit: the values of one unit for all rows of the block end to end. So a vector register holds one
-unit of several rows, and a weight meets it as one number: layers of any width fill the registers, and weights and
-gradients lie as torch lays them. Products are made of tiles, as many sums at a time as fit the registers.
+A block is stored unit by unit: the values of one unit are contiguous for all rows of the block. So a vector register
+holds one unit of several rows, which a weight multiplies as one number: layers of any width fill the registers, and
+weights and gradients have torch's memory layout. Products are made of tiles, as many sums at a time as fit the
+registers.
 
-How many those are follows from the processor that Clang compiles for and changes no bit: an output is summed over its
-inputs in their order; a gradient over 16 interleaved sets of rows, then over these by halves. This module is for CPUs
-alone; a GPU never compiles it.
+That number depends on the processor that Clang compiles for but changes no bit of the results: an output is summed over
+its inputs in order; a gradient over 16 interleaved sets of rows, then over these by halves. This module is only for
+CPUs; a GPU never compiles it.
 """
 
 from enum import IntEnum
@@ -20,7 +21,7 @@ STEP = 48
 _FLAGS = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
 wp.set_module_options({
     "enable_backward": False,
-    # A product and a sum become one instruction. Of registers of 512 bits Clang would use half by itself.
+    # A product and a sum become one instruction. By default Clang would use only half of 512-bit registers.
     "cpu_compiler_flags": f"{_FLAGS} -ffp-contract=fast -mprefer-vector-width=512",
 })  # fmt: skip
 
@@ -29,7 +30,7 @@ class Mode(IntEnum):
     """What a job does with every block of rows."""
 
     FORWARD = 0  # write the outputs
-    BACKWARD = 1  # add up gradients, given those by the outputs
+    BACKWARD = 1  # add up gradients, given those with respect to the outputs
     VALUE = 2  # add up gradients of ``losses.ValueLoss``
     SURROGATE = 3  # add up gradients of ``losses.Surrogate``
 
@@ -69,7 +70,7 @@ class Job:
     x_unit: wp.int64
     inputs: int  # that ``x`` has
     y: wp.uint64  # outputs, shape (count, rows, outputs)
-    data: wp.uint64  # of the loss, or gradients by outputs, shape (count, columns, rows)
+    data: wp.uint64  # of the loss, or gradients with respect to outputs, shape (count, columns, rows)
     data_net: wp.int64
     data_column: wp.int64
     data_row: wp.int64
@@ -92,7 +93,7 @@ class Block:
 
 
 def _vectors(size: str) -> str:
-    """Vectors of so many bytes: of one that is wider than a register Clang makes several."""
+    """Vectors of this many bytes: Clang splits those that are wider than a register."""
     return f"""
 typedef float Vector __attribute__((vector_size({size})));
 typedef int Whole __attribute__((vector_size({size})));
@@ -138,7 +139,7 @@ auto expm1 = [](Vector x) __attribute__((always_inline)) {
 
 
 def _in_tiles(count: str, tile: str) -> str:
-    """A loop over so many units, N at a time: the compiler must know how many sums it is to keep in registers."""
+    """A loop over this many units, N at a time: the compiler must know how many sums to keep in registers."""
     cases = (f"case {n}: {{ {tile.replace('N', str(n))} break; }}" for n in range(1, 9))
     return "\n".join([
         f"for (int unit = 0, height; unit < {count}; unit += height) {{",
@@ -262,7 +263,7 @@ def _apply_activation(shape: Shape, b: Block, layer: int):
     """Apply ELU or tanh to a layer's outputs; ReLU costs nothing while they are in registers."""
 
 
-# The data of a loss lie behind the outputs, column by column as ``losses`` has them.
+# The data of a loss are stored behind the outputs, column by column as in ``losses``.
 _VALUE = _vectors("64") + _TOTAL + """
 float* value = (float*)b.memory + shape.unit.data[shape.layers] * b.stride;
 const float *weight = value + b.stride, *old = weight + b.stride, *target = old + b.stride;
@@ -443,5 +444,5 @@ def _work(shape: Shape, jobs: wp.array[Job], thread: int):
 
 
 def record(shape: Shape, jobs: wp.array, thread: int) -> wp.Launch:
-    """A launch for one of the threads that share ``jobs[0]``, to be replayed whenever that has been filled in."""
+    """A launch for one of the threads that share ``jobs[0]``, to be replayed whenever that job has been filled in."""
     return wp.launch(_work, dim=1, inputs=[shape, jobs, thread], device="cpu", record_cmd=True)

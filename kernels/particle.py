@@ -25,7 +25,7 @@ BROKEN = ("action", "velocity", "position", "goal")  # quantities that may be br
 
 @wp.struct
 class ParticleParams:
-    """What all particles share."""
+    """Parameters that all particles share."""
 
     velocity_goals: wp.bool  # whether goals are velocities, not positions
     half_side: float  # half side of the cube [u]
@@ -42,7 +42,7 @@ class ParticleParams:
 
 @wp.struct
 class ParticleState:
-    """Where every particle is. Arrays of shape (num_envs,)."""
+    """The state of every particle. Arrays of shape (num_envs,)."""
 
     position: wp.array[wp.vec3]  # [u]
     velocity: wp.array[wp.vec3]  # [u/step]
@@ -131,12 +131,12 @@ def _step_particles(
 
 
 def step_particles(worlds: Worlds, state: ParticleState, params: ParticleParams) -> wp.Launch:
-    """Record a step of every particle: physics, crash, reward, clocks, observation.
+    """Record a launch that steps every particle: physics, crash, reward, clocks, observation.
 
     Args:
         worlds: The worlds. Their actions are forces [u/step^2], clipped to ``params.max_force``.
         state: The particles. Updated.
-        params: What all particles share.
+        params: Parameters that all particles share.
 
     Raises:
         ValueError: If an array has another shape, dtype or device.
@@ -167,7 +167,9 @@ def _reset_particles(
 
 
 def reset_particles(worlds: Worlds, state: ParticleState, params: ParticleParams) -> wp.Launch:
-    """Record a new episode in every world of ``worlds.mask``, with a uniform first goal; the others are left alone.
+    """Record a launch that begins an episode, with a uniform first goal, in every world of ``worlds.mask``.
+
+    It leaves the other worlds alone.
 
     The arguments are those of ``step_particles``.
     """

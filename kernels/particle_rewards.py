@@ -1,4 +1,4 @@
-"""The particle's reward: how a distance to the goal becomes a number in (0, 1].
+"""The particle's reward, which maps a distance to the goal to a number in (0, 1].
 
 To add a shape, write one ``@wp.func`` here, name it in ``RewardName`` and ``RewardShape``, and give it a branch in
 ``shape_reward``; the configuration, the command line and the tests find it by its name.
@@ -15,11 +15,11 @@ wp.set_module_options({"enable_backward": False})
 
 
 RewardName = Literal["linear", "reciprocal", "exponential"]
-"""How a configuration names a shape."""
+"""Names of the shapes in a configuration."""
 
 
 class RewardShape(IntEnum):
-    """The shapes that ``shape_reward`` knows, by their names in capitals."""
+    """The shapes that ``shape_reward`` knows, by their names in upper case."""
 
     LINEAR = 0
     RECIPROCAL = 1
@@ -78,7 +78,7 @@ def _reward_distances(
 def reward_distances(
     distance: wp.array, reward: wp.array, *, shape: RewardShape, largest: float, length: float
 ) -> None:
-    """Reward distances that no step has measured, such as those to goals that nobody pursued.
+    """Compute rewards for distances that no step has measured, such as those to goals that were not pursued.
 
     Args:
         distance: Distances to the goal, at least 0, shape (n,).

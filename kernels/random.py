@@ -4,7 +4,7 @@ A sequential generator hands out numbers in the order of the calls, so what one 
 what the others did before. Here a draw is addressed by *who* draws *what* for *which time*: the key is
 (seed, purpose), the counter (world, count, index, block). Two policies that crash at different times
 meet the same i-th goal in every world, two halves of a batch equal the whole, and a resumed run continues
-with the very numbers that it would have had.
+with the numbers that it would have had.
 
 The generator is Philox4x32-10 of Salmon et al., *Parallel Random Numbers: As Easy as 1, 2, 3*, SC 2011.
 """
@@ -173,7 +173,7 @@ def draw_uniforms(
 
     Args:
         row: Worlds to draw for, int32, shape (n,), each in [0, num_envs).
-        count: How often each world has drawn for this purpose, int32, shape (num_envs,).
+        count: Number of earlier draws of each world for this purpose, int32, shape (num_envs,).
         draw: The numbers, vec4, shape (n,). Written.
         seed: Seed of the run, in [0, 2^32).
         purpose: What the numbers are for.

@@ -3,8 +3,8 @@
 Lengths along x and y are in cells here, so a sample is a pair of whole numbers. Where vertices are multiples of
 1/4096 cell and within 16384 cells, the products of the test below take at most 53 bits and float64 evaluates it
 without rounding: whether a ray meets a triangle, its edges and corners included, is decided exactly, and no ray slips
-between two triangles. (A ray that is tested against float32 boxes by division, as ``wp.mesh_query_ray`` does it, comes
-to 0 x inf on their sides. Here a box of no width asks the same search tree, which only compares.)
+between two triangles. (A ray that is tested against float32 boxes by division, as in ``wp.mesh_query_ray``, results in
+0 x inf on their sides. Here a box without width queries the same search tree, which only compares.)
 """
 
 import warp as wp
@@ -79,15 +79,14 @@ def cast_rays(
 ) -> None:
     """Write the height of the highest face of a mesh above every sample (i, j) of a grid.
 
-    Edges and corners belong to their faces; upright faces count for nothing but through the faces that
-    they join.
+    Edges and corners belong to their faces; upright faces only count through the faces that they join.
 
     Args:
         mesh: Triangles; x and y in cells, multiples of 1 / ``SNAP`` in [-``LARGEST``, ``LARGEST``] for exactness.
         height: Heights, float32, shape (nx, ny), each axis at most ``LARGEST`` + 1. Written.
-        low: A height below all of the mesh.
-        high: A height above all of the mesh.
-        miss: What a ray that meets nothing gives, at most ``low``.
+        low: A height below the whole mesh.
+        high: A height above the whole mesh.
+        miss: The result of a ray that meets nothing, at most ``low``.
         first: First sample to write, in rows of y, at least 0.
         count: Samples to write; ``None`` for all that follow.
 

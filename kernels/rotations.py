@@ -1,6 +1,6 @@
 """Rotations by MuJoCo's unit quaternions (w, x, y, z), which map the body frame to the world frame.
 
-Warp's own quaternions are (x, y, z, w), so a MuJoCo quaternion is a ``wp.vec4`` here and no other
+Warp's own quaternions are (x, y, z, w), so a MuJoCo quaternion is a ``wp.vec4`` here, and only this
 file rotates with one.
 """
 

@@ -1,6 +1,6 @@
 """Tables of the arrays in a struct: each shape is declared once; memory, checks and tests' builders follow from it.
 
-Warp's structs know what their arrays hold and how many axes they have, not how long these are. A table adds that, by
+Warp's structs know the dtype and the number of axes of their arrays, but not the axes' lengths. A table adds these, by
 name: a field that it does not mention has one element for every world.
 """
 
@@ -21,7 +21,7 @@ class StructTable:
     """The arrays of a Warp struct and their shapes.
 
     Args:
-        struct: Made by ``@wp.struct``; its fields that are no arrays are left alone.
+        struct: Made by ``@wp.struct``; its fields that are not arrays are left alone.
         shapes: Shape of every array that is not ``("num_envs",)``, by name.
     """
 
@@ -38,7 +38,7 @@ class StructTable:
         return tuple(name for name, var in self.struct.vars.items() if wp.types.is_array(var.type))
 
     def dtype(self, name: str) -> type:
-        """What an array holds."""
+        """The dtype of an array."""
         return self.struct.vars[name].type.dtype
 
     def shape(self, name: str, **sizes: int) -> tuple[int, ...]:
@@ -60,7 +60,7 @@ class StructTable:
         return struct
 
     def rows(self, struct: Any, rows: slice) -> Any:
-        """The struct of some of the worlds: arrays with an element for each are views of theirs, the rest is shared."""
+        """The struct of some of the worlds: arrays with an element per world are views, the rest is shared."""
         part = self.struct()
         for name in self.struct.vars:
             value = getattr(struct, name)
@@ -70,12 +70,12 @@ class StructTable:
         return part
 
     def require(self, label: str, struct: Any, like: wp.array, **sizes: int) -> None:
-        """Raise ``ValueError`` unless every array of ``struct`` is as the table says.
+        """Raise ``ValueError`` unless every array of ``struct`` is as the table requires.
 
         Args:
-            label: What the caller knows the struct by, for the message.
+            label: The caller's name for the struct, for the message.
             struct: The struct.
-            like: An array on whose device all must be.
+            like: An array whose device all must be on.
             sizes: The sizes that the shapes name.
         """
         for name in self.names:

@@ -1,6 +1,6 @@
 """Terrain for the legged robots; imports NumPy, trimesh and Warp only.
 
-A shape builds a triangle mesh, a grid lays tiles of many shapes out, and the whole mesh becomes one height grid::
+A shape builds a triangle mesh, a grid lays out tiles of many shapes, and the whole mesh becomes one height grid::
 
     ground = terrain.rough(seed=1)  # Legged Gym's grid with steps that a Go1 can climb
     ground = terrain.build(terrain.preset("legged-gym", levels=5))

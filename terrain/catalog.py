@@ -28,7 +28,7 @@ def make(name: str, parameters: Mapping[str, Any] | None = None) -> TileShape:
     """
     known = _defaults()
     if name not in known:
-        raise ValueError(f"There is no shape '{name}'; there are: {', '.join(sorted(known))}.")
+        raise ValueError(f"Unknown shape '{name}'; choose from: {', '.join(sorted(known))}.")
     given, hints = dict(parameters or {}), known[name].parameters()
     if unknown := sorted(set(given) - set(hints)):
         raise ValueError(f"{name} has no parameter '{unknown[0]}'; it has: {', '.join(hints)}.")
@@ -56,10 +56,10 @@ def _of_module(module: ModuleType) -> list[TileShape]:
 
 
 def convert(name: str, value: Any, hint: Any) -> Any:
-    """A value from a file as its field wants it: whole numbers may stand for others, lists for tuples.
+    """Convert a value from a file to its field's type: whole numbers may stand for others, lists for tuples.
 
     Raises:
-        ValueError: If it is of another kind.
+        ValueError: If it is of another type.
     """
     if parts := get_args(hint):
         if not isinstance(value, list | tuple) or len(value) != len(parts):

@@ -16,7 +16,7 @@ ENDINGS = (".glb", ".obj", ".ply", ".stl", ".npz", ".png")
 MJCF_FILES = ("terrain.xml", "heights.bin")
 _NOTE = "height [m] = {low!r} + {unit!r} * grey; {cell!r} m per pixel; lower left pixel at x = {x!r} m, y = {y!r} m"
 GREY_NOTE = re.compile(re.sub(r"\\{(\w+)!r\\}", r"(?P<\1>\\S+)", re.escape(_NOTE)))
-"""What a picture of heights says of itself, with the groups ``low``, ``unit``, ``cell``, ``x`` and ``y``."""
+"""The description in a picture of heights, with the groups ``low``, ``unit``, ``cell``, ``x`` and ``y``."""
 BASE = 1.0  # [m] of solid ground below the lowest sample of a MuJoCo model
 
 _MJCF = """\
@@ -41,9 +41,9 @@ _MJCF = """\
 
 
 def save(path: Path, terrain: Terrain, mesh: Mesh) -> None:
-    """Write a terrain to a file whose ending, one of ``ENDINGS``, says how; whole or not at all.
+    """Write a terrain to a file in the format of its ending, one of ``ENDINGS``; whole or not at all.
 
-    ``.stl``, ``.obj``, ``.ply`` and ``.glb`` hold the mesh [m]; z is up, but in ``.glb``, where y must be.
+    ``.stl``, ``.obj``, ``.ply`` and ``.glb`` hold the mesh [m]; z is up, except in ``.glb``, where y must be.
     ``.npz`` holds the terrain. ``.png`` holds its heights as 16-bit grey values, see ``grey``.
 
     Raises:
@@ -60,7 +60,7 @@ def save(path: Path, terrain: Terrain, mesh: Mesh) -> None:
 
 
 def grey(terrain: Terrain) -> tuple[np.ndarray, float, float]:
-    """The heights as 16-bit numbers, seen as on a map: x to the right, y up.
+    """The heights as 16-bit numbers, arranged as on a map: x to the right, y up.
 
     Returns:
         Numbers n, uint16, shape (ny, nx), and two lengths a and b [m]: the height is a + b n.
@@ -72,10 +72,10 @@ def grey(terrain: Terrain) -> tuple[np.ndarray, float, float]:
 
 
 def save_mjcf(folder: Path, terrain: Terrain) -> None:
-    """Write a MuJoCo model of the terrain alone: ``terrain.xml`` and, beside it, its heights.
+    """Write a MuJoCo model of the terrain alone: ``terrain.xml`` and a file with its heights.
 
     Raises:
-        OSError: If the folder cannot be made.
+        OSError: If the folder cannot be created.
         RunError: If a file cannot be written.
     """
     folder.mkdir(exist_ok=True)
@@ -86,7 +86,7 @@ def save_mjcf(folder: Path, terrain: Terrain) -> None:
         x=terrain.corner[0] + half_x, y=terrain.corner[1] + half_y, low=low, half_x=half_x, half_y=half_y,
         extent=extent or 1.0, base=BASE, reach=1.2 * math.hypot(half_x, half_y),
     )  # fmt: skip
-    rows = np.ascontiguousarray((terrain.heights - low).T, "<f4")  # MuJoCo scales them to [0, 1] itself
+    rows = np.ascontiguousarray((terrain.heights - low).T, "<f4")  # MuJoCo itself scales them to [0, 1]
     header = struct.pack("<ii", *rows.shape)
     write_bytes(folder / MJCF_FILES[1], header + rows.tobytes())
     write_bytes(folder / MJCF_FILES[0], text.encode())

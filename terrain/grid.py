@@ -1,4 +1,4 @@
-"""One world of ground: tiles of rising level along x, a column for each shape along y, as one height grid."""
+"""The ground of one world: tiles of rising level along x, a column for each shape along y, as one height grid."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,17 +10,17 @@ from deimos.checks import check_positive
 from deimos.files import UNREADABLE, first_line, load_arrays, write_whole
 
 SCHEMA = 1  # of the file that ``Terrain.save`` writes
-FARTHEST = 1e6  # [m] from the origin, and up and down; float32 tells 6 cm there
+FARTHEST = 1e6  # [m] from the origin, and up and down; float32 resolves 6 cm there
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """The ground of a world. Between the samples of ``heights`` it is interpolated."""
+    """The ground of a world, interpolated between the samples of ``heights``."""
 
     heights: np.ndarray
     """Ground at x = corner[0] + i * cell and y = corner[1] + j * cell [m], float32, shape (nx, ny)."""
     cell: float
-    """Distance of two samples [m]."""
+    """Distance between samples [m]."""
     corner: tuple[float, float]
     """World x and y of ``heights[0, 0]`` [m]."""
     origins: np.ndarray
@@ -71,7 +71,7 @@ class Terrain:
         try:
             data: dict[str, Any] = load_arrays(Path(path))
             if data.pop("schema") != SCHEMA:
-                raise ValueError("it is of another version")
+                raise ValueError("it has another version")
             data["shapes"] = tuple(str(name) for name in data["shapes"])
             data["corner"] = tuple(float(value) for value in data["corner"])
             return Terrain(**data | {name: float(data[name]) for name in ("cell", "tile")})
@@ -80,7 +80,7 @@ class Terrain:
         except UNREADABLE as error:
             raise ValueError(
                 f"{path} is not a terrain file of version {SCHEMA}, or it is broken ({first_line(error)}); "
-                "files of other programs are imported first: deimos terrain import."
+                "import files of other programs first: deimos terrain import."
             ) from error
 
 
@@ -89,7 +89,7 @@ def flat(size: float = 8.0, cell: float = 0.05) -> Terrain:
 
     Args:
         size: Side [m], positive.
-        cell: Distance of two samples [m]; must divide ``size``.
+        cell: Distance between samples [m]; must divide ``size``.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -104,7 +104,7 @@ def check_heights(heights: np.ndarray) -> None:
     """Raise ``ValueError`` unless ``heights`` are a grid of at least 2 x 2 finite numbers within ``FARTHEST``."""
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise ValueError(f"heights must have at least 2 x 2 samples, got the shape {heights.shape}.")
-    if not -FARTHEST <= heights.min() <= heights.max() <= FARTHEST:  # NaN is not
+    if not -FARTHEST <= heights.min() <= heights.max() <= FARTHEST:  # false for NaN
         raise ValueError(f"heights must be finite everywhere, and within {FARTHEST:g} m up or down.")
 
 

@@ -1,4 +1,4 @@
-"""A mesh becomes a height grid: one exact vertical ray for every sample."""
+"""Turns a mesh into a height grid, with one exact vertical ray for every sample."""
 
 from collections.abc import Callable
 
@@ -24,14 +24,14 @@ def rasterise(
 ) -> np.ndarray:
     """Height of the highest face above every sample of a grid, by exact ray casts.
 
-    Vertices are moved to multiples of 1/4096 cell along x and y; then a ray misses no face, edge or corner
+    Vertices are moved to multiples of 1/4096 cell along x and y; rays then miss no face, edge or corner
     (see ``deimos.kernels.ray_cast``). A sample on a riser gets its upper edge: the upper tread keeps its whole depth,
     and the riser is crossed within the first cell of the lower one.
 
     Args:
         mesh: Ground [m]; must cover the grid.
         corner: World x and y of the first sample [m].
-        cell: Distance of two samples [m].
+        cell: Distance between samples [m].
         shape: Number of samples along x and y, each from 2 to 16385.
         device: Warp device that casts the rays.
         progress: Called with the share that is done, in (0, 1].

@@ -1,4 +1,4 @@
-"""Ground from elsewhere: meshes, grey pictures and arrays of heights become a terrain."""
+"""Imports ground from other programs: meshes, grey pictures and arrays of heights become a terrain."""
 
 import zipfile
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ from .world import BYTES_PER_SAMPLE, require_memory
 
 RESOLUTION = 0.05  # [m]; the finest that robots walk on
 FINEST = 1e-6  # [m]
-BYTES_PER_TILE = 100  # its origin, and what it is made of
+BYTES_PER_TILE = 100  # its origin, and what it is made from
 OPTIONS = {
     **dict.fromkeys((".glb", ".obj", ".ply", ".stl"), ("resolution", "scale", "tile")),
     ".png": ("resolution", "height_range", "tile"),
     **dict.fromkeys((".npy", ".npz"), ("resolution", "tile")),
 }
-"""What ``import_file`` takes beside a file, by its ending."""
+"""Options of ``import_file``, by the ending of the file."""
 
 _Field = tuple[np.ndarray, float, tuple[float, float]]  # heights, cell and corner of a ``Terrain``
 
@@ -39,34 +39,33 @@ def import_file(
     tile: float | None = None,
     device: str = "cpu",
 ) -> Terrain:
-    """A terrain from a file of another program or of ``deimos terrain``. The file's ending says what it is.
+    """A terrain from a file of another program or of ``deimos terrain``. The file's ending gives its format.
 
     ``.stl``, ``.obj``, ``.ply``, ``.glb``
-        A mesh with z up (y in ``.glb``), which keeps its place. Its highest faces count; they must cover its extent.
+        A mesh with z up (y in ``.glb``), which keeps its position. Its highest faces count; they must cover its extent.
     ``.png``
-        Heights as 8- or 16-bit grey values, seen as on a map: x to the right, y up.
+        Heights as 8- or 16-bit grey values, arranged as on a map: x to the right, y up.
     ``.npy``, ``.npz``
         An array of heights [m] with x along the first axis and y along the second, or a saved terrain.
 
-    Files of ``deimos terrain`` give their heights back: meshes and arrays, at the resolution that they were made with,
-    to the bit, pictures to half a grey value.
-    Such pictures know their place, their ``resolution`` and their ``height_range``. Other pictures, and arrays, lie
-    around the origin.
+    Files of ``deimos terrain`` give their heights back: meshes and arrays exactly, at the resolution of their making,
+    pictures to half a grey value. Such pictures store their position, ``resolution`` and ``height_range``. Other
+    pictures, and arrays, are put around the origin.
 
     Args:
         path: The file.
-        resolution: Distance of two samples [m], positive; by default 0.05, or what a picture says.
-        height_range: Heights of the lowest and the highest possible grey value [m]; by default what a picture says.
+        resolution: Distance between samples [m], positive; by default 0.05, or a picture's own.
+        height_range: Heights of the lowest and the highest possible grey value [m]; by default a picture's own.
         scale: Length of a mesh's unit [m], positive, such as 0.001 for millimetres; by default 1.
         tile: Side of the tiles in whose middles robots start [m], positive; by default there is one, in the middle.
         device: Warp device that rasterises a mesh.
 
     Returns:
-        The terrain. Its columns have the file's name; how difficult its levels are is not known, and 0.
+        The terrain. Its columns have the file's name; the difficulty of its levels is unknown, and set to 0.
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is not such a file, or an argument is out of its range or not for its kind.
+        ValueError: If it is not such a file, or an argument is out of its range or does not apply to it.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -78,7 +77,7 @@ def import_file(
     if is_terrain:
         return Terrain.load(path)
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite and NaN heights are refused
             if ending == ".png":
                 field = _read_picture(path, resolution, height_range)
             elif ending in (".npy", ".npz"):
@@ -93,7 +92,7 @@ def import_file(
 
 
 def _check_options(path: Path, takes: Sequence[str], options: dict[str, Any]) -> None:
-    """What is given must be within its range and apply to the file."""
+    """Raise ``ValueError`` unless the given options are within their ranges and apply to the file."""
     given = {name: value for name, value in options.items() if value is not None}
     for name in ("resolution", "scale", "tile"):
         check_positive(name, given.get(name, 1.0), finite=True)
@@ -108,11 +107,11 @@ def _check_options(path: Path, takes: Sequence[str], options: dict[str, Any]) ->
 
 
 def _is_terrain(path: Path) -> bool:
-    """Whether a file is one of ``Terrain.save``."""
+    """Whether ``Terrain.save`` has written a file."""
     try:
         with open_file(path) as file, zipfile.ZipFile(file) as archive:
             return "schema.npy" in archive.namelist()
-    except (zipfile.BadZipFile, NotImplementedError, ValueError):  # of a broken one too
+    except (zipfile.BadZipFile, NotImplementedError, ValueError):  # also if it is broken
         return False
 
 
@@ -123,16 +122,16 @@ def _read_mesh(path: Path, cell: float, scale: float, device: str) -> _Field:
     with open_file(path) as file:
         try:
             mesh = trimesh.load_mesh(file, file_type=path.suffix[1:].lower(), process=False, skip_materials=True)
-        except Exception as error:  # its readers raise whatever a broken file makes them stumble over
-            raise ValueError(f"it is no mesh, or it is broken ({first_line(error)}).") from error
+        except Exception as error:  # its readers raise all sorts of errors on broken files
+            raise ValueError(f"it is not a mesh, or it is broken ({first_line(error)}).") from error
     if not len(getattr(mesh, "faces", ())):
-        raise ValueError("it holds no faces.")
+        raise ValueError("it has no faces.")
     vertices = scale * np.asarray(mesh.vertices, np.float64)
     if path.suffix.lower() == ".glb":  # glTF 2.0, section 3.4: y is up
         vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
     if not (np.abs(vertices) <= FARTHEST).all():
         raise ValueError(f"its vertices must be finite, and within {FARTHEST:g} m of the origin.")
-    unit = cell / SNAP  # float32 numbers are not quite where they should be; vertices are rounded to this too
+    unit = cell / SNAP  # removes float32 rounding errors; vertices are rounded to this too
     low, high = (np.round(end(axis=0)[:2] / unit) * unit for end in (vertices.min, vertices.max))
     nx, ny = (int(cells) + 1 for cells in (high - low) / cell + 1e-6)
     if min(nx, ny) < 2:
@@ -149,7 +148,7 @@ def _read_mesh(path: Path, cell: float, scale: float, device: str) -> _Field:
 
 
 def _read_picture(path: Path, resolution: float | None, height_range: tuple[float, float] | None) -> _Field:
-    """Grey values as heights; what the picture says of them holds where the arguments say nothing."""
+    """Grey values as heights; the picture's own description applies where the arguments are ``None``."""
     from PIL import Image
 
     with open_file(path) as file:
@@ -158,7 +157,7 @@ def _read_picture(path: Path, resolution: float | None, height_range: tuple[floa
                 mode, grey = image.mode, np.asarray(image)
                 note = GREY_NOTE.match(str(image.info.get("Description")))
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise ValueError(f"it is no picture, or it is broken ({first_line(error)}).") from error
+            raise ValueError(f"it is not a picture, or it is broken ({first_line(error)}).") from error
     if mode not in ("L", "I", "I;16"):
         raise ValueError(f"it must have 8- or 16-bit grey values and nothing else, got the mode {mode}.")
     most = 255 if mode == "L" else 65535
@@ -167,7 +166,7 @@ def _read_picture(path: Path, resolution: float | None, height_range: tuple[floa
         low, high = height_range
         says |= {"low": low, "unit": (high - low) / most}
     elif note:
-        says["unit"] *= 65535 / most  # another program may have made 8 bits of it, and kept the note
+        says["unit"] *= 65535 / most  # another program may have converted it to 8 bits, and kept the note
     if "low" not in says:
         raise ValueError("height_range must be given: the heights of its lowest and its highest grey value [m].")
     heights = says["low"] + says["unit"] * grey[::-1].T.astype(np.float64)
@@ -181,7 +180,7 @@ def _read_array(path: Path, cell: float) -> _Field:
     try:
         arrays = [*load_arrays(path).values()]
     except ValueError as error:
-        raise ValueError(f"it is no NumPy file of numbers, or it is broken ({error}).") from error
+        raise ValueError(f"it is not a NumPy file of numbers, or it is broken ({error}).") from error
     if len(arrays) != 1 or arrays[0].ndim != 2 or arrays[0].dtype.kind not in "fiu":
         shapes = ", ".join(f"{array.dtype}{list(array.shape)}" for array in arrays)
         raise ValueError(f"it must hold one array of numbers with two axes, got {shapes}.")
@@ -200,7 +199,7 @@ def _with_tiles(name: str, field: _Field, tile: float | None) -> Terrain:
     size = cell * (np.array(heights.shape) - 1)
     side = float(size.min()) if tile is None else tile
     if tile is not None and tile < cell:
-        raise ValueError(f"tile must be at least {cell:g} m, the distance of two samples, got {tile:g} m.")
+        raise ValueError(f"tile must be at least {cell:g} m, the distance between samples, got {tile:g} m.")
     levels, columns = (1, 1) if tile is None else (int(tiles) for tiles in size / side + 1e-6)
     require_memory((levels, columns), BYTES_PER_TILE * levels * columns, "tile", side)
     if min(levels, columns) < 1:

@@ -1,4 +1,4 @@
-"""What shapes are made of: triangle meshes from heights. Faces are seen from above counter-clockwise."""
+"""Triangle meshes of heights, which shapes are made of. Seen from above, faces are counter-clockwise."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ UPRIGHT = 1e-6  # a face whose unit normal has a smaller vertical part is a rise
 
 
 def from_quads(corners: np.ndarray) -> Mesh:
-    """Two triangles for every quadrilateral; nothing is shared, so that edges stay sharp when they are drawn.
+    """Two triangles for every quadrilateral; nothing is shared, so that edges stay sharp when rendered.
 
     Args:
         corners: Corners in counter-clockwise order [m], shape (n, 4, 3).
@@ -31,10 +31,10 @@ def from_triangles(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def take_apart(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a mesh that nobody uses any more; all else of it is freed.
+    """Vertices and faces of a mesh that is no longer used; the rest of it is freed.
 
-    A mesh of trimesh's and its helpers (cache, colours, rays) hold each other, so that it would keep its arrays until
-    Python searches for cycles, which no array, however large, brings about.
+    A trimesh mesh and its helpers (cache, colours, rays) refer to each other, so it would keep its arrays until
+    Python's garbage collector runs, which arrays, however large, do not trigger.
     """
     parts = mesh.vertices, mesh.faces
     vars(mesh).clear()
@@ -84,7 +84,7 @@ def terraces(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Mesh:
 
 
 def _riser(here: np.ndarray, there: np.ndarray, right: np.ndarray, left: np.ndarray) -> list[tuple]:
-    """Corners of risers, along the edge and in height; ``right`` is that of who stands lower, if ``here`` is higher."""
+    """Corners of risers, along the edge and in height; ``right`` is seen from the lower side, if ``here`` is higher."""
     right, left = np.where(here > there, (right, left), (left, right))
     low, high = np.minimum(here, there), np.maximum(here, there)
     return [(right, low), (left, low), (left, high), (right, high)]
@@ -97,7 +97,7 @@ def rings(half_sides: np.ndarray, heights: np.ndarray) -> Mesh:
         half_sides: Half side of each square [m], falling, shape (n,). A square as large as the one before hides it.
         heights: Height of each square [m], shape (n,).
     """
-    lines = np.unique(np.concatenate([-half_sides, half_sides]).round(9))  # [nm]: what differs by less is one line
+    lines = np.unique(np.concatenate([-half_sides, half_sides]).round(9))  # [nm]: closer lines are merged
     middle = np.abs((lines[:-1] + lines[1:]) / 2)
     distance = np.maximum(middle[:, None], middle[None, :])
     innermost = (distance[..., None] < half_sides).sum(axis=-1) - 1
@@ -110,7 +110,7 @@ def blocks(x: np.ndarray, y: np.ndarray, bottom: float, top: float) -> Mesh:
     Args:
         x: Where each block begins and ends along x [m], shape (n, 2).
         y: The same along y, shape (n, 2).
-        bottom: Height of their foot [m].
+        bottom: Height of their bottom [m].
         top: Height of their top [m].
     """
     low, high = np.full(len(x), bottom), np.full(len(x), top)
@@ -130,7 +130,7 @@ def steepest_slope(mesh: Mesh) -> float:
 
 
 def highest_riser(mesh: Mesh) -> float:
-    """Height of the highest vertical face [m]; 0 without any."""
+    """Height of the highest vertical face [m]; 0 if there is none."""
     upright = np.abs(mesh.face_normals[:, 2]) <= UPRIGHT
     z = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[upright], 2]
     return float(np.ptp(z, axis=1).max()) if len(z) else 0.0

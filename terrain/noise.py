@@ -13,9 +13,9 @@ def draw_noise(
     Args:
         generator: Source of the heights.
         tile: Side of the tile [m].
-        spacing: Distance of two heights [m]; changed as little as needed for it to divide the tile.
+        spacing: Distance between heights [m]; changed as little as needed for it to divide the tile.
         amplitude: Largest height [m].
-        quantum: Difference of two neighbouring heights [m].
+        quantum: Step between possible heights [m].
         room: Side of the square without noise [m].
 
     Returns:

@@ -1,4 +1,4 @@
-"""Grids from TOML files: the ready-made ones in ``terrain/grids``, and those of others."""
+"""Grids from TOML files: the ready-made ones in ``terrain/grids``, and custom ones."""
 
 import tomllib
 from pathlib import Path
@@ -23,7 +23,7 @@ def preset(name: str, **changes: Any) -> Grid:
 
     Args:
         name: One of ``preset_names()``.
-        changes: Fields of ``Grid`` that are to be otherwise.
+        changes: Fields of ``Grid`` to change.
 
     Raises:
         ValueError: If there is no such preset, or a value is out of its range.
@@ -39,7 +39,7 @@ def read_grid(path: str | Path, **changes: Any) -> Grid:
 
     Args:
         path: The file.
-        changes: Fields of ``Grid`` that are to be otherwise.
+        changes: Fields of ``Grid`` to change.
 
     Raises:
         OSError: If it cannot be read.
@@ -52,7 +52,7 @@ def read_grid(path: str | Path, **changes: Any) -> Grid:
         if not table.get("shape"):
             raise ValueError(f"it needs a [[shape]], or preset = one of {', '.join(preset_names())}")
         return _grid(table, changes)
-    except ValueError as error:  # of TOML too
+    except ValueError as error:  # also TOML's
         raise ValueError(f"{path}: {str(error).rstrip('.')}.") from error
 
 
@@ -62,12 +62,12 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _read_preset(name: str) -> dict[str, Any]:
     if name not in preset_names():
-        raise ValueError(f"There is no preset '{name}'; there are: {', '.join(preset_names())}.")
+        raise ValueError(f"Unknown preset '{name}'; choose from: {', '.join(preset_names())}.")
     return _read(_FOLDER / f"{name}.toml")
 
 
 def _grid(table: dict[str, Any], changes: dict[str, Any]) -> Grid:
-    """The grid that a table describes as a file does."""
+    """The grid that a table, as in a file, describes."""
     hints = {name: hint for name, hint in get_type_hints(Grid).items() if name != "shapes"}
     values = {name: value for name, value in table.items() if name != "shape"}
     if unknown := sorted(set(values) - set(hints)):
@@ -93,7 +93,7 @@ def rough(*, device: str = "cpu", **changes: Any) -> Terrain:
 
     Args:
         device: Warp device that rasterises the mesh.
-        changes: Fields of ``Grid`` that are to be otherwise than in the preset ``go1``.
+        changes: Fields of ``Grid`` to change from the preset ``go1``.
 
     Raises:
         ValueError: If a value is out of its range, or the grid would not fit into memory.

@@ -14,8 +14,8 @@ from .grid import Terrain
 
 LENGTH = 760  # pixels along the longer side of long ground
 DPI = 100
-WORDS = 240  # pixels for titles, names and the bar of colours
-POINTS = 16  # size of the letters: they can be read where a page shows the picture at the width of a phone
+WORDS = 240  # pixels for titles, names and the colour bar
+POINTS = 16  # size of the letters: legible on a page at the width of a phone
 SAMPLES = 2  # samples per pixel, along each axis
 TURN, TILT = math.radians(25.0), math.radians(35.0)  # of the oblique view: about the vertical, above the horizon
 HIGHEST = 10.0  # times the longer side: beyond, a picture takes gigabytes
@@ -29,7 +29,7 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     Args:
         path: The file, written whole or not at all.
         terrain: The terrain.
-        title: What stands above.
+        title: The title.
 
     Raises:
         RunError: If the file cannot be written.
@@ -52,7 +52,7 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
             f"preview is to scale, so the longer side of the ground must be at most {LONGEST:g} times the shorter one, "
             f"{narrow:g} m, got {long:g} m."
         )
-    margin = max(0.05, 0.15 * (high - low))  # flat ground has neither the darkest nor the lightest colour
+    margin = max(0.05, 0.15 * (high - low))  # so that flat ground has neither the darkest nor the lightest colour
     colours = ScalarMappable(Normalize(low - margin, high + margin), "YlGnBu_r")
     stacked = max(terrain.size) > 1.5 * min(terrain.size)
     pixel = max(terrain.size) / (LENGTH if stacked else 0.55 * LENGTH)  # [m]
@@ -72,7 +72,7 @@ def save_preview(path: Path, terrain: Terrain, title: str) -> None:
     bar.set_label("height [m]", fontsize=POINTS)
     bar.ax.tick_params(labelsize=POINTS)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.1)  # no name is cut off, however long
+    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.1)  # cuts off no name, however long
     image = Image.open(buffer).convert("RGB")
     image = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)  # a third of the bytes
     write_whole(path, lambda file: image.save(file, format="PNG", optimize=True))
@@ -84,9 +84,9 @@ def _is_wide(terrain: Terrain) -> bool:
 
 
 def _draw(terrain: Terrain, colours: Any, step: float, turn: float, tilt: float) -> tuple[np.ndarray, tuple]:
-    """A parallel projection of the height grid, white beside it.
+    """A parallel projection of the height grid, white around it.
 
-    Every column of the picture walks over the ground from near to far; a pixel shows the first sample that reaches it.
+    Every column of the picture scans the ground from near to far; a pixel shows the first sample that reaches it.
 
     Args:
         terrain: The terrain.
@@ -103,10 +103,10 @@ def _draw(terrain: Terrain, colours: Any, step: float, turn: float, tilt: float)
     stride = max(1, int(step / terrain.cell))
     ground = (terrain.heights.T[::-1] if _is_wide(terrain) else terrain.heights)[::stride, ::stride]
     low, high = float(ground.min()), float(ground.max())
-    level = 0.0 if low <= 0.0 <= high else low  # ground far from 0, as a survey has it, is cut not far below itself
+    level = 0.0 if low <= 0.0 <= high else low  # ground far from 0, as in a survey, is cut just below itself
     ground = ground - level
     cell = stride * terrain.cell
-    light = LightSource(azdeg=315, altdeg=30)  # brightness 1/2 where it is flat, which keeps the colour of its height
+    light = LightSource(azdeg=315, altdeg=30)  # brightness 1/2 on flat ground, which keeps the colour of its height
     south, east = np.gradient(ground, cell)
     normals = np.stack([-east, south, np.ones_like(east)], axis=-1)
     brightness = (normals @ light.direction / np.linalg.norm(normals, axis=-1)).clip(0.0, 1.0)
@@ -141,7 +141,7 @@ def _draw(terrain: Terrain, colours: Any, step: float, turn: float, tilt: float)
 
 
 def _scale_bar(axis: Any, left: float, right: float, bottom: float, top: float) -> None:
-    """A bar of a round length below the lower left corner."""
+    """Draw a bar of a round length below the lower left corner."""
     rough = (right - left) / 6
     power = 10.0 ** math.floor(math.log10(rough))
     length = next(step * power for step in (5, 2, 1) if step * power <= rough)
@@ -152,7 +152,7 @@ def _scale_bar(axis: Any, left: float, right: float, bottom: float, top: float) 
 
 
 def _name_tiles(axis: Any, terrain: Terrain) -> None:
-    """Numbers of the levels and names of the shapes, beside and above the tiles."""
+    """Write the numbers of the levels and the names of the shapes next to the tiles and above them."""
     if terrain.origins.shape[:2] == (1, 1):
         return  # the title says it all
     x, y = np.moveaxis(terrain.origins[..., :2] - terrain.corner - np.divide(terrain.size, 2), -1, 0)

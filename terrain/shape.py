@@ -1,4 +1,4 @@
-"""What every shape of ground promises."""
+"""The interface of all shapes of ground."""
 
 import abc
 import math
@@ -21,9 +21,9 @@ class TileShape(abc.ABC):
     """A square of ground around the origin, at height 0 along its edge, with a flat middle to stand on.
 
     A file of ``terrain.shapes`` holds one, named ``Shape``; its fields are its parameters. Every number must be
-    positive, and both ends of a ramp at least 0; further checks belong into ``__post_init__``. A field ``direction``
-    makes two shapes of it. It is seen by the robot, which starts in the middle: ``up`` is the way out of a
-    hollow, ``down`` the way off a hill.
+    positive, and both ends of a ramp at least 0; further checks belong in ``__post_init__``. A field ``direction``
+    makes two shapes of it. It is the direction for the robot, which starts in the middle: ``up`` is the way out
+    of a hollow, ``down`` the way off a hill.
     """
 
     tile: float = 8.0
@@ -32,7 +32,7 @@ class TileShape(abc.ABC):
     """Side of the flat middle [m], positive and smaller than the tile."""
 
     def __post_init__(self) -> None:
-        hints = get_type_hints(type(self))  # a field's own type is a string where annotations are
+        hints = get_type_hints(type(self))  # a field's type is a string if annotations are
         for field in fields(self):
             if hints[field.name] is float:
                 check_positive(field.name, getattr(self, field.name), finite=True)
@@ -48,7 +48,7 @@ class TileShape(abc.ABC):
 
     @classmethod
     def parameters(cls) -> dict[str, Any]:
-        """Names and types of the fields that a caller may set: all but ``direction``, which is in the shape's name."""
+        """Names and types of the fields that a caller may set: all except ``direction``, part of the shape's name."""
         return {name: hint for name, hint in get_type_hints(cls).items() if name != "direction"}
 
     @abc.abstractmethod
@@ -64,7 +64,7 @@ class TileShape(abc.ABC):
         """
 
     def build(self, difficulty: float, generator: np.random.Generator) -> Mesh:
-        """See ``surface``; raises ``ValueError`` if ``difficulty`` is out of its range, or it is no such square."""
+        """See ``surface``; raises ``ValueError`` if ``difficulty`` is out of its range, or the mesh is wrong."""
         check_range("difficulty", difficulty, 0, 1)
         mesh = self.surface(difficulty, generator)
         across = np.abs(mesh.vertices[:, :2])

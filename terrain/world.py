@@ -1,4 +1,4 @@
-"""The layout of a world and its making: shapes, tiles, one mesh, one height grid."""
+"""The layout of a world and how it is built: shapes, tiles, one mesh, one height grid."""
 
 import os
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from .mesh import Mesh, from_quads, from_triangles, take_apart
 from .shape import TileShape
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and the share of it that is done, in [0, 1]."""
+"""Called with the current stage and the share of it that is done, in [0, 1]."""
 
 BYTES_PER_SAMPLE = 12  # measured: 5 while a terrain is made, checked and saved, 9 while its files are written
 BYTES_PER_TILE = 5 * 2**20  # measured: 4.5 MiB for the finest stepping stones, less for all else
@@ -24,12 +24,12 @@ BYTES_PER_TILE = 5 * 2**20  # measured: 4.5 MiB for the finest stepping stones, 
 
 @dataclass(frozen=True, kw_only=True)
 class Share:
-    """A shape and how much of the world it gets."""
+    """A shape and its share of the world."""
 
     shape: TileShape
     """The ground of the columns; its ``tile`` is that of the grid."""
     share: float = 1.0
-    """Part of the columns, positive; in relation to the sum of all."""
+    """Share of the columns, positive; relative to the sum of all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Grid:
     """Tiles of rising difficulty along x (levels), a column for each shape along y, and a flat border around."""
 
     shapes: tuple[Share, ...]
-    """What the columns are made of, in order, at least one."""
+    """Shapes of the columns, in order, at least one."""
     levels: int = 10
     """Tiles along x, at least 1."""
     columns: int = 20
@@ -47,7 +47,7 @@ class Grid:
     border: float = 25.0
     """Width of the flat border [m], at least 0."""
     cell: float = 0.05
-    """Distance of two samples of the height grid [m]; must divide tile and border."""
+    """Distance between samples of the height grid [m]; must divide tile and border."""
     easiest: float = 0.0
     """Difficulty of the first level, in [0, 1]."""
     hardest: float = 0.9
@@ -87,7 +87,7 @@ class Grid:
     def column_shapes(self) -> tuple[TileShape, ...]:
         """The shape of each column: column j has the shape at j / columns + 0.001 of the summed shares."""
         ends = np.cumsum([part.share for part in self.shapes])
-        # The small shift is Legged Gym's: sums of shares such as 0.1 + 0.2 are not what they seem.
+        # The small shift is Legged Gym's: sums of shares such as 0.1 + 0.2 are not exact.
         choice = np.arange(self.columns) / self.columns + 0.001
         which = np.minimum(np.searchsorted(ends / ends[-1], choice, side="right"), len(ends) - 1)
         return tuple(_on_tile(self.shapes[k].shape, self.tile) for k in which)
@@ -99,7 +99,7 @@ class Grid:
 
     @property
     def corner(self) -> tuple[float, float]:
-        """World x and y of the first sample [m]; the tiles lie around the origin."""
+        """World x and y of the first sample [m]; the tiles are around the origin."""
         return -self.levels * self.tile / 2 - self.border, -self.columns * self.tile / 2 - self.border
 
     @property
@@ -110,7 +110,7 @@ class Grid:
 
     @property
     def memory(self) -> int:
-        """About how much memory the making takes [B]."""
+        """Approximate memory that building takes [B]."""
         nx, ny = self.num_samples
         return BYTES_PER_SAMPLE * nx * ny + BYTES_PER_TILE * self.levels * self.columns
 
@@ -124,7 +124,7 @@ class Grid:
 
 
 def _on_tile(shape: TileShape, tile: float) -> TileShape:
-    """A shape on a tile of another side [m]; whose numbers do not fit on it is named."""
+    """A shape on a tile with another side [m]; an error names the shape."""
     try:
         return replace(shape, tile=tile)
     except ValueError as error:
@@ -139,7 +139,7 @@ def build(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) 
 
 
 def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | None = None) -> tuple[Terrain, Mesh]:
-    """Make a world and the mesh that it is the height grid of.
+    """Make a world and the mesh that its height grid is made from.
 
     The same grid gives the same bytes, on any number of threads.
 
@@ -165,7 +165,7 @@ def build_with_mesh(grid: Grid, *, device: str = "cpu", progress: Progress | Non
 def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
     """The mesh of a world [m]: all tiles and the border.
 
-    Every tile has a generator of its own, seeded by (seed, level, column): none depends on another.
+    Every tile has its own generator, seeded by (seed, level, column): none depends on another.
     """
     from trimesh.util import append_faces
 
@@ -183,25 +183,25 @@ def build_mesh(grid: Grid, progress: Progress | None = None) -> Mesh:
 
 
 def require_memory(num_samples: tuple[int, int], need: int, name: str, cell: float) -> None:
-    """Raise ``ValueError`` if a height grid has too many samples, or its making would not fit into memory.
+    """Raise ``ValueError`` if a height grid has too many samples, or building it would not fit into memory.
 
     Args:
         num_samples: Samples along x and y.
         need: Memory that is needed [B].
-        name: What the caller calls ``cell``, for the message.
-        cell: Distance of two samples [m].
+        name: The caller's name for ``cell``, for the message.
+        cell: Distance between samples [m].
     """
     most = max(num_samples) - 1
     if most > LARGEST:
         raise ValueError(
-            f"{name} must be at least {cell * most / LARGEST:.3g} m for {LARGEST} cells along an axis at most, "
+            f"{name} must be at least {cell * most / LARGEST:.3g} m for at most {LARGEST} cells along an axis, "
             f"got {cell:g} m, which makes {most}."
         )
     free = _free_memory()
     if need > free:
         nx, ny = num_samples
         raise ValueError(
-            f"The grid of {nx} x {ny} samples needs about {need / 2**30:.1f} GiB of memory and "
+            f"The grid of {nx} x {ny} samples needs about {need / 2**30:.1f} GiB of memory, but "
             f"{free / 2**30:.1f} GiB are free; enlarge {name}, or ask for less ground."
         )
 
@@ -212,7 +212,7 @@ def _free_memory() -> float:
         with open("/proc/meminfo", encoding="ascii") as file:
             return next(1024 * int(line.split()[1]) for line in file if line.startswith("MemAvailable"))
     except (OSError, StopIteration):  # not Linux
-        sizes = getattr(os, "sysconf_names", {})  # Windows has none
+        sizes = getattr(os, "sysconf_names", {})  # missing on Windows
         if not {"SC_PAGE_SIZE", "SC_PHYS_PAGES"} <= set(sizes):
             return np.inf
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

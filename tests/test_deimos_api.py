@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -72,6 +73,19 @@ def test_the_same_evaluation_replaces_its_rows(run):
     assert len(RunFolder(run).read_json("evaluation.json")) == before
 
 
+def test_numbers_of_numpy_are_evaluated(tmp_path):
+    """A run of NumPy's numbers ends with an evaluation, and so does an evaluation for another T of theirs."""
+    config = deimos.TrainConfig(
+        env=particle.Config(goal_period=np.int64(4)), ppo=PPOConfig(hidden=(4,), num_steps=4), num_envs=np.int64(8),
+        env_steps=4, method="uniform", device="cpu", threads=1, log=(),
+        eval=EvalConfig(worlds=np.int64(8), steps=np.int64(12), seed=np.uint32(5), attackers=()),
+    )  # fmt: skip
+    run = deimos.train(config, tmp_path / "run")
+    deimos.evaluate(run, goal_period=np.int64(3), worlds=np.int64(4))
+    rows = [(row["goal_period"], row["worlds"], row["seed"]) for row in RunFolder(run).read_json("evaluation.json")]
+    assert rows == [(4, 8, 5), (3, 4, 5)]
+
+
 @pytest.mark.parametrize("changes", [{"worlds": 8}, {"adversary_steps": 30}])
 def test_another_evaluation_stands_beside(run, changes):
     """An evaluation of other sizes, or by attackers that were made otherwise, leaves the earlier rows alone."""
@@ -135,7 +149,7 @@ def test_hidden_layers_are_whole_numbers(sizes):
     [
         ({"evaluation": "no"}, "evaluation must be true or false, got 'no'"),
         ({"ppo": PPOConfig(hidden=(8,), clip_value=0)}, "clip_value must be true or false, got 0"),
-        ({"selector": Unknown()}, "is not the Config of a plugin of deimos.goals.selectors; register its module by"),
+        ({"selector": Unknown()}, "is not the Config of a plugin of deimos.goals.selectors; register its module with"),
     ],
 )
 def test_a_run_that_could_not_be_read_again_does_not_begin(tmp_path, changes, message):

@@ -281,14 +281,17 @@ def test_a_pool_is_refused_in_one_line(tmp_path):
     sizes = replace(SMALL, attackers=("pooled",), pool=pool)
     with pytest.raises(RunError, match=r"pool.pt cannot be read \(No such file"):
         evaluate(stay, config, sizes, CPU)
-    with pytest.raises(RunError, match="These policies never crashed, or always"):
+    with pytest.raises(RunError, match="These policies never or always crashed"):
         make_pool([make_target(stay, config, SMALL, CPU)], pool)
     make_pool([make_target(blind(), config, SMALL, CPU)], pool)
-    with pytest.raises(RunError, match=r"pool\.pt is of other observations"):
+    with pytest.raises(RunError, match=r"pool\.pt is for other observations"):
         evaluate(stay, replace(config, max_speed=20.0), sizes, CPU)
     other = make_target(blind(), replace(config, max_speed=20.0), SMALL, CPU)
-    with pytest.raises(RunError, match="observe different things"):
+    with pytest.raises(RunError, match="The policies have different observations"):
         make_pool([make_target(blind(), config, SMALL, CPU), other], pool)
+    shorter = make_target(blind(), replace(config, goal_period=50), SMALL, CPU)
+    with pytest.raises(RunError, match=r"goals of the same period T, got 50, 100\."):
+        make_pool([make_target(blind(), config, SMALL, CPU), shorter], pool)
     pool.write_bytes(b"broken")
     with pytest.raises(RunError, match=r"pool\.pt"):
         evaluate(stay, config, sizes, CPU)

@@ -76,8 +76,8 @@ def test_an_attacker_may_want_another_network():
 @pytest.mark.parametrize(
     ("facts", "message"),
     [
-        ({"crashes": 3, "score": 0.5}, "Facts of the attacker scripted must have names of their own, got crashes, sc"),
-        ({"steps": 3}, "must have names of their own, got steps"),
+        ({"crashes": 3, "score": 0.5}, "Facts of the attacker scripted must not repeat names of the row, got cr"),
+        ({"steps": 3}, "must not repeat names of the row, got steps"),
         ({"tried": [1, 2]}, r"The fact tried of the attacker scripted must be a number or a text, got \[1, 2\]"),
     ],
 )

@@ -126,9 +126,9 @@ def test_what_must_not_differ_is_named(origin, tmp_path):
         "env.kind": replace(base, env=quad.Config(goal_period=16)),
     }
     for name, config in others.items():
-        with pytest.raises(ValueError, match=f"^{name} must be .*, as it was there, got "):
+        with pytest.raises(ValueError, match=f"^{name} must be .*, as in the origin, got "):
             check_branch(config, base)
-    with pytest.raises(RunError, match=r"cannot branch off .*origin: num_envs must be 64, as it was there, got 65"):
+    with pytest.raises(RunError, match=r"cannot branch off .*origin: num_envs must be 64, as in the origin, got 65"):
         training.start(others["num_envs"], tmp_path / "run", branch_from=origin)
     assert not (tmp_path / "run").exists()
     with pytest.raises(RunError, match="--init-from and --branch-from cannot be combined"):

@@ -271,7 +271,7 @@ def forget_the_copy(self, result):
 
 
 BUGS = [
-    ("sample_goals", forget_rows, "sample_goals must not depend on who else asks"),
+    ("sample_goals", forget_rows, "sample_goals must not depend on the other worlds that ask"),
     ("sample_goals", forget_count, "sample_goals must give the first ones of a longer list"),
     ("set_goals", forget_to_count, "sample_goals must give other goals once a goal was set: count it"),
     ("set_goals", forget_others, "set_goals must leave the other worlds alone, but position changed"),
@@ -280,7 +280,7 @@ BUGS = [
     ("set_goals", forget_the_goals, "set_goals must give a goal to the rows in where"),
     ("step", forget_the_view, "position must stay where it is: write into it, never rebind it"),
     ("step", forget_the_seed, "the same seed must give the same numbers"),
-    ("step", forget_the_clock, "a goal must be not be due before T = 6 steps, but not so after 5 steps"),
+    ("step", forget_the_clock, "a goal must not be due before T = 6 steps, but this fails after 5 steps"),
     ("step", forget_the_limit, "episodes must be truncated at the time limit of 30 steps"),
     ("step", forget_the_difference, "a world that crashed must not be truncated too"),
     ("step", forget_the_penalty, "the step of a crash, and no other, must cost crash_penalty"),

@@ -87,7 +87,7 @@ TRAIN_ERRORS = {
     "bogus": "Unrecognized options: bogus",
     "--out there": "there exists and is not overwritten; choose another --out, or continue with --resume",
     "--out file": "file exists and is not overwritten",
-    "--out file/run": r"file/run cannot be made \(Not a directory\)",
+    "--out file/run": r"file/run cannot be created \(Not a directory\)",
     "--resume nowhere": "nowhere is not a run folder: it holds no config.json",
     "--resume there": "there is not a run folder: it holds no config.json",
     "--resume file": "file is not a run folder",

@@ -193,7 +193,7 @@ def test_checkpoint_of_another_size_is_refused(copied, capfd, part, change):
     folder.write_json("config.json", data)
     before = contents(copied)
     message = refused(["train", "--resume", copied], capfd)
-    assert "The checkpoint is that of another environment or network size: " in message
+    assert "The checkpoint belongs to another environment or network size: " in message
     assert contents(copied) == before
 
 

@@ -1,13 +1,16 @@
 """Clips of the policy while it learns: what they show, and a training that does not notice them."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
 from PIL import Image, ImageSequence
 
 from deimos.learn.ppo import PPOConfig
+from deimos.nn import ranks
 from deimos.run import training
-from deimos.run.clips import Camera, clips, cut_clips
+from deimos.run.clips import PATIENCE_SECONDS, Camera, clips, cut_clips
 from deimos.run.film import FPS, SECONDS, SIZE
 from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig
@@ -68,6 +71,20 @@ def test_a_clip_that_cannot_be_kept_ends_the_clips(tmp_path, monkeypatch, caplog
     assert [record.getMessage() for record in caplog.records] == [
         "There will be no videos in the logs from iteration 1 on: [Errno 28] No space left on device"
     ]
+
+
+def test_a_clip_that_takes_too_long_is_said_to(tmp_path, monkeypatch, caplog):
+    """The line names the timeout, not the last words of the process, which are bytes then."""
+    command = [sys.executable, "-c", "import sys, time; print('a hint', file=sys.stderr, flush=True); time.sleep(60)"]
+
+    def slow(*paths):
+        subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=1.0)
+
+    monkeypatch.setattr("deimos.run.clips.render", slow)
+    assert Camera(RunFolder(tmp_path), 1).after(1, lambda path: None) is None
+    (record,) = caplog.records
+    assert record.getMessage().endswith("timed out after 1.0 seconds")
+    assert PATIENCE_SECONDS < ranks.PATIENCE.total_seconds()  # the other ranks wait for the clip
 
 
 def test_clips_after_an_iteration_are_dropped(tmp_path):

@@ -251,9 +251,9 @@ def test_unknown_and_broken_terrains_are_refused(tmp_path):
     """A terrain that is neither a name nor a file, and a file that is not one, each give one clear line."""
     with pytest.raises(ValueError, match=r"terrain must be flat, rough or the path of a terrain file, got 'moon'"):
         Config(terrain="moon").load_terrain()
-    with pytest.raises(ValueError, match=r"got 'h.stl'; make one of it by: deimos terrain import h.stl --out h.npz"):
+    with pytest.raises(ValueError, match=r"got 'h.stl'; convert it with: deimos terrain import h.stl --out h.npz"):
         Config(terrain="h.stl").load_terrain()
-    with pytest.raises(ValueError, match=r"make one of it by: deimos terrain grid --file my.toml --out my.npz"):
+    with pytest.raises(ValueError, match=r"convert it with: deimos terrain grid --file my.toml --out my.npz"):
         Config(terrain="my.toml").load_terrain()
     (tmp_path / "x.npz").write_bytes(b"no terrain")
     with pytest.raises(ValueError, match="is not a terrain file"):

@@ -26,6 +26,31 @@ def naive(env):
     return uniform.Config().build(spaces(env), 0)
 
 
+def test_goals_without_time_to_end_before_the_limit_do_not_count():
+    """Of goals that the time limit cuts off only crashes could be known: neither crash nor survival counts."""
+    env = particle.Config(goal_period=10, time_limit=25).build(3, CPU, 0)
+
+    def act(obs):
+        """World 0 crashes on step 22 of every episode, under such a goal, world 1 on step 16, and world 2 lives."""
+        for world, age in ((0, 22), (1, 16)):
+            if env.episode_step[world] == age - 1:
+                env.tensors["position"][world] = 2 * particle.HALF_SIDE
+        return torch.zeros(3, 3)
+
+    row = play(env, act, naive(env), 75)
+    assert row["crashes"] == 3 + 4
+    assert (row["interaction_crashes"], row["interactions"]) == (4, 3 + 4 + 3)
+    assert row["first_goal_steps"] == 3 * 75 - sum((3 * 12, 4 * 6 + 1, 3 * 15))
+
+
+def test_where_doing_nothing_is_as_good_as_the_reference_there_is_no_score():
+    """Forces that move nothing leave no scale to place a policy on."""
+    still = evaluate(lambda obs: torch.zeros(8, 3), particle.Config(goal_period=5, max_force=1e-9), EvalConfig(
+        worlds=8, steps=10, attackers=()), CPU)[0]  # fmt: skip
+    assert math.isnan(still["score"])
+    assert still["return_per_step"] > 0
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_crashing_does_not_pay_on_the_score(variant):
     """The follower that brakes for the wall scores 1, the one that does not scores less, doing nothing scores 0."""
@@ -38,6 +63,15 @@ def test_crashing_does_not_pay_on_the_score(variant):
     assert braking["crashes"] == still["crashes"] == 0
     assert blind["crashes"] > 0
     assert blind["score"] < 0.9
+
+
+def test_a_scale_without_a_length_gives_no_score():
+    """Where doing nothing is as good as the reference, the evaluation ends, and the score is not a number."""
+    config = EvalConfig(worlds=4, steps=200, attackers=())
+    (row,) = evaluate(
+        lambda obs: torch.zeros(4, 3), particle.Config(), config, CPU, once=lambda task, compute: ("reward", 0.5, 0.5)
+    )
+    assert math.isnan(row["score"])
 
 
 def test_the_mean_reward_pays_for_crashing():
@@ -234,7 +268,7 @@ def test_the_audit_is_exact():
         ("seed", -1, r"seed must be in \[0, 2\^32 - 2\), got -1"),
         ("seed", 2**32 - 2, r"seed must be in \[0, 2\^32 - 2\), got 4294967294"),  # the shield's would be 2^32
         ("oracle_worlds", 0, "oracle_worlds must be at least 1, got 0"),
-        ("attackers", ("nobody",), "There is no attacker 'nobody'; there are: argmax, argmax-long, .*scripted"),
+        ("attackers", ("nobody",), "Unknown attacker 'nobody'; choose from: argmax, argmax-long, .*scripted"),
         ("attackers", ("argmax", "argmax"), "attackers must be different, got argmax, argmax"),
     ],
 )

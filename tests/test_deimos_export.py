@@ -390,12 +390,12 @@ def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsy
         (other / name).write_bytes((particles / name).read_bytes())
     (other / "policy.pt").write_bytes((WALK / "policy.pt").read_bytes())
     assert cli.main(["export", str(other), str(tmp_path / "out")]) == 2
-    assert "is one of another environment: it observes" in capsys.readouterr().err
+    assert "belongs to another environment: it observes" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     (other / "policy.pt").write_bytes((particles / "policy.pt").read_bytes())
     (other / "shield.json").write_text('{"deploy": {"weights": "0123456789abcdef"}}')
     assert cli.main(["export", str(other), str(tmp_path / "out")]) == 2
-    assert "was made for an earlier policy; make it again by deimos shield" in capsys.readouterr().err
+    assert "was made for an earlier policy; make it again with deimos shield" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert cli.main(["export", str(WALK), str(tmp_path / "go1")]) == 0
     assert "This run has learnt no fear network, so there is no fear.onnx." in capsys.readouterr().err

@@ -130,6 +130,8 @@ def test_evaluation_that_was_killed_keeps_its_rows(run):
     evaluate_run(run, CONFIG.env, config, CPU, lambda *at: made.append(at[0]), again=False)
     assert read_evaluation(run) == whole
     assert not any(stage.startswith(("naive", "argmax")) for stage in made)
+    turned = dataclasses.replace(config, attackers=("scripted", "argmax"))
+    assert [row["goals"] for row in evaluate_run(run, CONFIG.env, turned, CPU, again=False)][1:] == [*turned.attackers]
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
@@ -303,15 +305,17 @@ def test_what_stopped_a_run_is_written_down(run, monkeypatch):
         row = iterate(self)
         if self.iteration == 5:
             self.env.tensors["position"][[2, 9]] = torch.nan
+            self.rollout.last_obs.fill_(torch.nan)  # memory may hold anything where nothing is written
         return row
 
     monkeypatch.setattr(type(trainer), "iterate", poisoned)
-    with pytest.raises(SimulationError, match=r"Iteration 6: .*What it was about is in .*failure\.json"):
+    with pytest.raises(SimulationError, match=r"Iteration 6: .*Details are in .*failure\.json"):
         training.train(trainer, folder)
     report = run.read_json("failure.json")
     assert report["versions"]["deimos"] == deimos.__version__
     assert [row["iteration"] for row in report["last_rows"]] == ["1", "2", "3", "4", "5"]
     assert [(found["step"], found["world"]) for found in report["invalid"]] == [(0, 2), (0, 9)]
+    assert {tuple(found["worlds"]) for found in report["not_finite"]} == {(2, 9)}
     assert len(report["invalid"][0]["action"]) == trainer.env.action_dim
     state = load_tensors(run.path / "failure.pt", "state", 1)
     assert state["rollout"]["obs"].shape[:2] == (CONFIG.ppo.num_steps + 1, CONFIG.num_envs)

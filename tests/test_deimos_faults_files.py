@@ -109,6 +109,15 @@ def test_rows_may_say_more_than_before(tmp_path):
     ]
 
 
+def test_a_table_that_begins_anew_has_its_names(tmp_path):
+    """Where a run goes on from before its first row, the rows that follow stand below the names of their columns."""
+    folder = RunFolder(tmp_path)
+    folder.append_csv("progress.csv", {"iteration": 1, "reward": 0.5})
+    folder.cut_csv("progress.csv", 0)
+    folder.append_csv("progress.csv", {"iteration": 1, "reward": 0.25})
+    assert folder.read_csv("progress.csv") == [{"iteration": "1", "reward": "0.25"}]
+
+
 def test_what_is_no_number_is_named(tmp_path):
     """A plug-in that says a text in its row is told which, before anything is written."""
     with pytest.raises(TypeError, match=r"mine must be a number, got 'high'"):

@@ -153,7 +153,7 @@ def test_devices_by_their_names(cuda):
     cuda(2, 2)
     for name, device in {"auto": GPU, "cuda": GPU, "cuda:1": torch.device("cuda", 1), "cpu": CPU}.items():
         assert training.resolve_device(name) == device
-    with pytest.raises(RunError, match="There is no CUDA device 2 here; there are: cuda:0, cuda:1"):
+    with pytest.raises(RunError, match="There is no CUDA device 2 here; choose from: cuda:0, cuda:1"):
         training.resolve_device("cuda:2")
     with pytest.raises(RunError, match="device must be auto, cpu, cuda or cuda:N, got 'tpu'"):
         training.resolve_device("tpu")

@@ -300,7 +300,7 @@ def test_dry_friction_has_rows(device):
     [
         (1, r"^NEFC: up to \d+ constraint rows in a world were needed, the buffer holds 53; raise physics.rows$"),
         (16, r"^CCD: up to \d+ contacts in all worlds were needed, the buffer holds 96; raise physics.contacts$"),
-        (32, "^HFIELD: a geom covered more of the height field than is tested; take a terrain of larger cells$"),
+        (32, "^HFIELD: a geom covered more of the height field than is tested; use a terrain with larger cells$"),
         (256, "^EPA_HORIZON: a contact was deeper than the collision test can resolve$"),
         (33 + 512, "^NEFC: .*; HFIELD: "),
     ],

@@ -106,6 +106,10 @@ def test_a_particle_is_drawn_where_it_is():
     drawing()
     env.reset(torch.ones(1, dtype=torch.bool))
     assert int((drawing() == RED).all(axis=2).sum()) > counts[1] + 20
+    env.reset(torch.ones(1, dtype=torch.bool))
+    env.step(torch.zeros(1, 3))
+    drawing()
+    assert len(drawing._ends) == 2  # though the episode is older than the last one was in its picture
 
 
 @pytest.mark.parametrize("width", [160, 640, 1920])
@@ -170,7 +174,7 @@ def write_into(writer, *pictures):
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_video_without_a_picture_is_one_line(tmp_path, ending):
     """A video that no picture was written into is refused, and nothing is left."""
-    with pytest.raises(RunError, match=rf"x{ending} could not be written \(there is no picture"):
+    with pytest.raises(RunError, match=rf"x{ending} could not be written \(there are no pictures"):
         write_into(video(tmp_path / f"x{ending}", (64, 48), 25.0))
     assert not list(tmp_path.iterdir())
 
@@ -191,7 +195,7 @@ def test_a_video_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
 def test_pictures_that_cannot_be_written_are_one_line(tmp_path):
     """A folder that exists or cannot be made, or that is gone when a picture comes, is named in one line."""
     (tmp_path / "file").touch()
-    with pytest.raises(RunError, match="file exists already; name another folder"):
+    with pytest.raises(RunError, match="file exists already; choose another folder"):
         write_into(pictures(tmp_path / "file"))
     with pytest.raises(RunError, match=r"file/x could not be written \(Not a directory\)"):
         write_into(pictures(tmp_path / "file" / "x"))

@@ -85,6 +85,41 @@ def test_adam_is_torchs():
     torch.testing.assert_close(ours, theirs.data, rtol=1e-5, atol=1e-6)
 
 
+def test_who_begins_to_learn_later_takes_steps_of_the_same_size():
+    """Parameters that stay for the first fifty steps then move as under an Adam that begins with them, also resumed."""
+    generator = torch.Generator().manual_seed(0)
+    rate, late = torch.tensor(1e-2), 20
+    ours, grad, apart = torch.ones(33), torch.zeros(33), torch.ones(33)
+    adam = Adam(ours, grad, rate, late=late)
+    alone = [Adam(apart[part], grad[part], rate) for part in (slice(late), slice(late, None))]
+    for step in range(70):
+        grad.normal_(generator=generator)
+        warming_up = step < 50
+        adam.step(without_late=warming_up)
+        for part in alone[warming_up:]:
+            part.step()
+        if step in (30, 60):  # what it has learnt is gone on with by another one
+            state = adam.state_dict()
+            adam = Adam(ours, grad, rate, late=late)
+            adam.load_state_dict(state)
+    torch.testing.assert_close(ours, apart, rtol=1e-6, atol=1e-6)
+
+
+def test_a_state_of_adam_from_before_there_was_waiting_can_be_loaded():
+    """It is gone on with as it was: all parameters have made the same number of steps."""
+    parameters, grad, rate = torch.ones(5), torch.ones(5), torch.tensor(1e-2)
+    first, second = (Adam(parameters.clone(), grad, rate.clone(), late=2) for _ in range(2))
+    first.step()
+    state = first.state_dict()
+    del state["waited"]
+    second.load_state_dict(state)
+    second._parameters.copy_(first._parameters)
+    for adam in (first, second):
+        adam.step(without_late=True)
+        adam.step()
+    assert torch.equal(first._parameters, second._parameters)
+
+
 def filled(ppo, seed=1, *, truncations=False):
     """A rollout of random transitions that the policy might have made."""
     generator = torch.Generator().manual_seed(seed)

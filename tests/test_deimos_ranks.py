@@ -70,9 +70,9 @@ def learn(case):
             found["minibatches"] = [part.table[:, part.table[-3] > 0].clone() for part in parts]
         return parts
 
-    def note_gradient(*part):
+    def note_gradient(**options):
         found.setdefault("gradient", ppo._grad.clone())
-        step(*part)
+        step(**options)
 
     ppo._minibatches, ppo.optimizer.step = note_minibatches, note_gradient
     for _ in range(ITERATIONS):
@@ -343,7 +343,7 @@ def test_a_rank_ends_when_another_is_killed(tmp_path):
             end(process)
     assert processes[0].returncode == 2, errors
     (line,) = [line for line in errors.splitlines() if line.startswith("deimos: ")]
-    assert line.startswith("deimos: Rank 0 has lost another one")
+    assert line.startswith("deimos: Rank 0 has lost another rank, ")
 
 
 def flags(out):

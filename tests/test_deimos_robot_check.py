@@ -79,7 +79,7 @@ def test_engines_agree_on_standing(page, simulator):
 FAULTS = {
     "a shell that does not collide": (
         "xml", 'name="shell"', 'name="shell" contype="0" conaffinity="0"',
-        "base 'chassis' does not collide, so a fall is no crash; give it a geom with a contype of 1",
+        "base 'chassis' does not collide, so a fall is not a crash; give it a geom with a contype of 1",
     ),
     "soft joints": ("toml", "stiffness = 25 ", "stiffness = 1 ", r"it falls from its pose: .* raise stiffness"),
     "weak motors": ("toml", "[9.0, 9.0, 9.0]", "[0.5, 0.5, 0.5]", r"'knee_\w+' is .* of 0.5 N m; raise stiffness or"),
@@ -93,16 +93,16 @@ ODDITIES = {
     "legs that do not collide": (
         "xml", 'er"><geom', 'er"><geom contype="0" conaffinity="0"', "front left: neither thigh nor calf collides",
     ),
-    "a light base": ("xml", 'mass="4.5"', 'mass="1"', "base 'chassis' weighs 1 kg, .* take --env.payload 0.25"),
+    "a light base": ("xml", 'mass="4.5"', 'mass="1"', "base 'chassis' weighs 1 kg, .* use --env.payload 0.25"),
     "a pose at a limit": ("xml", "-2.5 -0.4", "-1.54 -0.4", "pose of 'knee_fl', -1.5 rad, is in the outer tenth of"),
     "motors near their limit": ("toml", "[9.0, 9.0, 9.0]", "[9.0, 9.0, 2.6]", "standing takes .* of the 2.6 N m of 'k"),
     "soft knees": ("toml", "stiffness = 25 ", "stiffness = [25, 25, 6] ", "'knee_rl' gives way by -.* raise stiffness"),
     "trembling joints": ("xml", 'armature="0.004"', 'armature="0"', "joints tremble at .* raise damping or armature"),
     "a load at the front left": (
-        "xml", 'name="shell"', 'name="shell" pos="0.12 0.12 0"', "the rear right foot is off the ground where the",
+        "xml", 'name="shell"', 'name="shell" pos="0.12 0.12 0"', "the rear right foot is off the ground when the",
     ),
     "a knee for a foot": (
-        "toml", 'feet = ["pad_fl"]', 'feet = ["lower_fl_geom0"]', "the front left calf touches the ground where the",
+        "toml", 'feet = ["pad_fl"]', 'feet = ["lower_fl_geom0"]', "the front left calf touches the ground when the",
     ),
 }  # fmt: skip
 
@@ -174,7 +174,7 @@ def test_a_check_ends_with_1_where_there_is_a_fault(page):
     done = run(page, "check", "scout.toml", "--picture", "fallen.png")
     assert done.returncode == 1
     assert "\nfault: it falls from its pose" in done.stdout
-    assert "\nnote: geom 'lid' touches nothing and adds to the weight" in done.stdout
+    assert "\nnote: geom 'lid' touches nothing but adds to the weight" in done.stdout
     assert "It cannot be trained like this." in done.stdout
     assert (page / "fallen.png").is_file()
 

@@ -265,11 +265,11 @@ CHANGES = [
     ('<joint name="knee_fl"', '<joint name="knee_fl" type="slide"', "'knee_fl' of body 'lower_fl' must be a hinge"),
     ('name="abduct_fl" class="abduct"/>', 'name="abduct_fl" class="abduct"/> <joint name="more"/>', "found 4 chains"),
     ("</worldbody>", "</worldbody><equality><weld body1='lower_fl' body2='lower_fr'/></equality>", "equality constr"),
-    ("</worldbody>", "</worldbody><tendon><spatial><site site='s'/></spatial></tendon>", "that MuJoCo loads, but of"),
+    ("</worldbody>", "</worldbody><tendon><spatial><site site='s'/></spatial></tendon>", "MuJoCo loads, but .* fails"),
     ('pos="0.14 0.06', 'pos="-0.2 0.06', "base's frame must have x to the front and y to the left"),
     ('class="pad"><geom', 'class="pad"><geom contype="0" conaffinity="0"', None),
     ('0 0" mass="0.35"', '0 0" mass="0"', "mass and inertia of moving bodies must be larger .*'shoulder_rr'"),
-    ("<worldbody>", "<worldbodies>", "must be a file that MuJoCo loads, but of .* it says: XML"),
+    ("<worldbody>", "<worldbodies>", "must be a file that MuJoCo loads, but .* fails: XML"),
 ]  # fmt: skip
 
 
@@ -295,10 +295,10 @@ def test_a_urdf_is_refused_with_what_converts_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("robot.urdf").write_text(f"<robot name='r'>{link('base', None, 4.0)}{''.join(map(urdf_leg, CORNERS))}</robot>")
     with pytest.raises(
-        ValueError, match=r"mjcf must be an MJCF file, got robot\.urdf, which Python converts: "
+        ValueError, match=r"mjcf must be an MJCF file, got robot\.urdf; convert it in Python: "
     ) as error:
         robot_draft.draft(Path("robot.urdf"))
-    exec(str(error.value).partition("converts: ")[2], {})
+    exec(str(error.value).partition("in Python: ")[2], {})
     Path("robot.xml").write_text(capsys.readouterr().out)
     robot, _ = robot_draft.draft(Path("robot.xml"))
     assert [leg.joints[0] for leg in robot.legs] == ["fl1", "fr1", "rl1", "rr1"]
@@ -310,7 +310,7 @@ def test_the_base_is_not_held(tmp_path):
     """A robot whose own free joint is to be held is told so in a line."""
     path = write_scout(tmp_path)
     path.write_text(path.read_text().replace("<freejoint/>", '<freejoint name="root"/>'))
-    with pytest.raises(ValueError, match="held must name joints of a head, tail or arm, but 'root' is what the base"):
+    with pytest.raises(ValueError, match="held must name joints of a head, tail or arm, but 'root' is the base's free"):
         robot_draft.draft(path, ("root",))
 
 
@@ -320,7 +320,7 @@ def test_looks_that_weigh_are_named(tmp_path):
     path.write_text(
         path.read_text().replace("<freejoint/>", '<freejoint/><geom name="lid" size=".1" contype="0" conaffinity="0"/>')
     )
-    assert any("geom 'lid' touches nothing and adds to the weight" in note for note in robot_draft.draft(path)[1])
+    assert any("geom 'lid' touches nothing but adds to the weight" in note for note in robot_draft.draft(path)[1])
 
 
 LEFT_OUT = {
@@ -330,7 +330,7 @@ LEFT_OUT = {
     ),
     "delay": (
         '<motor joint="knee_fl"/>', '<motor joint="knee_fl" delay="0.01" nsample="4"/>',
-        "the delay of the actuator of joint 'knee_fl' is left out: its torque comes at once",
+        "the delay of the actuator of joint 'knee_fl' is left out: its torque is immediate",
     ),
     "timeconst": (
         '<motor joint="knee_fl"/>', '<general joint="knee_fl" dyntype="filter" dynprm="0.1" ctrlrange="-9 9"/>',
@@ -338,7 +338,7 @@ LEFT_OUT = {
     ),
     "jet": (
         "<actuator>", '<actuator><adhesion name="glue" body="lower_fl" ctrlrange="0 1" gain="3"/>',
-        "actuator 'glue' is left out, for it acts on no joint",
+        "actuator 'glue' is left out because it acts on no joint",
     ),
 }  # fmt: skip
 

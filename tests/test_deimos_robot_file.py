@@ -100,6 +100,18 @@ def test_a_broken_file_is_refused(scout, line, change, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_damaged_copy_of_a_robot_is_refused(tmp_path):
+    """Whatever damage makes the archive's reader raise, here a mark of encryption, it is one ValueError."""
+    path = tmp_path / "robot.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("robot.toml", "")
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"is not a run's copy of a robot: .* is encrypted"), robot_file.opened(path):
+        pass
+
+
 def test_a_run_keeps_its_robot(tmp_path, capsys):
     """Data file, MJCF, includes and meshes are kept in one file; the run goes on from it, bit for bit, without them.
 
@@ -125,7 +137,7 @@ def test_a_run_keeps_its_robot(tmp_path, capsys):
     (tmp_path / "run" / "robot.zip").write_bytes(b"nothing")
     capsys.readouterr()
     assert cli.main(["train", "--resume", str(tmp_path / "run"), "--env-steps", "144"]) == 2
-    assert "is not a robot that a run has kept" in capsys.readouterr().err
+    assert "is not a run's copy of a robot" in capsys.readouterr().err
 
 
 def test_a_robot_that_no_run_could_keep_is_refused(tmp_path):
@@ -159,7 +171,7 @@ def test_a_robot_that_no_run_could_keep_is_refused(tmp_path):
         ),
         (
             ["--env.robot", "light.toml"],
-            "payload must be less than the 0.9 kg of 'chassis', from which it is taken too, got 1; take --env.pa",
+            "payload must be less than the 0.9 kg of 'chassis', since it is also subtracted, got 1; use --env.pa",
         ),
         (["--env.robot", "scout.toml", "--num-envs", "2000000000"], "2000000000 worlds, each at least "),
         (["--env.robot", "bad.toml"], "joint 'abduct_rr' of body 'shoulder_rr' must have a range of angles; give it"),

@@ -201,7 +201,7 @@ def test_study_file_may_name_further_attackers(file, tmp_path):
         study.add_rounds(rounds(description))
     assert [(each.attackers, each.seeds) for each in study.rounds()] == [(("search",), (0,)), (("search",), ())]
     for table, message in (
-        ({"attackers": ["nobody"]}, "There is no attacker 'nobody'"),
+        ({"attackers": ["nobody"]}, "Unknown attacker 'nobody'"),
         ({"attackers": []}, "attackers must be one or more names, got none"),
         ({"attackers": ["search"], "seeds": "x"}, "seeds must be a number of seeds"),
         ({"who": ["search"]}, r"An \[\[attack\]\] has no who; it has: attackers, seeds"),

@@ -9,6 +9,7 @@ import torch
 from deimos.goals.selector import GoalSelector
 from deimos.learn.ppo import PPOConfig
 from deimos.run import audit, training
+from deimos.run.attackers.scripted import Scripted
 from deimos.run.audit import audit_choices, audit_clones
 from deimos.run.oracle import Clones, Oracle
 from deimos.run.trainer import TrainConfig, Trainer
@@ -55,6 +56,17 @@ def test_audited_choices_of_the_oracle_are_the_worst():
         assert len(found.percentile) > 20
         assert least < sum(found.percentile) / len(found.percentile) < most
         assert found.auroc == []
+
+
+def test_goals_of_a_selectors_own_are_judged_too():
+    """Who makes goals instead of picking candidates is measured by these: the worst that a person can think of."""
+    trainer = trained()
+    trainer.ppo.actor = Follower(trainer.env)
+    trainer.loop.selector = trainer.loop.core.selector = Scripted(trainer.env)
+    found = audit_choices(trainer, 64, audit_clones(trainer))
+    assert len(found.percentile) > 20
+    assert sum(found.percentile) / len(found.percentile) > 75
+    assert torch.equal(found.chosen.abs(), torch.ones_like(found.chosen))
 
 
 def test_a_curriculum_chooses_from_its_range():

@@ -146,7 +146,7 @@ def test_a_cell_begins_where_the_run_ended(origin, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"train": {"num_envs": 64}}, "Environment 'after' cannot branch off .*: num_envs must be 32, as it was there"),
+        ({"train": {"num_envs": 64}}, "Environment 'after' cannot branch off .*: num_envs must be 32, as in"),
         ({"environment": [{"name": "a", "preset": "particle"}]}, "preset and branch_from cannot be combined"),
         ({"branch_from": 3}, "branch_from must be a text, got 3"),
         ({"branch_from": "nowhere"}, "nowhere"),

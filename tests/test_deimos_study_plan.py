@@ -109,7 +109,7 @@ train = { num_envs = 8, ppo = { epochs = 2 } }
     other = toml.replace("{ terrain", '{ kind = "particle", terrain')
     with pytest.raises(RunError, match=r"Environment 'hills': preset 'quad' is for quad, not for particle"):
         plan.expand(described(tmp_path, other))
-    with pytest.raises(RunError, match=r"Environment 'hills': There is no preset 'quat'; there are: .*quad"):
+    with pytest.raises(RunError, match=r"Environment 'hills': Unknown preset 'quat'; choose from: .*quad"):
         plan.expand(described(tmp_path, toml.replace('"quad"', '"quat"')))
 
 

@@ -374,4 +374,4 @@ def test_broken_run_is_one_line_of_a_worker(whole, tmp_path, capsys):
     (run / "checkpoint.pt").write_text("not a checkpoint")
     (run / "config.json").write_text("{}")
     assert worker.main([str(study.path), cell.name]) == 2
-    assert capsys.readouterr().err == f"{Path(run) / 'config.json'} is not that of a run of schema 1.\n"
+    assert capsys.readouterr().err == f"{Path(run) / 'config.json'} does not belong to a run of schema 1.\n"

@@ -180,7 +180,7 @@ def test_smaller_budget_is_refused(undisturbed, capsys):
     """A resumed run takes no smaller budget, and the refusal changes nothing."""
     before = files(undisturbed)
     assert cli.main(["train", "--resume", str(undisturbed), "--env-steps", "479"]) == 2
-    assert "--env-steps must exceed the 480 already set, got 479" in capsys.readouterr().err
+    assert "--env-steps must be at least the 480 already set, got 479" in capsys.readouterr().err
     assert files(undisturbed) == before
 
 
@@ -429,7 +429,7 @@ def test_checkpoint_of_another_task_is_refused(undisturbed, other):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"hidden": (16, 8)}, "size mismatch"), ({"activation": "tanh"}, "ppo.activation must be relu, as it was there")],
+    [({"hidden": (16, 8)}, "size mismatch"), ({"activation": "tanh"}, "ppo.activation must be relu, as in the origin")],
 )
 def test_init_from_refuses_other_networks(undisturbed, tmp_path, change, message):
     """Networks of another size, or that would compute something else, are refused, and no folder is made."""

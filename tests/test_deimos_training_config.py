@@ -121,5 +121,5 @@ def test_a_preset_is_a_training_configuration():
         assert presets.environment(name) == name
     for name in presets.names():
         assert kind(presets.preset(name).env) == presets.environment(name)
-    with pytest.raises(ValueError, match=r"no preset 'nonsense'; there are: .*particle"):
+    with pytest.raises(ValueError, match=r"Unknown preset 'nonsense'; choose from: .*particle"):
         presets.preset("nonsense")

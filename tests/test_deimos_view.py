@@ -145,13 +145,13 @@ def test_a_policy_stays_with_its_shield(shielded, tmp_path, caplog):
     for each in (session, other):
         each.step()
     assert torch.equal(session.env.obs, other.env.obs)
-    with pytest.raises(RunError, match="was made for an earlier policy; make it again by deimos shield"):
+    with pytest.raises(RunError, match="was made for an earlier policy; make it again with deimos shield"):
         Session(SavedRun.open(path), 1, seed=5, shield="stop")
 
 
 def test_a_shield_that_is_not_there_is_one_line(bold):
     """A run without a shield says how to make one."""
-    with pytest.raises(RunError, match=r"has no shield; make one by deimos shield\."):
+    with pytest.raises(RunError, match=r"has no shield; make one with deimos shield\."):
         Session(SavedRun.open(bold), 1, seed=5, shield="stop")
 
 
@@ -214,6 +214,8 @@ def test_an_attacker_can_choose_and_lends_its_fear(scared, tmp_path):
     del state["loop"]["selector"]["fear"]
     torch.save(state, run / "checkpoint.pt")
     told = []
+    with pytest.raises(RunError, match="goal_period must be at least 1, got 0"):
+        SavedRun.open(run, goal_period=0)
     saved = SavedRun.open(run)
     attacks, afraid = prepare(saved, ["argmax", "scripted"], 32, lambda stage, share: told.append((stage, share)))
     assert told[-1][0] == "argmax"
@@ -361,7 +363,7 @@ def test_a_video_is_recorded_meanwhile(scared, tmp_path):
     ("arguments", "message"),
     [
         (["--goals", "argmax"], "Unknown value 'argmax' for --goals; choose from: uniform, p75, and with --attackers"),
-        (["--attackers", "nobody"], "There is no attacker 'nobody'"),
+        (["--attackers", "nobody"], "Unknown attacker 'nobody'"),
         (["--pool", "a.pt"], "pool is the file of the attacker pooled; add --attackers pooled"),
         (["--attackers", "argmax", "pooled", "--pool", "a.pt"], "a.pt cannot be read (No such file or directory)"),
         (["--attackers", "pooled"], "pool must be a file of deimos pool for the attacker pooled, got none"),
@@ -383,7 +385,7 @@ def test_what_cannot_be_shown_is_one_line(scared, tmp_path, monkeypatch, capsys,
     ("arguments", "message"),
     [
         ("--goals argmx --attackers argmax", "Unknown value 'argmx' for --goals"),
-        ("--shield stop --attackers argmax", "has no shield; make one by deimos shield"),
+        ("--shield stop --attackers argmax", "has no shield; make one with deimos shield"),
         ("--record none/x.mp4 --attackers argmax", "The folder none does not exist; make it first"),
         ("--record x.avi --attackers argmax", "video must end in one of .mp4,"),
     ],
@@ -418,7 +420,7 @@ def test_a_policy_of_another_environment_is_one_line(scared, bold, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(scared, run)
     shutil.copy(WALK / "policy.pt", run / "policy.pt")
-    with pytest.raises(RunError, match=r"one of another environment: it observes linear_velocity.*here is velocity"):
+    with pytest.raises(RunError, match=r"belongs to another environment: it observes linear_velocity.*not velocity"):
         session_of(run)
 
 

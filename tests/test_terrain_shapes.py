@@ -242,7 +242,7 @@ def test_every_number_is_checked(name):
 @pytest.mark.parametrize(
     ("name", "parameters", "message"),
     [
-        ("stairs", {}, r"There is no shape 'stairs'; there are: discrete, flat, .*stairs-down, stairs-up"),
+        ("stairs", {}, r"Unknown shape 'stairs'; choose from: discrete, flat, .*stairs-down, stairs-up"),
         ("gap", {"step": 1}, r"gap has no parameter 'step'; it has: tile, platform, width, depth"),
         ("stairs-up", {"direction": "down"}, r"stairs-up has no parameter 'direction'"),
         ("gap", {"width": 0.3}, r"gap: width must be 2 numbers, got 0.3"),

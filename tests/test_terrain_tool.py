@@ -148,7 +148,7 @@ def test_ground_from_elsewhere_becomes_everything(folder, capsys):
     [
         ("nowhere.stl", "nowhere.stl could not be read or written (No such file or directory)"),
         ("notes.txt", "A file to import must end in one of .glb, .obj"),
-        ("broken.png", "broken.png cannot be imported: it is no picture, or it is broken"),
+        ("broken.png", "broken.png cannot be imported: it is not a picture, or it is broken"),
         ("flat.npy --resolution 0", "resolution must be finite and positive, got 0.0"),
         ("flat.npy --height-range 0 1", "height_range does not apply to flat.npy"),
         ("flat.npy --out there.npz", "there.npz exists and is not overwritten"),
@@ -253,15 +253,15 @@ def test_force_overwrites_and_nothing_else_does(folder, capsys):
         ("shape flat --difficulty nan", "difficulty must be in [0, 1], got nan"),
         ("grid --difficulty 0 2", "hardest must be in [0, 1], got 2.0"),
         ("shape stairs", "Unknown command 'terrain shape stairs'; choose from: discrete, flat, gap"),
-        ("grid --shapes flat stair", "There is no shape 'stair'; there are: discrete, flat, gap"),
-        ("grid --preset go2", "There is no preset 'go2'; there are: go1, legged-gym"),
+        ("grid --shapes flat stair", "Unknown shape 'stair'; choose from: discrete, flat, gap"),
+        ("grid --preset go2", "Unknown preset 'go2'; choose from: go1, legged-gym"),
         ("shape pit --tile 3", "platform must be smaller than tile = 3 m, got 4 m"),
         ("grid --tile 2", "platform must be smaller than tile = 2 m, got 3 m"),
         ("shape stairs-up --max-step 0.1", "max_step is 0.1 m, but stairs-up at difficulty 0.5 has steps of 0.14 m"),
         ("grid --preset legged-gym --max-step 0.2", "has steps of 0.212 m; lower them or raise max_step"),
         ("shape flat --cell 0.3", "cell must divide tile = 8 m, got 0.3 m"),
         ("shape flat --cell 0", "cell must be finite and positive, got 0.0"),
-        ("shape flat --cell 0.0001", "cell must be at least 0.000488 m for 16384 cells along an axis at most"),
+        ("shape flat --cell 0.0001", "cell must be at least 0.000488 m for at most 16384 cells along an axis"),
         ("shape flat --out here.npz", "here.npz exists and is not overwritten; choose another name, or add --force"),
         ("shape flat --out a.stl b.xyz", "out must end in one of .glb, .obj, .ply, .stl, .npz, .png, got b.xyz"),
         ("shape flat --out noending", "out must end in one of .glb, .obj, .ply, .stl, .npz, .png, got noending"),
@@ -309,7 +309,7 @@ def test_grid_that_does_not_fit_is_refused(folder, capsys, monkeypatch):
     """A grid beyond the free memory says how much it needs, and writes nothing."""
     monkeypatch.setattr("deimos.terrain.world._free_memory", lambda: 2**27)
     assert run("grid", "--out", "a.npz") == 2
-    assert "needs about 1.0 GiB of memory and 0.1 GiB are free; enlarge cell" in capsys.readouterr().err
+    assert "needs about 1.0 GiB of memory, but 0.1 GiB are free; enlarge cell" in capsys.readouterr().err
     assert not list(folder.iterdir())
 
 

@@ -1,1 +1,1 @@
-"""The learner: PPO, its rollouts, the policy that it leaves behind."""
+"""The learner: PPO, its rollouts and the trained policy."""

@@ -1,4 +1,4 @@
-"""A trained policy in one file: weights, statistics of a normaliser, observation scaling and layout."""
+"""A trained policy in one file: weights, normaliser statistics, observation scaling and layout."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -17,12 +17,12 @@ SCHEMA = 1
 
 
 class Policy(nn.Module):
-    """Physical observations to the deterministic (mean) actions of the trained policy.
+    """Maps physical observations to the trained policy's deterministic (mean) actions.
 
     Attributes:
-        layout: What stands where in the observation, with units.
-        goal_slice: Where the goal stands.
-        dt: Duration of a step [s]; 1 where the world has no seconds.
+        layout: Fields of the observation, with units.
+        goal_slice: Components of the observation that hold the goal.
+        dt: Duration of a step [s]; 1 where the environment has no seconds.
     """
 
     scale: Tensor
@@ -78,13 +78,13 @@ def load_policy(path: Path | str, device: str = "cpu") -> Policy:
 
     Args:
         path: A ``policy.pt``, or the run folder that holds one.
-        device: Where it shall act, one of torch's.
+        device: Torch device that it runs on.
 
     Raises:
         RunError: If there is no policy.
-        RuntimeError, AssertionError: If there is no such device; the words are torch's.
+        RuntimeError, AssertionError: If there is no such device; the message is torch's.
     """
-    torch.empty(0, dtype=torch.float32, device=device)  # raises here: below it would be taken for a fault of the file
+    torch.empty(0, dtype=torch.float32, device=device)  # raises here: below it would look like a fault of the file
     path = Path(path)
     path = path / "policy.pt" if path.is_dir() else path
     data = load_tensors(path, "policy", SCHEMA)

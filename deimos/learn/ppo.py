@@ -26,7 +26,7 @@ from deimos.nn.ranks import gather_rows, own_transitions, place, sum_over_ranks
 from deimos.nn.seeds import generator
 from deimos.nn.stateful import Stateful
 
-LEARNING_RATE_RANGE = (1e-5, 1e-2)  # what the adaptive schedule may reach; rsl_rl's
+LEARNING_RATE_RANGE = (1e-5, 1e-2)  # bounds of the adaptive schedule; rsl_rl's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class PPOConfig:
     epochs: int = 5
     """Passes over every rollout, at least 1."""
     minibatches: int = 4
-    """Parts that a rollout is split into, at least 1. What does not divide evenly is left out."""
+    """Parts that a rollout is split into, at least 1. A remainder is left out."""
     learning_rate: float = 1e-3
     """Initial learning rate of Adam, positive."""
     desired_kl: float = 0.01
@@ -61,17 +61,17 @@ class PPOConfig:
     max_grad_norm: float = 1.0
     """Norm that the gradient of each network is clipped to, positive."""
     reward_scale: float = 0.01
-    """What rewards are multiplied by for learning, positive. 1 - gamma makes returns of order 1, within
-    reach of the clipped value loss."""
+    """Factor on rewards for learning, positive. 1 - gamma makes returns of order 1, within reach of the clipped value
+    loss."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers of the actor and of the critic."""
     activation: Activation = "relu"
-    """Between the layers."""
+    """Activation between the layers."""
     init_std: float = 1.0
     """Standard deviation that the policy starts with, in units of the action, positive."""
     normalize_observations: bool = False
-    """Whether actor and critic see observations less their running mean, in units of their running standard deviation.
-    The statistics are part of the trained policy, and fixed in it."""
+    """Whether actor and critic see observations minus their running mean, in units of their running standard
+    deviation. The statistics are part of the trained policy, and fixed in it."""
 
     def __post_init__(self) -> None:
         for name in ("num_steps", "epochs", "minibatches"):
@@ -88,10 +88,10 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions to learn from, one per column: what is one per row elsewhere then lies end to end."""
+    """Transitions to learn from, one per column, so that every component is contiguous in memory."""
 
     table: Tensor
-    """Observations as the networks are given them, actions, means of the policy that acted, log-probability under it,
+    """Observations as the networks receive them, actions, means of the policy that acted, log-probability under it,
     normalised advantage, weight, value before the update and target, shape (obs_dim + 2 action_dim + 5, n)."""
     obs_dim: int
     """Components of an observation."""
@@ -117,14 +117,14 @@ class PPO(Stateful):
 
     Args:
         config: How they learn.
-        num_envs: Number of worlds; where several ranks share a run, of those of each.
+        num_envs: Number of worlds; of each rank, where several share a run.
         obs_dim: Components of an observation.
         action_dim: Components of an action.
-        device: Where they live.
+        device: Device of the networks.
         seed: Seed of the weights, the exploration and the order of the minibatches, in [0, 2^32).
         actor_sees: What the actor sees of an observation.
         critic_sees: What the critic sees of it.
-        record: Who records what is learnt from all minibatches of a rollout, to replay it; ``None`` for nobody.
+        record: Records the learning from all minibatches of a rollout, to replay it; ``None`` records nothing.
 
     Raises:
         ValueError: If there are more minibatches than transitions in a rollout.
@@ -159,9 +159,8 @@ class PPO(Stateful):
             for module, part in zip((self.actor, self.critic), memory.split(sizes, dim=1), strict=True)
         )
         self._parameters, self._grad = memory
-        self._critic_part = slice(sizes[0], None)
         self.learning_rate = torch.tensor(config.learning_rate, dtype=torch.float32, device=device)
-        self.optimizer = Adam(self._parameters, self._grad, self.learning_rate)
+        self.optimizer = Adam(self._parameters, self._grad, self.learning_rate, late=sizes[0])
         shape = obs_dim + 2 * action_dim + 5, rows
         self._batch, self._shuffled = (
             Batch(torch.zeros(shape, dtype=torch.float32, device=device), obs_dim) for _ in range(2)
@@ -181,15 +180,15 @@ class PPO(Stateful):
         )  # fmt: skip
 
     def draw_noise(self, noise: Tensor, first_step: int | Tensor, env_offset: int = 0) -> None:
-        """Draw the exploration of a whole rollout; a world's number depends on the seed, the world and the step alone.
+        """Draw the exploration noise of a rollout; a world's numbers depend only on the seed, the world and the step.
 
         Args:
             noise: Standard normal draws, shape (num_steps, num_envs, action_dim). Written.
-            first_step: Steps that every world has taken before, below 2^32 - num_steps; a tensor of no axes, int64,
-                where it is to be read on the device.
+            first_step: Steps that every world has taken before, below 2^32 - num_steps; a zero-dimensional int64 tensor
+                to have it read on the device.
             env_offset: Global number of world 0.
         """
-        size = max(1, 2**17 // len(self._worlds))  # steps at a time whose words stay within a core's caches
+        size = max(1, 2**17 // len(self._worlds))  # steps at a time, so that their words stay within a core's caches
         for start in range(0, len(noise), size):
             part = noise[start : start + size]
             steps = (torch.arange(start, start + len(part), device=noise.device) + first_step).unsqueeze(1)
@@ -215,7 +214,7 @@ class PPO(Stateful):
         return self._critic.forward(self._inputs(obs.flatten(0, -2))[:, self._critic_sees]).view(obs.shape[:-1])
 
     def _inputs(self, obs: Tensor, out: Tensor | None = None) -> Tensor:
-        """What the networks are given of observations, shape (n, obs_dim); normalised in ``out`` if it is given."""
+        """What the networks receive for observations, shape (n, obs_dim); normalised into ``out`` if it is given."""
         return obs if self.actor.normalizer is None else self.actor.normalizer(obs, out)
 
     @torch.no_grad()
@@ -227,17 +226,16 @@ class PPO(Stateful):
 
         Args:
             rollout: What the current policy did.
-            order: The order that the transitions of all ranks are split into minibatches in, int64,
+            order: The order in which the transitions of all ranks are split into minibatches, int64,
                 shape (num_steps * all worlds,); ``None`` draws one.
             critic: The value function to use as the baseline, from observations of shape (..., obs_dim) to values
-                in units of scaled rewards; ``None`` for PPO's own. Somebody else trains it, and PPO's own learns
-                nothing then.
+                in units of scaled rewards; ``None`` for PPO's own. With a given one, PPO trains no critic.
             learn_policy: Whether the policy learns, its normaliser included.
 
         Returns:
             Averages over all minibatches: ``value_loss``, ``surrogate_loss``, ``kl``; and, after the
-            update, ``entropy``, ``learning_rate``, ``action_std``, ``explained_variance``. Where fewer transitions
-            count than a minibatch has, nothing is learnt and the first three are NaN.
+            update, ``entropy``, ``learning_rate``, ``action_std``, ``explained_variance``. If fewer transitions
+            have weight than a minibatch holds, nothing is learnt and the first three are NaN.
         """
         explained = self.batch(rollout, critic)[1]
         if order is None:
@@ -248,10 +246,10 @@ class PPO(Stateful):
         learns = learn_policy or critic is None
         if learns and self._has_enough(rollout.weight):
             options = {"policy": learn_policy, "value": critic is None}
-            key = tuple(options.values()) if place().size == 1 else None  # what ranks send each other is not recorded
+            key = tuple(options.values()) if place().size == 1 else None  # communication between ranks is not recorded
             value_loss, surrogate_loss, kl = self._fit(partial(self._fit_batch, **options), key).tolist()
         if learn_policy and self.actor.normalizer is not None:
-            # Only now: the policy that acted is the one that learning starts from.
+            # Only now: learning must start from the policy that acted.
             for obs, weight in zip(rollout.obs[:-1], rollout.weight, strict=True):
                 self.actor.normalizer.update(obs, (weight > 0).float())
         entropy = self.actor.std.log().sum() + len(self.actor.std) * 0.5 * math.log(2 * math.pi * math.e)
@@ -267,7 +265,7 @@ class PPO(Stateful):
         }
 
     def _has_enough(self, weight: Tensor) -> bool:
-        """Whether as many transitions count as a minibatch has, however little each, and more than one in all."""
+        """Whether a minibatch's number of transitions has any weight, and the weights add up to more than 1."""
         count, total = sum_over_ranks(torch.stack([(weight > 0).sum(dtype=torch.float64), weight.sum().double()]))
         return bool((count >= self._size) & (total > 1.0))
 
@@ -276,7 +274,7 @@ class PPO(Stateful):
         """Advantages, value targets and old log-probabilities of a rollout; and the share of variance explained.
 
         The networks have not changed since the rollout, so values and log-probabilities are
-        computed here at once and not step by step. The next call overwrites them.
+        computed here all at once instead of step by step. The next call overwrites the batch.
         """
         value = rollout.estimate(critic or self.value)
         advantage = rollout.advantage
@@ -299,9 +297,9 @@ class PPO(Stateful):
         return self._batch, explained
 
     def _fit_batch(self, *, policy: bool, value: bool) -> Tensor:
-        """Learn from the last batch in the last order; returns means of ``_learn`` over all minibatches.
+        """Learn from the last batch in the last order; return means of ``_learn`` over all minibatches.
 
-        It reads and writes what stays where it is, and waits for nothing: see ``deimos.nn.graphs``.
+        It reads and writes tensors that stay in place, and never waits for the device: see ``deimos.nn.graphs``.
         """
         std = self.actor.std.clone()
         minibatches = self._minibatches(self._batch, self._order)
@@ -313,10 +311,10 @@ class PPO(Stateful):
         return totals / (self.config.epochs * self.config.minibatches)
 
     def _minibatches(self, batch: Batch, order: Tensor) -> list[Batch]:
-        """Parts of a batch in another order, each with weights that add up to 1 over all ranks."""
+        """Parts of a batch in the given order, each with weights that add up to 1 over all ranks."""
         count, num_envs = self.config.minibatches, self._sizes[0]
         rows, own = own_transitions(order[: self._size * count].view(count, self._size), num_envs)
-        table = self._shuffled.table.resize_(len(batch.table), rows.numel())  # ranks have unequal shares each time
+        table = self._shuffled.table.resize_(len(batch.table), rows.numel())  # a rank's share differs each time
         torch.index_select(batch.table, 1, rows.flatten(), out=table)
         weight = table[-3].view_as(rows)
         if own is not None:
@@ -325,7 +323,7 @@ class PPO(Stateful):
         return [Batch(part, batch.obs_dim) for part in table.split(rows.shape[1], dim=1)]
 
     def _learn(self, minibatch: Batch, old_std: Tensor, *, learn_value: bool = True) -> Tensor:
-        """One step of Adam; returns value loss, surrogate loss and KL divergence, shape (3,)."""
+        """Make one step of Adam; return value loss, surrogate loss and KL divergence, shape (3,)."""
         config, std = self.config, self.actor.std
         assert std.grad is not None
         work: list[tuple[MLPs, Tensor, Loss]]
@@ -353,12 +351,12 @@ class PPO(Stateful):
         return self._critic, minibatch.obs[:, self._critic_sees], ValueLoss(minibatch.value, clip)
 
     def _learn_value(self, minibatch: Batch) -> Tensor:
-        """``_learn`` for the critic alone; of a policy that stays there is neither a loss nor a divergence."""
+        """``_learn`` for the critic alone; surrogate loss and KL divergence are NaN."""
         (loss,) = gradients(self._value_work(minibatch))
         sum_over_ranks(self._critic.grad, loss)
         self._critic.grad *= self.config.value_coef
         self._critic.clip_gradient(self.config.max_grad_norm)
-        self.optimizer.step(self._critic_part)
+        self.optimizer.step(without_late=True)
         return torch.stack([loss[0, 0], *loss.new_full((2,), math.nan)])
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
@@ -379,7 +377,7 @@ class PPO(Stateful):
         self.critic.load_state_dict(state["critic"])
 
     def load_learnt(self, state: dict) -> None:
-        """Load what was learnt: networks, statistics of observations, and the optimiser's of gradients.
+        """Load what was learnt: networks, observation statistics and the optimiser's gradient statistics.
 
         Raises:
             KeyError: If something is missing.

@@ -1,4 +1,4 @@
-"""What happened in every world over a few steps, in memory allocated once, and what it was worth."""
+"""The transitions of every world over a few steps, in memory allocated once, and their advantages."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +12,7 @@ from deimos.nn.returns import advantages
 class Rollout:
     """The transitions of ``num_steps`` steps of every world.
 
-    Shapes are (num_steps, num_envs, ...) but for ``obs``, which has one more step: the observation
+    Shapes are (num_steps, num_envs, ...) except for ``obs``, which has one more step: the observation
     that the next rollout starts from. Where an episode ended, ``obs[t + 1]`` is the one after the reset.
 
     Args:
@@ -20,10 +20,10 @@ class Rollout:
         num_envs: Number of worlds.
         obs_dim: Components of an observation.
         action_dim: Components of an action.
-        device: Where everything lies.
+        device: Device of all tensors.
         discount: Weight of the next step's reward (gamma), in [0, 1].
         gae_lambda: lambda of the advantages, in [0, 1].
-        reward_scale: What rewards are multiplied by before they are valued.
+        reward_scale: Factor on rewards in the advantages.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Rollout:
         self.truncated = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
         self.last_obs = torch.empty(num_steps, n, obs_dim, dtype=torch.float32, device=device)
         """Observations that steps ended in, before any reset; only those of steps that truncated a world are written,
-        and a CPU gives memory to no others."""
+        and on a CPU only those take memory."""
         self.advantage = zeros(num_steps, n)
         """Advantages in units of scaled rewards, before they are normalised; see ``estimate``."""
         self.invalid = torch.zeros(num_steps, n, dtype=torch.bool, device=device)
@@ -60,7 +60,7 @@ class Rollout:
         self, t: int, *, obs: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, invalid: Tensor,
         weight: Tensor, cut_off: Tensor,
     ) -> None:  # fmt: skip
-        """Copy what step ``t`` gave back.
+        """Copy what step ``t`` returned.
 
         Args:
             t: Index of the step, in [0, num_steps).
@@ -68,9 +68,9 @@ class Rollout:
             reward: Rewards, shape (num_envs,).
             terminated: True where the world crashed, bool, shape (num_envs,).
             truncated: True where the episode was cut off without a crash, bool, shape (num_envs,).
-            invalid: True where the state is not physical any more, bool, shape (num_envs,).
+            invalid: True where the state is no longer physical, bool, shape (num_envs,).
             weight: Weight of every world's transition, shape (num_envs,).
-            cut_off: Worlds, int64, shape (m,), among them all in which ``truncated`` is true.
+            cut_off: Worlds, int64, shape (m,), including all in which ``truncated`` is true.
         """
         kinds = 3 if len(cut_off) else 2
         torch._foreach_copy_(self._numbers[t][:kinds], (reward, weight, obs)[:kinds])  # a GPU copies all at once

@@ -1,4 +1,4 @@
-"""What runs ``kernels.mlp`` for ``MLPs``: memory, jobs, and threads that share them."""
+"""Run ``kernels.mlp`` for ``MLPs``: memory, jobs, and threads that share them."""
 
 import ctypes
 import itertools
@@ -15,15 +15,15 @@ from deimos.kernels.mlp import ACTIVATIONS, STEP, Job, Mode, Shape, record
 from deimos.nn.losses import Loss, Surrogate, ValueLoss, by_outputs
 from deimos.nn.threads import POOL, available
 
-BLOCK_ROWS = 384  # rows of a block: the more, the less it costs to sum a gradient over the lanes of a register
+BLOCK_ROWS = 384  # rows of a block: with more, summing a gradient over the lanes of a register costs less
 BLOCK_SIZE = 3 * 2**17  # numbers in a block, 1.5 MiB: what a core's caches hold
-PARTS = 16  # of the rows of all networks together, each with a gradient of its own
+PARTS = 16  # of the rows of all networks together, each with its own gradient
 MIN_OPERATIONS = 1e7  # operations that are worth waking a thread for, about 100 us
 
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Keep Warp's report of its start, and of what it loads, off the terminal: its host may not know that we use it."""
+    """Keep Warp's messages about its start and the modules it loads off the terminal: the host may not know of it."""
     level = wp.config.log_level
     wp.config.log_level = max(level, wp.LOG_WARNING)
     try:
@@ -39,13 +39,13 @@ class Kernel:
         units: Inputs, and outputs of every layer.
         activation: One of ``ACTIVATIONS``.
         weights: Where every layer's weights start among a network's parameters.
-        free: Where the parameters that belong to no layer lie.
+        free: Which parameters belong to no layer.
         parameters: Shape (K, numbers), float32.
-        grad: The same of the gradient, which ``gradients`` writes.
+        grad: The gradient, of the same shape, which ``gradients`` writes.
     """
 
     @_quietly()
-    @torch.inference_mode(False)  # what is made in a loop without gradients shall also be used outside it
+    @torch.inference_mode(False)  # what is made in inference mode must also be usable outside it
     def __init__(
         self, units: Sequence[int], activation: str, weights: Sequence[int], free: slice,
         parameters: Tensor, grad: Tensor,
@@ -68,7 +68,7 @@ class Kernel:
         self._gradient = torch.zeros(0, dtype=torch.float32)
         self._counter = ctypes.c_int32()
         self._jobs = jobs = wp.zeros(1, dtype=Job, device="cpu")
-        # A view of that memory; ctypes' costs least of all, and every minibatch fills in 30 fields.
+        # A view of that memory; ctypes is cheapest, and every minibatch fills in 30 fields.
         self._job = np.ctypeslib.as_ctypes_type(jobs.numpy().dtype).from_address(jobs.ptr)
         self._fill(
             count=count, block_rows=self._block_rows, stride=stride, counter=ctypes.addressof(self._counter),
@@ -84,10 +84,10 @@ class Kernel:
         """Outputs of all networks, shape (K, n, outputs).
 
         Args:
-            x: Inputs, shape (n, inputs) or (K, n, inputs); the last ones, where the others' share is in ``start``.
+            x: Inputs, shape (n, inputs) or (K, n, inputs); only the last ones if ``start`` has the others' share.
             start: What the first layer's sums start from instead of its biases, shape (K, n / shared, units).
-            shared: Consecutive rows that start from the same.
-            out: Where outputs shall lie, contiguous; ``None`` allocates it.
+            shared: Consecutive rows that share a start.
+            out: Memory for the outputs, contiguous; ``None`` allocates it.
         """
         rows = x.shape[-2]
         y = torch.empty(len(self._parameters), rows, self._outputs, dtype=torch.float32) if out is None else out
@@ -99,7 +99,7 @@ class Kernel:
         return y
 
     def _prepare(self, mode: Mode, x: Tensor, parts: int) -> None:
-        """Fill in what every job has."""
+        """Fill in what every job needs."""
         self._counter.value = 0
         net = x.stride(0) if x.dim() == 3 and len(x) > 1 else 0
         self._fill(
@@ -108,9 +108,10 @@ class Kernel:
         )  # fmt: skip
 
     def prepare_gradient(self, mode: Mode, x: Tensor, data: Tensor, sums: int = 0, clip: float = 0.0) -> float:
-        """Fill in a job that adds up gradients; gives its operations.
+        """Fill in a job that adds up gradients; return the number of its operations.
 
-        ``data`` are the loss's, or gradients by outputs, shape (K, columns, n); ``sums`` says how many the loss has.
+        ``data`` is the loss's, or gradients with respect to outputs, shape (K, columns, n); ``sums`` is how many sums
+        the loss has.
         """
         rows, count = x.shape[-2], len(self._parameters)
         parts = max(1, min(-(-rows // self._block_rows), max(4, PARTS // count)))
@@ -126,7 +127,7 @@ class Kernel:
         return 3.0 * rows * self._operations
 
     def collect(self) -> Tensor:
-        """Write the gradient of what has been run, added up in the order of the parts; gives the loss's sums."""
+        """Write the gradient of what has been run, added up in the order of the parts; return the loss's sums."""
         total = self._gradient.sum(1)
         self._grad.copy_(total[:, : self._size])
         return total[:, self._size :]
@@ -153,10 +154,10 @@ def gradients(work: list[tuple[Kernel, Tensor, Loss]]) -> list[Tensor]:
 
 
 def _run(kernels: list[Kernel], operations: float) -> None:
-    """Run what has been prepared, on as many threads as it is worth."""
+    """Run the prepared jobs on as many threads as are worth waking."""
 
     def work(thread: int) -> None:
         for kernel in kernels:
-            kernel._launches[thread].launch()  # Python's lock is free meanwhile
+            kernel._launches[thread].launch()  # without Python's lock
 
     POOL.run(work, max(1, min(min(kernel._threads for kernel in kernels), int(operations / MIN_OPERATIONS))))

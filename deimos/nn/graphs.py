@@ -1,8 +1,8 @@
-"""Work on a device that is recorded once and replayed, as a CUDA graph is; and numbers that may change meanwhile.
+"""Work on a device that is recorded once and replayed, as a CUDA graph is, and numbers that may change in between.
 
-A graph repeats the calls that Python made while it was recorded, with the arguments that they had: tensors by their
-addresses, numbers by their values. So whatever changes from one time to the next must be a tensor that is written in
-place, what Python decides by must be in the key of the graph, and what Python counts must be counted without it.
+A graph repeats the calls that Python made while it was recorded, with the same arguments: tensors by address, numbers
+by value. So whatever changes from one replay to the next must be a tensor that is written in place, whatever Python
+branches on must be in the graph's key, and whatever Python counts must be counted outside the graph.
 """
 
 from collections.abc import Callable, Hashable
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 class Recording(Protocol[T]):
-    """Calls that were recorded."""
+    """Recorded calls."""
 
     result: T
     """What the work returned while it was recorded: tensors that every replay overwrites."""
@@ -24,16 +24,16 @@ class Recording(Protocol[T]):
 
 
 Recorder = Callable[[Callable[[], Any]], Recording[Any]]
-"""Runs work once while it records what the device is asked to do; that is done only when it is replayed."""
+"""Runs work once and records what it asks the device to do; the device does it only when it is replayed."""
 
 
 class Recorded(Generic[T]):
     """Work that is recorded when it is asked for a second time, and replayed from then on.
 
-    The first time it runs as it is, which compiles kernels and allocates what is kept.
+    The first time it runs directly, which compiles kernels and allocates what is kept.
 
     Args:
-        record: Who records; ``None`` for nobody, so that it runs as it is every time.
+        record: The recorder; with ``None`` the work runs directly every time.
     """
 
     def __init__(self, record: Recorder | None) -> None:
@@ -47,15 +47,15 @@ class Recorded(Generic[T]):
         Args:
             work: The same every time. It reads and writes tensors that stay where they are, and does not wait for the
                 device.
-            key: What Python decides by within; when it is another one, the work is recorded anew. ``None`` where it
+            key: What Python branches on in ``work``; when it changes, the work is recorded again. ``None`` where it
                 cannot be recorded.
-            replayed: Counts what Python counts in ``work``, which a replay does not run.
+            replayed: Called after every replay but the first, to count what Python counts in ``work``.
         """
         if self._record is None or key is None or key != self._key:
             self._key, self._recording = key, None
             return work()
         if self._recording is None:
-            self._recording = self._record(work)  # Python has counted then, and the device has done nothing
+            self._recording = self._record(work)  # now Python has counted, but the device has done nothing
             self._recording.replay()
         else:
             self._recording.replay()
@@ -64,10 +64,10 @@ class Recorded(Generic[T]):
 
 
 class Mirrored:
-    """A number of an object's that Python sets, and recorded work reads as a tensor on the device; a descriptor.
+    """Descriptor of a number that Python sets and recorded work reads as a tensor on the device.
 
     Args:
-        tensor: Name of the object's attribute that holds the tensor, of no axes.
+        tensor: Name of the attribute that holds the zero-dimensional tensor.
     """
 
     def __init__(self, tensor: str) -> None:
@@ -82,4 +82,4 @@ class Mirrored:
     def __set__(self, instance: Any, value: float) -> None:
         vars(instance)[self._name] = value
         tensor: Tensor = getattr(instance, self._tensor)
-        tensor.fill_(value)  # on CUDA an argument of a kernel, and no copy
+        tensor.fill_(value)  # on CUDA an argument of a kernel, not a copy

@@ -1,4 +1,4 @@
-"""Settings of torch that belong to the program around us, and change neither our numbers nor where they lie."""
+"""Torch settings of the host program, which must change neither our numbers nor their device."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -12,11 +12,11 @@ DEVICES = ("cpu", "cuda")  # whose autocast may be on
 def own_settings() -> Iterator[None]:
     """Compute in the precision and on the devices that the code names, whatever the host prefers; also a decorator.
 
-    Whatever a host's loop calls runs under it. Autocast is off, and what names no device lies on the CPU, in this
-    thread and until the context ends. The default dtype is no thread's own, so nobody changes it here: whoever makes a
-    tensor names its dtype.
+    Everything that a host's loop calls runs under it. In this thread, until the context ends, autocast is off and
+    tensors for which no device is named are on the CPU. The default dtype is shared by all threads, so it is not
+    changed here: code that makes a tensor names its dtype.
     """
-    with ExitStack() as stack:  # nothing is entered, and nothing is slower, where the host has no such preference
+    with ExitStack() as stack:  # where the host has no such settings, nothing is entered and nothing costs time
         for device in DEVICES:
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))

@@ -1,4 +1,4 @@
-"""What stands where in an observation: environments lay it out, policies carry it with them."""
+"""The layout of an observation: environments define it, policies carry it with them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ObsField:
-    """A run of components of the observation."""
+    """Consecutive components of an observation."""
 
     name: str
     size: int
@@ -18,11 +18,11 @@ class ObsField:
     scale: float | tuple[float, ...]
     """The policy sees the physical value times this; one number for all components or one for each."""
     seen_by: Literal["both", "actor", "critic"] = "both"
-    """Who sees it; what only the critic sees is privileged, for a simulator alone. The goal is seen by both."""
+    """Who sees it; what only the critic sees is privileged: only a simulator knows it. Both see the goal."""
 
 
 Seen = slice | Tensor
-"""Components of an observation, as what indexes them: all as a slice, else their numbers, int64."""
+"""An index of components of an observation: a slice for all, otherwise their numbers, int64."""
 ALL = slice(None)
 
 
@@ -33,7 +33,7 @@ def seen_by(who: Literal["actor", "critic"], layout: Sequence[ObsField], device:
 
 
 def count(seen: Seen, obs_dim: int) -> int:
-    """How many components of an observation of ``obs_dim`` are seen."""
+    """How many of an observation's ``obs_dim`` components are seen."""
     return len(range(obs_dim)[seen]) if isinstance(seen, slice) else len(seen)
 
 
@@ -41,7 +41,7 @@ def goal_field(layout: Sequence[ObsField]) -> ObsField:
     """The field named ``goal``.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If no field has that name.
     """
     for field in layout:
         if field.name == "goal":
@@ -50,10 +50,10 @@ def goal_field(layout: Sequence[ObsField]) -> ObsField:
 
 
 def goal_slice(layout: tuple[ObsField, ...]) -> slice:
-    """Where the field named ``goal`` stands in the observation.
+    """The components of the observation that the field named ``goal`` has.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If no field has that name.
     """
     field = goal_field(layout)
     start = sum(other.size for other in layout[: layout.index(field)])
@@ -65,9 +65,9 @@ class GoalComponent:
     """One component of the goal."""
 
     name: str
-    """That of its group, with x, y, z where the group has up to three, and its number from 0 on where it has more."""
+    """Its group's name; followed by x, y or z in a group of two or three, by a number from 0 in a larger one."""
     unit: str
-    """Of the physical value; 1 for none."""
+    """Unit of the physical value; 1 for none."""
     scale: float
     """The policy sees the physical value times this."""
 
@@ -83,9 +83,9 @@ def goal_components(
     """The components of the goal, in order.
 
     Args:
-        layout: Of the observation.
+        layout: Layout of the observation.
         groups: Components that belong together; every one is in one group.
-        group_names: What each of them is called.
+        group_names: The groups' names.
     """
     field = goal_field(layout)
     names, units = [""] * field.size, field.unit.split(", ")

@@ -1,7 +1,7 @@
-"""Losses of networks and their gradients by the outputs, written out in torch: the reference.
+"""Losses of networks and their gradients with respect to the outputs, written out in torch: the reference.
 
-``kernels.mlp`` has ``ValueLoss`` and ``Surrogate`` too, which a CPU computes while a block of rows lies in its caches.
-Tests hold these functions to autograd in float64, and the kernel's to them.
+``kernels.mlp`` also has ``ValueLoss`` and ``Surrogate``, which a CPU computes while a block of rows is in its caches.
+Tests compare these functions with autograd in float64, and the kernel's with these.
 """
 
 import math
@@ -13,16 +13,16 @@ import torch
 from torch import Tensor, nn
 
 Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
-"""From outputs, shape (K, n, outputs), and a network's parameters that belong to no layer, shape (K, free), to sums
-over the rows, shape (K, sums), the first of which is minimised, and its gradients by outputs and by free parameters."""
+"""From outputs, shape (K, n, outputs), and a network's free parameters, which belong to no layer, shape (K, free), to
+sums over the rows, shape (K, sums), and the gradients of the first, the loss, with respect to both."""
 
 
 @dataclass(frozen=True)
 class ValueLoss:
     """The squared error of values; clipped, it does not follow a value that has moved too far already.
 
-    Where a value has moved too far and clipping makes the loss larger, the clipped loss counts, and that one is flat.
-    Inside the clip both are the same, without a rounding that could decide. Gives one sum, the loss.
+    Where a value has moved too far and clipping makes the loss larger, the clipped loss counts, and it is flat.
+    Inside the clip both are exactly equal, so that rounding cannot decide. It has one sum, the loss.
     """
 
     data: Tensor
@@ -61,7 +61,7 @@ class ValueLoss:
 class Surrogate:
     """PPO's clipped surrogate for a Gaussian policy: outputs are its mean, free parameters its standard deviation.
 
-    Its sums are the loss and, for every action, the square of how far the mean has moved: what the KL divergence needs.
+    Its sums are the loss and, for every action, the squared distance that the mean has moved, for the KL divergence.
     The slope of max(-A r, -A clip(r)) is -A where the first is the larger or both are equal (inside the clip), and 0
     elsewhere; log r has the slopes z / std and (z^2 - 1) / std.
     """
@@ -89,19 +89,19 @@ class Surrogate:
 
     @property
     def sums(self) -> int:
-        """How many sums it gives."""
+        """Number of its sums."""
         return (self.data.shape[1] - 1) // 2
 
     def __call__(self, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See ``Loss``."""
         size = mean.shape[2]
         action, old_mean, (old_log_prob, advantage, weight) = self.data[0].split([size, size, 3])
-        mean, std = mean[0].t(), std[0].unsqueeze(1)  # with actions along the first axis, rows lie end to end
+        mean, std = mean[0].t(), std[0].unsqueeze(1)  # with actions along the first axis, rows are contiguous
         z = (action - mean) / std
         ratio = (log_prob(z, std) - old_log_prob).exp()
         cost = -advantage
         plain, clipped = cost * ratio, cost * ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
-        slope = weight * plain * (plain >= clipped)  # by log r
+        slope = weight * plain * (plain >= clipped)  # with respect to log r
         loss = weight @ torch.maximum(plain, clipped)
         sums = torch.cat([loss.unsqueeze(0), (mean - old_mean).square() @ weight])
         by_mean, by_std = z / std * slope, (z.square() - 1.0) @ slope / std[:, 0]
@@ -109,10 +109,10 @@ class Surrogate:
 
 
 def by_outputs(loss: Loss, y: Tensor, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """What a loss gives for outputs; its gradient by them in float32.
+    """What a loss returns for outputs; its gradient with respect to them in float32.
 
     Raises:
-        ValueError: If that has another shape or device than the outputs.
+        ValueError: If that gradient is not of the outputs' shape and on their device.
     """
     sums, slopes, by_free = loss(y, free)
     if slopes.shape != y.shape or slopes.device != y.device:

@@ -21,21 +21,21 @@ _NAMES = {module: name for name, module in ACTIVATIONS.items()}
 
 
 class MLPs:
-    """K networks of one shape in one vector of parameters, those of a network end to end as its module orders them.
+    """K networks of one shape in one vector of parameters, each network's contiguous, in its module's order.
 
-    Products are torch's or, on a CPU where Warp is installed, those of ``kernels.mlp``. Both give the same to rounding;
+    Products are torch's or, on a CPU where Warp is installed, those of ``kernels.mlp``. Both agree up to rounding;
     the kernel's results do not depend on the number of threads.
 
     Args:
         modules: Linear layers with one kind of activation between them, as ``networks.mlp`` makes them, on one device;
-            a module may have free parameters besides, which its loss uses (a policy's standard deviation), and a
+            a module may also have free parameters, which its loss uses (a policy's standard deviation), and a
             ``Normalizer``, whose outputs are then the inputs here. All parameters and their gradients become views of
             ``parameters`` and ``grad``.
-        memory: Where parameters and gradients shall lie, float32, shape (2, K, numbers); ``None`` allocates it.
+        memory: Memory for parameters and gradients, float32, shape (2, K, numbers); ``None`` allocates it.
         workspace: Memory for activations in torch's products [MiB]; what takes more is computed in parts.
 
     Raises:
-        ValueError: If a module has other layers, or they are not of one shape.
+        ValueError: If a module has other layers, or the modules' shapes differ.
     """
 
     def __init__(self, modules: Sequence[nn.Module], memory: Tensor | None = None, workspace: int = 64) -> None:
@@ -61,8 +61,8 @@ class MLPs:
 
     def __getstate__(self) -> dict:
         raise TypeError(
-            "Networks whose parameters are views of one vector cannot be copied or pickled, nor can what holds them; "
-            "make another one and load this one's state_dict()."
+            "Networks whose parameters are views of one vector cannot be copied or pickled, nor can an object that "
+            "holds them; make another one and load this one's state_dict()."
         )
 
     @torch.no_grad()
@@ -70,11 +70,11 @@ class MLPs:
         """Outputs of all networks, shape (K, n, outputs).
 
         Args:
-            x: Inputs, shape (n, inputs), or (K, n, inputs) for inputs of their own; rounded to float32.
-            out: Where they shall lie, float32, contiguous; ``None`` allocates it.
+            x: Inputs, shape (n, inputs), or (K, n, inputs) if each network has its own; rounded to float32.
+            out: Memory for the outputs, float32, contiguous; ``None`` allocates it.
 
         Raises:
-            ValueError: If the shape or the device is another one, or ``out`` is not as it must be.
+            ValueError: If shape or device of the inputs are wrong, or ``out`` does not fit.
         """
         x, shape = self._rounded(x), (len(self), x.shape[-2], self.units[-1])
         if out is not None and (out.shape != shape or out.dtype != torch.float32 or not out.is_contiguous()):
@@ -139,7 +139,7 @@ class MLPs:
         return gradients((self, x, loss))[0]
 
     def _gradient(self, x: Tensor, loss: Loss) -> Tensor:
-        """``gradient`` by torch's products."""
+        """``gradient`` with torch's products."""
         activations = self._outputs(x.expand(len(self), -1, -1))
         sums, delta, free = by_outputs(loss, activations.pop(), self.parameters[:, self.free])
         if free.shape[1]:
@@ -154,7 +154,7 @@ class MLPs:
         return sums
 
     def _outputs(self, x: Tensor, first: int = 0, out: Tensor | None = None) -> list[Tensor]:
-        """The inputs and the outputs of all layers; from ``first`` on, whose inputs are those before the activation."""
+        """The inputs and the outputs of layers from ``first`` on; unless that is 0, ``x`` is not activated yet."""
         outputs = [x] if first == 0 else [_activated(x, self.activation)]
         *hidden, (weight, bias) = self._layers[first:]
         for layer in hidden:
@@ -169,7 +169,7 @@ class MLPs:
         return weight.unflatten(1, (outputs, inputs)), bias.unsqueeze(1)
 
     def parts(self, rows: int, each: int = 1) -> Iterator[slice]:
-        """Parts of rows whose activations fit the workspace; ``each`` row stands for so many."""
+        """Parts of rows whose activations fit the workspace; each row counts as ``each``."""
         size = max(1, self._workspace // (8 * len(self) * each * max(self.units)))  # a layer's inputs and outputs
         return (slice(start, start + size) for start in range(0, max(rows, 1), size))
 
@@ -190,7 +190,7 @@ class MLPs:
         return x.float()
 
     def _rounded_loss(self, loss: Loss, rows: int) -> Loss:
-        """A loss with its data in float32; they must fit the networks, for the kernel reads them by address."""
+        """A loss with its data in float32; these must fit the networks, since the kernel reads them by address."""
         if not isinstance(loss, ValueLoss | Surrogate):
             return loss
         data, device = loss.data, self.parameters.device
@@ -204,7 +204,7 @@ class MLPs:
 
 
 def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
-    """``MLPs.gradient`` of several, by threads that pass from one to the next without waiting for each other."""
+    """``MLPs.gradient`` of several, on threads that go from one to the next without waiting for each other."""
     rounded = [(nets, nets._rounded(x), nets._rounded_loss(loss, x.shape[-2:-1].numel())) for nets, x, loss in work]
     prepared = [(nets._kernel, x, loss) for nets, x, loss in rounded if nets._kernel is not None]
     if len(prepared) < len(work):
@@ -215,7 +215,7 @@ def gradients(*work: tuple[MLPs, Tensor, Loss]) -> list[Tensor]:
 
 
 def _layout(module: nn.Module) -> tuple[tuple[int, ...], str, list[int], slice]:
-    """A network's units, its activation, where layers' weights start among its parameters, and where free ones lie."""
+    """A network's units, its activation, where layers' weights start among its parameters, and which are free."""
     leaves = [part for part in module.modules() if not list(part.children()) and not isinstance(part, Normalizer)]
     linears = [layer for layer in leaves[::2] if isinstance(layer, nn.Linear) and layer.bias is not None]
     between = {type(layer) for layer in leaves[1::2]}
@@ -242,7 +242,7 @@ def _layout(module: nn.Module) -> tuple[tuple[int, ...], str, list[int], slice]:
 
 
 def _move(module: nn.Module, parameters: Tensor, grad: Tensor) -> None:
-    """Lay a module's parameters into a vector, and give them gradients that are views of another."""
+    """Move a module's parameters into a vector, and give them gradients that are views of another."""
     start = 0
     for parameter in module.parameters():
         rows = slice(start, start + parameter.numel())
@@ -257,7 +257,7 @@ def _activated(x: Tensor, activation: str) -> Tensor:
 
 
 def _times_slope(delta: Tensor, y: Tensor, activation: str) -> Tensor:
-    """``delta`` times the derivative of an activation, which its output ``y`` determines: autograd's own, one call."""
+    """``delta`` times the derivative of an activation, which its output ``y`` determines: autograd's own operator."""
     if activation == "tanh":
         return torch.ops.aten.tanh_backward(delta, y)
     if activation == "elu":

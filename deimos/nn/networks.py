@@ -25,9 +25,9 @@ def mlp(
         inputs: Inputs.
         hidden: Units of the hidden layers.
         outputs: Outputs.
-        activation: Between the layers.
+        activation: Activation between the layers.
         generator: Where the weights are drawn from, by PyTorch's default initialisation; ``None`` leaves them 0, to
-            be loaded. PyTorch itself would draw them from the process's generator, which is somebody else's.
+            be loaded. PyTorch itself would draw them from the global generator, which belongs to the host program.
     """
     sizes = [inputs, *hidden]
     layers: list[nn.Module] = []
@@ -49,17 +49,18 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.
 
 
 def weights_of(net: nn.Module) -> dict[str, Tensor]:
-    """A copy of a network's ``state_dict``: later updates leave it alone, and a file of it holds nothing else.
+    """A copy of a network's ``state_dict``: later updates do not change it, and a file of it holds nothing else.
 
-    Parameters that ``MLPs`` has laid out are views, and a view is saved with all that it is a view of.
+    Parameters in ``MLPs`` are views, and a view is saved with all the memory that it is a view of.
     """
     return {name: value.detach().clone() for name, value in net.state_dict().items()}
 
 
 class Actor(nn.Module):
-    """A Gaussian policy: its mean is an MLP of the observation, its deviation one number per action; see ``mlp``.
+    """A Gaussian policy: its mean is an MLP of the observation, its standard deviation one number per action.
 
-    With ``normalize`` the observation is normalised first, by statistics that are saved with the weights.
+    With ``normalize`` the observation is normalised first, by statistics that are saved with the weights. See
+    ``mlp`` for the other arguments.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Actor(nn.Module):
     ) -> None:  # fmt: skip
         super().__init__()
         self.seen = seen
-        """What it sees of an observation."""
+        """The components of an observation that it sees."""
         self.normalizer = Normalizer(obs_dim) if normalize else None
         self.mean = mlp(count(seen, obs_dim), hidden, action_dim, activation, generator)
         self.std = nn.Parameter(torch.full((action_dim,), init_std, dtype=torch.float32))

@@ -1,18 +1,18 @@
-"""Observations in units of their own standard deviation: running statistics, as rsl_rl's ``EmpiricalNormalization``."""
+"""Normalise observations by their running statistics, as rsl_rl's ``EmpiricalNormalization``."""
 
 import torch
 from torch import Tensor, nn
 
 from deimos.nn.ranks import sum_over_ranks
 
-EPSILON = 1e-2  # what a component that hardly varies is divided by at least; rsl_rl's
+EPSILON = 1e-2  # added to the standard deviation, for components that hardly vary; rsl_rl's
 
 
 class Normalizer(nn.Module):
     """Subtracts the running mean and divides by the running standard deviation, component by component.
 
-    The statistics are buffers, so that they are saved with the network that holds them. Nothing but ``update`` changes
-    them. Batches are merged by Chan, Golub and LeVeque's formula [1]_.
+    The statistics are buffers, so that they are saved with the network that holds them. Only ``update`` changes them.
+    Batches are merged by Chan, Golub and LeVeque's formula [1]_.
 
     Args:
         size: Components of an observation.
@@ -30,11 +30,11 @@ class Normalizer(nn.Module):
         super().__init__()
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float32))
         self.register_buffer("variance", torch.ones(size, dtype=torch.float32))
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))  # counts to 2^53
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))  # exact up to 2^53
 
     @torch.no_grad()
     def update(self, obs: Tensor, weight: Tensor) -> None:
-        """Take observations into the statistics.
+        """Add observations to the statistics.
 
         Args:
             obs: Observations, shape (n, size).

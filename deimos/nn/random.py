@@ -1,7 +1,7 @@
-"""Counter-based random numbers, on any device: the very ones that ``kernels.random`` draws.
+"""Counter-based random numbers, on any device: the same that ``kernels.random`` draws.
 
 A draw is a pure function of its address: *who* draws *what* for *which time*. So two halves of the worlds draw what
-the whole draws, and a resumed run continues with the very numbers that it would have had. The generator is
+the whole draws, and a resumed run continues with the numbers that it would have had. The generator is
 Philox4x32-10 of Salmon et al., *Parallel Random Numbers: As Easy as 1, 2, 3*, SC 2011.
 """
 
@@ -33,7 +33,7 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[int, int])
 
     Args:
         counter: The four words of the counters, int64 in [0, 2^32), of shapes that broadcast.
-        key: Its two words, in [0, 2^32).
+        key: The two words of the key, in [0, 2^32).
     """
     if counter[0].device.type != "cpu":
         return _rounds(counter, key)
@@ -42,11 +42,11 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[int, int])
 
 
 def _rounds(counter: Any, key: tuple[int, int]) -> Any:
-    """The rounds of ``philox``, of torch's tensors or NumPy's arrays."""
+    """The rounds of ``philox``, on torch tensors or NumPy arrays."""
     x0, x1, x2, x3 = counter
     k0, k1 = key
     for _ in range(10):
-        # An int64 keeps the low 64 bits of a product; what is above a word is taken off where it would matter.
+        # An int64 keeps the low 64 bits of a product; bits above a word are masked off where they would matter.
         p0, p1 = x0 * _MULTIPLIERS[0], x2 * _MULTIPLIERS[1]
         x0, x2 = ((p1 >> 32) ^ x1 ^ k0) & _WORD, ((p0 >> 32) ^ x3 ^ k1) & _WORD
         x1, x3 = p1, p0

@@ -1,9 +1,9 @@
-"""The one place where the processes of one training run meet.
+"""All communication between the processes of one training run.
 
 ``torchrun`` starts several processes, the *ranks*, one per GPU. Each simulates its share of the worlds; what networks
-learn from is added up, or gathered, over all of them here, so that every rank comes to hold the same networks. Within
+learn from is added up, or gathered, over all of them here, so that every rank ends up with the same networks. Within
 ``joined`` every rank must make the same calls in the same order. Without it, or with one process, nothing is sent:
-every function gives back what it was given.
+every function returns what it was given.
 """
 
 import os
@@ -18,26 +18,26 @@ from torch import Tensor
 
 from deimos.checks import RunError, SimulationError, one_line
 
-PATIENCE = timedelta(minutes=10)  # for a rank that does not answer; robots' kernels compile for minutes
+PATIENCE = timedelta(minutes=10)  # for a rank that does not answer; robots' kernels take minutes to compile
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a process stands among those of its run."""
+    """The place of a process among those of its run."""
 
     rank: int = 0
     """Its number, in [0, size)."""
     size: int = 1
-    """How many there are."""
+    """Number of processes."""
     local_rank: int = 0
-    """Its number among those of its machine, and so of its GPU."""
+    """Its number among those of its machine, which is also the number of its GPU."""
     local_size: int = 1
-    """How many its machine has."""
+    """Number of processes on its machine."""
 
     @property
     def first(self) -> bool:
-        """Whether it is the one that writes and speaks for all."""
+        """Whether it is the one that writes files and messages for all."""
         return self.rank == 0
 
 
@@ -47,15 +47,15 @@ _apart = False  # within ``together``
 
 
 def place() -> Place:
-    """Where this process stands: the first of one, but for those within ``joined``."""
+    """The place of this process: the first of one, except within ``joined``."""
     return _place
 
 
 @contextmanager
 def joined() -> Iterator[None]:
-    """Join the processes that torchrun has started, as its environment describes them, for as long as this lasts.
+    """Join the processes that torchrun has started, as its environment variables describe them, within the context.
 
-    Tensors on a CPU travel by gloo, those on a GPU by NCCL.
+    Tensors on a CPU are sent by gloo, those on a GPU by NCCL.
 
     Raises:
         RunError: If the others cannot be reached.
@@ -77,11 +77,11 @@ def joined() -> Iterator[None]:
         yield
     finally:
         _place = _ALONE
-        dist.destroy_process_group()  # ends threads that would abort a process which is ending
+        dist.destroy_process_group()  # ends threads that would abort an exiting process
 
 
 def _launched() -> Place:
-    """What the environment says; torchrun sets all of it."""
+    """The place that the environment variables give; torchrun sets all of them."""
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     if not all(name in os.environ for name in (*names, "MASTER_ADDR", "MASTER_PORT")):
         return _ALONE
@@ -92,7 +92,7 @@ def share(name: str, count: int) -> int:
     """How many of ``count`` things, such as worlds, each rank has.
 
     Raises:
-        ValueError: If they cannot be shared evenly; ``name`` is what they are called.
+        ValueError: If they cannot be shared evenly; the message calls them ``name``.
     """
     if count % _place.size:
         raise ValueError(f"{name} must be divisible by the {_place.size} ranks that share them, got {count}.")
@@ -100,7 +100,7 @@ def share(name: str, count: int) -> int:
 
 
 def sum_over_ranks(value: Tensor, *more: Tensor) -> Tensor:
-    """Add up ``value`` over all ranks, in place, and return it; in the same message ``more`` of the same dtype."""
+    """Add up ``value`` over all ranks, in place, and return it; ``more`` of the same dtype go in the same message."""
     if more and _communicates():
         sums = _reduced(torch.cat([part.flatten() for part in (value, *more)]), "SUM")
         for part, sum_ in zip((value, *more), sums.split([part.numel() for part in (value, *more)]), strict=True):
@@ -115,14 +115,14 @@ def max_over_ranks(value: Tensor) -> Tensor:
 
 
 def largest(*numbers: int) -> tuple[int, ...]:
-    """The largest of all ranks, number by number; of flags, whether any of them is set."""
+    """The maximum of each number over all ranks; for a flag, whether any rank sets it."""
     if not _communicates():
         return numbers
     return tuple(max_over_ranks(torch.tensor([*map(int, numbers)], device="cpu")).tolist())
 
 
 def mean_over_ranks(value: Tensor) -> Tensor:
-    """Average ``value`` over all ranks, in place, and return it; a mean over worlds becomes that over all of them."""
+    """Average ``value`` over all ranks, in place, and return it; a mean over its worlds becomes one over all."""
     return sum_over_ranks(value).div_(_place.size) if _communicates() else value
 
 
@@ -135,7 +135,7 @@ def _reduced(value: Tensor, operation: str) -> Tensor:
 
 
 def gather_rows(value: Tensor, dim: int = 0) -> Tensor:
-    """What has one row per world, of all ranks: joined along ``dim``, in the order of the worlds' global numbers."""
+    """Join tensors with one row per world, of all ranks, along ``dim``, in the order of the worlds' global numbers."""
     if not _communicates():
         return value
     import torch.distributed as dist
@@ -147,7 +147,7 @@ def gather_rows(value: Tensor, dim: int = 0) -> Tensor:
 
 
 def own_rows(value: Tensor) -> Tensor:
-    """The inverse of ``gather_rows``: this rank's part of what has one row per world, a view."""
+    """The inverse of ``gather_rows``: this rank's part of a tensor with one row per world, a view."""
     size = len(value) // _place.size
     return value[_place.rank * size : (_place.rank + 1) * size]
 
@@ -156,13 +156,13 @@ def own_transitions(order: Tensor, num_envs: int) -> tuple[Tensor, Tensor | None
     """This rank's share of minibatches that are drawn from the transitions of all ranks.
 
     Args:
-        order: Transitions of each minibatch, by step times all worlds plus global number of the world, int64, shape
+        order: Transitions of each minibatch, numbered step * all worlds + global number of the world, int64, shape
             (minibatches, size).
         num_envs: Worlds of each rank.
 
     Returns:
-        The same by step times ``num_envs`` plus world, shape (minibatches, n): of every minibatch its own, and others
-        that fill it up to the n of the largest share; and which are its own, bool, same shape, or ``None`` for all.
+        This rank's transitions of each minibatch, numbered step * ``num_envs`` + world, padded with others to the n of
+        its largest share, shape (minibatches, n); and which are its own, bool, same shape, or ``None`` for all.
     """
     if _place.size == 1:
         return order, None
@@ -173,7 +173,7 @@ def own_transitions(order: Tensor, num_envs: int) -> tuple[Tensor, Tensor | None
 
 
 def from_first(make: Callable[[], T]) -> T:
-    """What ``make`` gives on the first rank, on every rank; an error of it is raised on all."""
+    """The result of ``make`` on the first rank, for every rank; its error is raised on all."""
     with together():
         found = [make() if _place.first else None]
     if _communicates():
@@ -185,9 +185,9 @@ def from_first(make: Callable[[], T]) -> T:
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Raise on every rank what one of them raises within, named after it; where several fail, after the first.
+    """Raise on every rank what one of them raises within, with its number; where several fail, what the first raises.
 
-    Within, each rank is by itself and nothing is sent: sums are its own, and so are the worlds in a state.
+    Within, each rank is alone and nothing is sent: sums are over its own worlds, and a state holds only these.
 
     Raises:
         RunError, SimulationError: If another rank has failed.
@@ -199,7 +199,7 @@ def together() -> Iterator[None]:
     fault, _apart = None, True
     try:
         yield
-    except Exception as error:  # whatever it is: the others wait for a word, and it is raised again below
+    except Exception as error:  # whatever it is: the others wait for a message, and it is raised again below
         fault = error
     finally:
         _apart = False
@@ -220,12 +220,12 @@ def together() -> Iterator[None]:
 
 
 def _communicates() -> bool:
-    """Whether there are others to call on."""
+    """Whether there are other ranks to communicate with."""
     return _place.size > 1 and not _apart
 
 
 def _communicate(collective: Callable, *arguments: Any) -> None:
-    """Call on the others.
+    """Communicate with the other ranks.
 
     Raises:
         RunError: If one of them has ended or does not answer.
@@ -234,6 +234,6 @@ def _communicate(collective: Callable, *arguments: Any) -> None:
         collective(*arguments)
     except RuntimeError as error:
         raise RunError(
-            f"Rank {_place.rank} has lost another one, which has ended, or has not answered for "
-            f"{PATIENCE.total_seconds() / 60:g} minutes; what it said tells why ({one_line(error).partition('. ')[0]})."
+            f"Rank {_place.rank} has lost another rank, which has ended or has not answered for "
+            f"{PATIENCE.total_seconds() / 60:g} minutes; see its own message ({one_line(error).partition('. ')[0]})."
         ) from error

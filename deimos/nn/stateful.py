@@ -1,4 +1,4 @@
-"""What a bit-exact resume needs, by the names of attributes."""
+"""Save and restore what a bit-exact resume needs, by the names of attributes."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -15,18 +15,18 @@ from deimos.nn.seeds import restore
 class Stateful:
     """Saves and restores the attributes that its class names.
 
-    A tensor is copied, and written in place when it is restored, for others may hold views of it. Networks, generators
-    and what has a ``state_dict`` of its own are saved by it, the items of a tuple one by one; all else is plain.
+    A tensor is copied, and written in place when it is restored, since others may hold views of it. Networks,
+    generators and what has its own ``state_dict`` are saved by it, the items of a tuple one by one; all else is plain.
     """
 
     saved: ClassVar[tuple[str, ...]] = ()
     """Names of the attributes; ``state_dict`` has them without a leading underscore."""
     unknown: ClassVar[tuple[str, ...]] = ()
-    """Names of those among them where NaN says that something is not known, or not there. All other numbers must be
-    sound, see ``is_sound``, or the run stops."""
+    """Names of those in which NaN means that something is unknown or absent. All other numbers must be sound, see
+    ``is_sound``, or the run stops."""
     by_world: ClassVar[tuple[str, ...]] = ()
-    """Names of those among them that have one row per world: where several ranks share the worlds, each holds its own,
-    and a state those of all. Everything else must be the same on all of them."""
+    """Names of those with one row per world: where several ranks share the worlds, each holds its own rows, and a
+    saved state those of all. Everything else must be the same on all ranks."""
 
     def state_dict(self) -> dict:
         """Everything that a bit-exact resume needs; where several ranks share a run, all must call it."""
@@ -38,8 +38,8 @@ class Stateful:
         """Continue from ``state_dict()``.
 
         Raises:
-            KeyError: If something is missing in it.
-            RuntimeError, ValueError: If it belongs to something of another size.
+            KeyError: If something is missing from it.
+            RuntimeError, ValueError: If sizes differ.
         """
         for name in self.saved:
             saved = state[name.lstrip("_")]
@@ -47,8 +47,8 @@ class Stateful:
             setattr(self, name, _restored(getattr(self, name), saved))
 
     def must_be_sound(self) -> Mapping[str, Any]:
-        """By name, what ``state_dict`` is made of, with 0 for the NaN of what is unknown."""
-        if type(self).state_dict is not Stateful.state_dict:  # its own, which may hold anything
+        """What ``state_dict`` is made of, by name, with 0 for the NaN of unknown values."""
+        if type(self).state_dict is not Stateful.state_dict:  # overridden: it may hold anything
             return self.state_dict()
         found = {name.lstrip("_"): getattr(self, name) for name in self.saved}
         return found | {name.lstrip("_"): _known(getattr(self, name)) for name in self.unknown}
@@ -76,9 +76,9 @@ def _state(value: Any) -> Any:
 
 
 def _restored(value: Any, state: Any) -> Any:
-    """``value`` after it has taken over a state; another one only where it is plain."""
+    """Restore a state into ``value`` and return it; only plain values are replaced."""
     if isinstance(value, Tensor):
-        if not isinstance(state, Tensor):  # an older version's may be plain
+        if not isinstance(state, Tensor):  # older versions may have saved it as plain
             state = torch.tensor(state, device=value.device)
         if value.shape != state.shape:
             raise ValueError(f"A tensor of shape {tuple(value.shape)} cannot become one of {tuple(state.shape)}.")
@@ -96,7 +96,7 @@ def _restored(value: Any, state: Any) -> Any:
 
 
 LARGEST = 1e15
-"""Numbers beyond it come of a fault, and their squares leave the range of float32 (3.4e38) soon."""
+"""Larger numbers come from a fault, and their squares soon leave the range of float32 (3.4e38)."""
 
 
 def is_sound(value: Tensor) -> Tensor:
@@ -105,10 +105,10 @@ def is_sound(value: Tensor) -> Tensor:
 
 
 def unsound(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
-    """What ``value`` would save in which a number is not sound that must be: its name, and where; see ``unknown``.
+    """Tensors that ``value`` would save with unsound numbers, except ``Stateful.unknown``: their names, and where.
 
     Args:
-        name: What ``value`` is called.
+        name: Name of ``value``.
         value: Anything that an attribute of ``Stateful.saved`` may be, or a mapping of such.
     """
     if isinstance(value, float):

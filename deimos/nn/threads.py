@@ -1,4 +1,4 @@
-"""Threads that share work, how many torch uses beside them, and how precise its products are."""
+"""Threads that share work, the number of torch's own threads, and the precision of its products."""
 
 import os
 import threading
@@ -12,13 +12,13 @@ _shared: ContextVar[int | None] = ContextVar("threads that share work", default=
 
 
 def available() -> int:
-    """Threads that may share work: as many as torch has, or would have but for ``torch_on_one``."""
+    """Threads that may share work: as many as torch has, or would have without ``torch_on_one``."""
     return _shared.get() or torch.get_num_threads()
 
 
 @contextmanager
 def on_threads(count: int) -> Iterator[None]:
-    """Run torch's CPU operations, and work that is shared, on so many threads; afterwards on as many as before."""
+    """Run torch's CPU operations, and shared work, on ``count`` threads; afterwards on as many as before."""
     before, token = torch.get_num_threads(), _shared.set(None)
     torch.set_num_threads(count)
     try:
@@ -30,12 +30,12 @@ def on_threads(count: int) -> Iterator[None]:
 
 @contextmanager
 def torch_on_one() -> Iterator[None]:
-    """Run torch's CPU operations on one thread, and work that is shared on as many as before.
+    """Run torch's CPU operations on one thread, and shared work on as many as before.
 
-    Sums of torch's depend on its threads; and one of them that has had work waits for more in a loop, which takes the
-    processor from everybody else.
+    Torch's sums depend on its number of threads; and a thread that has had work spins while it waits for more, which
+    takes the processor from everything else.
     """
-    if torch.get_num_threads() == 1:  # as it is within a run; to set it takes as long as a small product
+    if torch.get_num_threads() == 1:  # as within a run; setting it takes as long as a small product
         yield
         return
     share = available()
@@ -56,12 +56,12 @@ def tf32_products(allowed: bool) -> Iterator[None]:
 
 
 class _Worker(threading.Thread):
-    """A thread that sleeps until it is given work; two locks cost half of what an executor does."""
+    """A thread that sleeps until it is given work; two locks cost half as much as an executor."""
 
     def __init__(self, number: int) -> None:
         super().__init__(daemon=True)
         self.work: Callable[[int], object] | None = None
-        """What it is to do; ``None`` once it has."""
+        """Its work; ``None`` once it is done."""
         self.error: BaseException | None = None
         """What its last work raised."""
         self._number = number
@@ -85,7 +85,7 @@ class _Worker(threading.Thread):
                 self._done.release()
 
     def wake(self) -> None:
-        """Let it look for work; doing so once too often does no harm."""
+        """Let it look for work; one call too many does no harm."""
         if self._gate.locked():
             self._gate.release()
 
@@ -96,21 +96,21 @@ class _Worker(threading.Thread):
 
 
 class ThreadPool:
-    """Threads of Python that sleep while there is nothing to do; made when they are first needed.
+    """Python threads that sleep while there is nothing to do; made when they are first needed.
 
-    Work must release Python's lock to gain by them, and find its own share of what there is to do.
+    To gain from them, work must release Python's lock; each call must find its own share of it.
     """
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
-        """Held by whoever prepares and runs work: of two threads of the host, one waits."""
+        """Held while work is prepared and run: of two threads of the host, one waits."""
         self._workers: list[_Worker] = []
 
     def run(self, work: Callable[[int], object], count: int) -> None:
         """Call ``work(i)`` on ``count`` threads, i from 0, the first of them the caller's.
 
-        Returns when all of them are done, for then nobody touches the work's memory, or raises the first error: what
-        interrupted the caller, or what the work raised on a thread.
+        Ends only when all of them are done, so that none still touches the work's memory. Then raises the first error,
+        if any: what interrupted the caller, or what the work raised on a thread.
         """
         while len(self._workers) < count - 1:
             self._workers.append(_Worker(len(self._workers) + 1))
@@ -133,7 +133,7 @@ class ThreadPool:
 
 
 POOL = ThreadPool()
-"""The process's."""
+"""The pool of this process."""
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=POOL.__init__)  # type: ignore[misc]  # threads do not survive a fork

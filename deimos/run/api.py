@@ -1,4 +1,4 @@
-"""Training and evaluation as two functions, for programs."""
+"""Training and evaluation as two functions."""
 
 from contextlib import ExitStack
 from dataclasses import replace
@@ -25,8 +25,8 @@ def train(
 ) -> Path:  # fmt: skip
     """Train a policy and evaluate it.
 
-    The environment of the process is left alone. Where other programs use the cores too, set OMP_WAIT_POLICY=passive
-    before torch is loaded, as the ``deimos`` command does: threads that spin while they wait are slow there.
+    The environment variables of the process are left alone. Where other programs use the cores too, set
+    OMP_WAIT_POLICY=passive before torch is loaded, as the ``deimos`` command does: spinning threads are slow there.
 
     Processes that ``torchrun`` starts train one policy, each in its share of the worlds; all must call this, once, and
     the first one evaluates.
@@ -34,8 +34,8 @@ def train(
     Args:
         config: What to train; ``None`` for the main job, Particle Gym under the Director.
         out: Folder of the run, which must not exist; ``None`` for ``runs/ENV-METHOD-sSEED-TIME``.
-        branch_from: Folder of a run whose networks, optimiser, worlds and levels it starts with; ``config`` is
-            by default ``deimos.run.branch.branch_config`` of its own.
+        branch_from: Folder of a run whose networks, optimiser, worlds and levels it starts with; ``config`` then
+            defaults to ``deimos.run.branch.branch_config`` of that run's.
 
     Returns:
         The run's folder, for ``evaluate`` and ``load_policy``.
@@ -47,8 +47,8 @@ def train(
     """
     if config is None and branch_from is not None:
         config = branch_config(training.read_config(RunFolder.open(Path(branch_from))))
-    config = config or TrainConfig()
-    with on_threads(torch.get_num_threads()), ExitStack() as stack:  # a run sets the number; the host gets its own back
+    config = with_plain_numbers(config or TrainConfig())
+    with on_threads(torch.get_num_threads()), ExitStack() as stack:  # a run changes it; the host gets its own back
         with ranks.joined():
             with ranks.together():
                 device = training.resolve_device(config.device)
@@ -74,7 +74,7 @@ def evaluate(
         run: The run's folder; its ``evaluation.json`` gains the rows.
         goal_period: T: steps that a goal is active; ``None`` for that of training.
         device: ``auto``, ``cpu`` or ``cuda``.
-        engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for what did in training.
+        engine: What simulates legged robots, ``warp`` or ``native``; ``None`` for the one of training.
         changes: Fields of ``EvalConfig`` that differ from the run's, such as ``worlds``, ``steps`` or ``seed``.
 
     Returns:
@@ -94,14 +94,14 @@ def evaluate(
 def configure_evaluation(
     config: TrainConfig, goal_period: int | None, changes: dict[str, Any], engine: str | None = None
 ) -> tuple[EnvConfig, EvalConfig]:
-    """What a run's policy is evaluated in and how, where that differs from how the run was set up.
+    """Environment and settings of an evaluation that may differ from those of the run.
 
     Raises:
         RunError: If a value is not allowed.
     """
     try:
         period = config.env.goal_period if goal_period is None else goal_period
-        env_config = config.env.for_evaluation().with_goal_period(period)  # no episode is too short for it
+        env_config = with_plain_numbers(config.env.for_evaluation().with_goal_period(period))  # no episode limits T
         eval_config = with_plain_numbers(replace(config.eval, **changes))
         require_readable(eval_config)
         if engine is not None:

@@ -1,4 +1,4 @@
-"""What an attacker is: who chooses the goals of a finished policy so that it crashes.
+"""The interface of attackers, which choose the goals of a finished policy so that it crashes.
 
 A file of ``deimos.run.attackers``, or a module that is registered under the entry-point group of that name, is an
 attacker. It may learn about the policy first, for a number of steps that is the same for every policy: one that could
@@ -29,9 +29,9 @@ from deimos.sim.env import Env
 Policy = Callable[[Tensor], Tensor]
 """Observations, shape (n, obs_dim), to actions, shape (n, action_dim)."""
 
-FITS = 15  # of an attacker's network while it chooses goals itself
+FITS = 15  # fits of an attacker's network while it chooses goals itself
 HELD_OUT = 5  # every fifth world is kept for the network's AUROC
-_NUMBERS = np.generic, Tensor  # what holds a number as Python has it
+_NUMBERS = np.generic, Tensor  # types whose ``item`` is a number of Python's
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +39,9 @@ class Target:
     """A policy that is attacked, and what an attacker may spend on it."""
 
     policy: Policy
-    """What acts; of a Gaussian policy, its mean actions."""
+    """Gives the actions; for a Gaussian policy, the mean ones."""
     build: Callable[[int, int], Env]
-    """Makes as many worlds as it is told, of a seed; without randomisations."""
+    """Makes a number of worlds, with a seed; without randomisations."""
     worlds: int
     """Worlds to learn in, at least 1."""
     steps: int
@@ -49,15 +49,15 @@ class Target:
     seed: int
     """Seed of the worlds that it is evaluated in, and of an attacker's own draws."""
     fear: FearConfig
-    """A fear network, and how it learns."""
+    """Size of a fear network, and how it learns."""
     pool: Path | None = None
     """The file of ``pooled``."""
     guard: GoalGuard | None = None
-    """Has the last word on the goals of its worlds, such as a shield; ``None`` for nobody."""
+    """Has the last word on the goals of its worlds, as a shield does; ``None`` for none."""
     progress: Callable[[float], None] = field(default=lambda share: None, compare=False)
     """Called now and then with the share of the preparation that is done."""
     learnt: list["Learnt"] = field(default_factory=list, repr=False, compare=False)
-    """What ``learn_fear`` has given so far: several attackers ask for the same network."""
+    """What ``learn_fear`` has trained so far: several attackers ask for the same network."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Learnt:
     """A fear network that ``learn_fear`` has trained, and what it was asked for."""
 
     target: Target
-    """The policy, and with what network, where and under which seed it was learnt about: an attacker may change it."""
+    """The policy, and the network, worlds and seed that it was learnt about with: an attacker may change these."""
     steps: int
     own_goals: bool
     fear: Fear
@@ -77,15 +77,15 @@ class Attack:
     """An attacker that is ready."""
 
     selector: Callable[[Env], GoalSelector]
-    """Makes who chooses the goals of some worlds."""
+    """Makes the selector of goals for some worlds."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """Numbers and texts that stand in the row of the evaluation beside what came out; see ``learn_fear``."""
+    """Numbers and texts that are added to the row of the evaluation; see ``learn_fear``."""
 
     def facts_beside(self, row: Iterable[str], who: str) -> dict[str, Any]:
         """``facts`` for a row of an evaluation, as its file holds them.
 
         Args:
-            row: Names that the row has itself.
+            row: Names that the row already has.
             who: Name of the attacker.
 
         Raises:
@@ -93,7 +93,7 @@ class Attack:
         """
         facts = {name: value.item() if isinstance(value, _NUMBERS) else value for name, value in self.facts.items()}
         if taken := sorted({*row} & facts.keys()):
-            raise RunError(f"Facts of the attacker {who} must have names of their own, got {', '.join(taken)}.")
+            raise RunError(f"Facts of the attacker {who} must not repeat names of the row, got {', '.join(taken)}.")
         for name, value in facts.items():
             if not isinstance(value, int | float | str | None):
                 raise RunError(f"The fact {name} of the attacker {who} must be a number or a text, got {value!r:.80}.")
@@ -101,10 +101,10 @@ class Attack:
 
 
 class AttackerConfig(abc.ABC):
-    """What the ``Config`` of an attacker promises: a frozen dataclass, of which every field has a default."""
+    """The interface of an attacker's ``Config``: a frozen dataclass in which every field has a default."""
 
     few_worlds: ClassVar[bool] = False
-    """Whether a goal costs so much that it meets ``EvalConfig.oracle_worlds`` worlds only."""
+    """Whether a goal costs so much that it attacks only ``EvalConfig.oracle_worlds`` worlds."""
 
     needs_pool: ClassVar[bool] = False
     """Whether it is made from the file ``EvalConfig.pool``."""
@@ -115,7 +115,7 @@ class AttackerConfig(abc.ABC):
 
     @abc.abstractmethod
     def prepare(self, target: Target) -> Attack:
-        """Learn what there is to learn about a policy."""
+        """Learn what it needs about a policy."""
 
 
 def names() -> list[str]:
@@ -124,7 +124,7 @@ def names() -> list[str]:
 
 
 def _plugins() -> dict[str, str]:
-    """Names of the plug-ins by those of the attackers, which have hyphens where a file's has underscores."""
+    """Names of the plug-ins by those of the attackers, which have hyphens instead of underscores."""
     return {name.replace("_", "-"): name for name in plugins.names(attackers)}
 
 
@@ -132,15 +132,15 @@ def attacker(name: str) -> AttackerConfig:
     """The configuration of an attacker.
 
     Raises:
-        ValueError: If there is none of this name; the message lists those that there are.
+        ValueError: If no attacker has this name; the message lists them.
     """
     if name not in _plugins():
-        raise ValueError(f"There is no attacker '{name}'; there are: {', '.join(names())}.")
+        raise ValueError(f"Unknown attacker '{name}'; choose from: {', '.join(names())}.")
     return plugins.load(attackers, _plugins()[name]).Config()
 
 
 def require_heard(among: Iterable[str], pool: Path | None, oracle_worlds: int | None = None) -> None:
-    """Refuse what is said to an attacker that is not among some: nobody would listen.
+    """Refuse settings that none of some attackers takes: they would have no effect.
 
     Raises:
         RunError: If a pool, or a number of worlds, is given, and none of the attackers takes it.
@@ -172,7 +172,7 @@ def learn_fear(target: Target, steps: int, *, own_goals: bool) -> tuple[Fear, di
     Returns:
         The network, and ``adversary_steps``, ``adversary_interactions``, ``adversary_crashes``, ``adversary_auroc`` (on
         every fifth world, which it did not learn from; NaN where they hold no pair to rank) and ``uninformed``: whether
-        it has learnt nothing, for want of a crash or of a survival, so that goals are uniform.
+        it has learnt nothing, because it saw no crash or no survival, so that goals are uniform.
     """
     asked = target, steps, own_goals
     known = next((each for each in target.learnt if (each.target, each.steps, each.own_goals) == asked), None)
@@ -195,7 +195,7 @@ def fear_of(targets: Sequence[Target], steps: int, *, own_goals: bool) -> tuple[
 
 
 def collect(targets: Sequence[Target], steps: int, *, own_goals: bool) -> tuple[Fear, Resolved]:
-    """Let policies act, each in worlds of its own, to learn from what happens.
+    """Let policies act, each in its own worlds, to learn from what happens.
 
     Args:
         targets: The policies, at least 1, of one environment.
@@ -204,7 +204,7 @@ def collect(targets: Sequence[Target], steps: int, *, own_goals: bool) -> tuple[
             show few crashes of a safe policy, its own choices alone no survivals. False for uniform goals alone.
 
     Returns:
-        The network, which has learnt nothing yet without goals of its own, and all interactions.
+        The network, which has learnt nothing yet unless it chose goals, and all interactions.
     """
     first = targets[0]
     envs = [target.build(target.worlds, target.seed + 1) for target in targets]
@@ -242,7 +242,7 @@ def learnt_from(data: Resolved) -> Resolved:
 def quality(fear: Fear, held_out: Resolved) -> float:
     """How often the network ranks a crash above a survival under a goal of the same kind, its own or a uniform one.
 
-    Between the kinds, to tell which goals are its own would tell much of what crashes.
+    Across the kinds, recognising its own goals would be enough to predict many crashes.
     """
     if not fear.fitted or not len(held_out):
         return math.nan

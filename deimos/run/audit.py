@@ -1,6 +1,6 @@
-"""Does the fear network rank goals rightly *within* a context? Exact labels from cloned worlds.
+"""Does the fear network rank goals correctly *within* a context? Exact labels from cloned worlds.
 
-The AUROC over all interactions is flattered by states: near a wall everything is dangerous. What a Director uses is the
+The AUROC over all interactions is inflated by states: near a wall everything is dangerous. What a Director uses is the
 ranking of goals for one state and one active goal. Here worlds at the moment of a goal change are cloned, every clone
 gets another candidate goal, and the policy is rolled out for T steps under each, with its actions drawn as in training.
 """
@@ -29,19 +29,19 @@ CANDIDATES = 50  # goals tried in every context
 BATCH = 256  # contexts cloned at a time
 PATIENCE = 50  # contexts tried per context wanted, before giving up
 RESAMPLES = 10_000
-AHEAD = 10  # steps whose noise is drawn at once: for few worlds every operation costs what its call costs
+AHEAD = 10  # steps whose noise is drawn at once: with few worlds, the overhead of the calls dominates
 
 
 class _Explorer:
-    """The policy with actions drawn as in training, by an audit's own numbers.
+    """The policy with actions drawn as in training, from an audit's own random numbers.
 
-    They are addressed by the seed, the number of the world, of which the first row's is given, and how often it acted.
+    They are addressed by the seed, the number of the world, that of the first row being ``first_world``, and the step.
     """
 
     def __init__(self, trainer: Trainer, first_world: int = 0) -> None:
         self._actor, self._seed, self._first = trainer.ppo.actor, trainer.config.seed, first_world
         self.steps = 0
-        self._noise: list[Tensor] = []  # of the coming steps, the next one last
+        self._noise: list[Tensor] = []  # for the coming steps, the next one last
 
     def __call__(self, obs: Tensor) -> Tensor:
         mean = self._actor(obs)
@@ -61,7 +61,7 @@ def audit_fear(trainer: Trainer, contexts: int) -> dict:
     candidates crash and some do not can be ranked.
 
     Args:
-        trainer: A run whose selector has a fear network that has learnt. Its worlds move on.
+        trainer: A run whose selector has a fear network that has learnt. Its worlds advance.
         contexts: Contexts with both outcomes to collect, at least 1.
 
     Returns:
@@ -69,7 +69,7 @@ def audit_fear(trainer: Trainer, contexts: int) -> dict:
         with both outcomes among those ``tried``; ``crash_rate`` of all rollouts; ``iteration``.
 
     Raises:
-        RunError: If there is no fear network, or no context with both outcomes, or none at all.
+        RunError: If there is no fear network, no context with both outcomes, or no context at all.
     """
     afraid = _learnt_fear(trainer)
     act, clones = _explorers(trainer)
@@ -96,7 +96,7 @@ def audit_fear(trainer: Trainer, contexts: int) -> dict:
 
 
 def _explorers(trainer: Trainer) -> tuple[_Explorer, Clones]:
-    """Who acts in the run's own worlds, and clones to try candidates in; both explore as in training."""
+    """What acts in the run's own worlds, and clones to try candidates in; both explore as in training."""
     config = trainer.config
     return _Explorer(trainer), Clones(
         lambda count: config.env.build(count, trainer.env.device, config.seed),
@@ -112,11 +112,11 @@ def audit_calibration(trainer: Trainer, interactions: int) -> dict[str, tuple[Te
 
     Args:
         trainer: See ``audit_fear``.
-        interactions: Interactions under either, at least 1.
+        interactions: Interactions under each, at least 1.
 
     Returns:
         For ``selected`` and ``uniform`` goals: probabilities, shape (n,), outcomes, bool, shape (n,), and what
-        ``calibration.evaluate`` gives, with ``interactions``, ``crash_rate`` and ``auroc``.
+        ``calibration.evaluate`` returns, with ``interactions``, ``crash_rate`` and ``auroc``.
 
     Raises:
         RunError: If there is no fear network.
@@ -149,7 +149,7 @@ def _watch(trainer: Trainer, act: _Explorer, chooser: GoalSelector, count: int) 
     steps = (-(-count // env.num_envs) + 1) * env.goal_period
     loop = GoalLoop(env, chooser, window=steps)
     for _ in range(steps):
-        loop.advance(env.step(act(env.obs)))
+        loop.advance(env.step(act(env.obs)), in_time=True)
     return loop.outcomes()
 
 
@@ -187,7 +187,7 @@ def _next_contexts(trainer: Trainer, act: _Explorer, clones: Clones) -> tuple[Te
 
 @dataclass(frozen=True)
 class Choices:
-    """What a selector chose in the next decision of some worlds, beside what would have become of every candidate."""
+    """What a selector chose in the next decision of some worlds, compared with the outcome of every candidate."""
 
     percentile: list[float]
     """Percentile of the chosen goal among 50 candidates by how soon each crashes the policy, ties counting half, in
@@ -197,10 +197,10 @@ class Choices:
     without a fear network that has learnt."""
     place: Tensor
     """Where each world was, in [-1, 1], shape (n, goal_dim): its ``Env.place`` or, where there is none, the active goal
-    in the box of valid goals; none where these are no box."""
+    in the box of valid goals; empty where these do not form a box."""
     chosen: Tensor
-    """Where the chosen goal is in the box of valid goals, in [-1, 1], shape (n, goal_dim); none where these are no
-    box."""
+    """Where the chosen goal is in the box of valid goals, in [-1, 1], shape (n, goal_dim); empty where these do
+    not form a box."""
 
 
 @torch.no_grad()
@@ -211,7 +211,7 @@ def audit_choices(trainer: Trainer, worlds: int, clones: Clones) -> Choices:
     whose episode ends before their goal is due do not count.
 
     Args:
-        trainer: A run. Its worlds move on.
+        trainer: A run. Its worlds advance.
         worlds: How many of its worlds, drawn at random; at least 1.
         clones: Where candidates are tried; see ``audit_clones``.
     """
@@ -238,7 +238,7 @@ def audit_choices(trainer: Trainer, worlds: int, clones: Clones) -> Choices:
 
 
 def audit_clones(trainer: Trainer) -> Clones:
-    """Worlds for ``audit_choices`` to try candidates in, for as many audits of the run as one likes."""
+    """Worlds for ``audit_choices`` to try candidates in, for any number of audits of the run."""
     return _explorers(trainer)[1]
 
 
@@ -262,7 +262,9 @@ def _decide(trainer: Trainer, rows: Tensor) -> _Decision:
     candidates = env.sample_goals(rows, CANDIDATES, scale).clone()
     worlds = {name: tensor[rows] for name, tensor in env.tensors.items()}
     chosen = selector.propose(rows, state, goal, candidates, env.draw(rows)).goal
-    if scale is not None:  # it chose from a part of the range, as a curriculum does, and is judged among goals of all
+    own = ~(candidates == chosen.unsqueeze(1)).all(2).any(1, keepdim=True)
+    candidates[:, 0] = torch.where(own, chosen, candidates[:, 0])  # a goal that was not a candidate is ranked too
+    if scale is not None:  # it chose from part of the range, as a curriculum does, but is judged among goals of all
         candidates = torch.where(
             (candidates == chosen.unsqueeze(1)).all(2, keepdim=True), candidates, env.sample_goals(rows, CANDIDATES)
         )

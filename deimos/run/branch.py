@@ -1,7 +1,7 @@
 """Runs that branch off another run: its networks, optimiser and worlds, under another method or another task.
 
-A branch tells methods apart that start from the same policy in the same worlds. What is chance, or belongs to whoever
-chooses the goals, is new: seed, draws, pending interactions, selector and budget.
+Branches compare methods that start from the same policy in the same worlds. What is random, or belongs to the choice
+of goals, is new: seed, draws, pending interactions, selector and budget.
 """
 
 from dataclasses import replace
@@ -10,7 +10,7 @@ from typing import Any
 from deimos.run.config import to_dict
 from deimos.run.trainer import TrainConfig
 
-WARM_UP = 10  # rollouts in which critics learn before the policy does: those of a selector know nothing yet
+WARM_UP = 10  # rollouts in which critics learn before the policy does: a selector's has learnt nothing yet
 MAY_DIFFER = (
     "method", "selector", "seed", "env_steps", "critic_warmup", "eval", "evaluation", "device", "threads",
     "tf32", "graph", "log", "video_every", "env.crash_penalty", "env.goal_period", "env.engine",
@@ -18,10 +18,10 @@ MAY_DIFFER = (
 
 
 def branch_config(origin: TrainConfig) -> TrainConfig:
-    """What a branch of a run is set up like unless somebody says otherwise: as the run, but for the method.
+    """The default configuration of a branch of a run: the run's own, except for the method.
 
-    Its seed is the next one, and critics learn for ``WARM_UP`` rollouts before the policy does. Branches that are to be
-    compared need the same.
+    Its seed is the next one, and critics learn for ``WARM_UP`` rollouts before the policy does. Branches that are
+    compared must share both.
     """
     return replace(
         origin, method=None, selector=None, seed=(origin.seed + 1) % 2**32, critic_warmup=WARM_UP, device="auto",
@@ -34,11 +34,11 @@ def check_branch(config: TrainConfig, origin: TrainConfig) -> None:
     ours, theirs = _fields(config), _fields(origin)
     for name in sorted(ours.keys() | theirs.keys(), key=lambda name: (name != "env.kind", name)):
         if ours.get(name) != theirs.get(name):
-            raise ValueError(f"{name} must be {theirs.get(name)}, as it was there, got {ours.get(name)}.")
+            raise ValueError(f"{name} must be {theirs.get(name)}, as in the origin, got {ours.get(name)}.")
 
 
 def _fields(config: TrainConfig) -> dict[str, Any]:
-    """All that must be the same, by the names of the command line; of files, a hash of what is in them."""
+    """All that must be the same, by the names of the command line; for files, a hash of their contents."""
     fields = flat(to_dict(config) | {"env": to_dict(config.env) | config.env.file_hashes()})
     free = tuple(f"{name}." for name in MAY_DIFFER)
     return {name: value for name, value in fields.items() if not f"{name}.".startswith(free)}

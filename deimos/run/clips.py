@@ -1,4 +1,4 @@
-"""Clips of the policy while it learns: ``videos/ITERATION.gif`` in a run's folder, from where the logs take them."""
+"""Clips of the policy while it learns: ``videos/ITERATION.gif`` in a run's folder, where the logs find them."""
 
 import logging
 import os
@@ -10,10 +10,12 @@ from tempfile import TemporaryDirectory
 
 from deimos.checks import RunError, one_line
 from deimos.files import write_bytes
+from deimos.nn.ranks import PATIENCE
 from deimos.run.folder import RunFolder
 
 VIDEOS = "videos"
-PATIENCE_SECONDS = 600.0  # mujoco-warp compiles for a minute or two where it has not yet
+# The first compilation of mujoco-warp takes a minute or two; other ranks, which wait for the clip, must not give up.
+PATIENCE_SECONDS = 0.8 * PATIENCE.total_seconds()
 
 _log = logging.getLogger(__name__)
 
@@ -39,21 +41,21 @@ def cut_clips(folder: RunFolder, iteration: int) -> None:
 
 
 def render(run: Path, policy: Path, clip: Path) -> None:
-    """Make a clip of a policy in the worlds of a run, in a process of its own.
+    """Make a clip of a policy in the worlds of a run, in a separate process.
 
     Raises:
-        OSError, subprocess.SubprocessError: If there is none; what the process said is in ``stderr``.
+        OSError, subprocess.SubprocessError: If it fails; what the process wrote is in ``stderr``.
     """
     subprocess.run(
         [sys.executable, "-m", "deimos.run.film", str(run), str(policy), str(clip)],
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=True,
         timeout=PATIENCE_SECONDS, start_new_session=True,  # Ctrl-C stops the training, after this clip
-        env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},  # the world of a clip is on the CPU; the GPU is the training's
+        env=os.environ | {"CUDA_VISIBLE_DEVICES": ""},  # the world of a clip is on the CPU; the GPU is for training
     )  # fmt: skip
 
 
 class Camera:
-    """Makes a clip every so many iterations; where that fails once, it says so and makes no more.
+    """Makes a clip every ``every`` iterations; after a failure it warns and makes no more.
 
     Args:
         folder: The run's folder.
@@ -64,7 +66,7 @@ class Camera:
         self._folder, self._every = folder, every
 
     def after(self, iteration: int, save_policy: Callable[[Path], None]) -> Path | None:
-        """The clip of an iteration; ``None`` where there is to be none, or it could not be made.
+        """The clip of an iteration; ``None`` if none is due, or it could not be made.
 
         Args:
             iteration: Its number, from 1.
@@ -81,7 +83,7 @@ class Camera:
                 path.parent.mkdir(exist_ok=True)
                 write_bytes(path, clip.read_bytes())
         except (OSError, RunError, subprocess.SubprocessError) as error:
-            said = (getattr(error, "stderr", None) or "").strip()
+            said = error.stderr.strip() if isinstance(error, subprocess.CalledProcessError) else ""
             reason = said.splitlines()[-1] if said else one_line(error)
             _log.warning("There will be no videos in the logs from iteration %d on: %s", iteration, reason)
             self._every = 0

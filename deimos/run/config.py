@@ -1,4 +1,4 @@
-"""Configurations to and from plain dictionaries, so that a run folder can rebuild its run."""
+"""Convert configurations to and from plain dictionaries, so that a run folder can rebuild its run."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ _PLAIN: dict[Any, tuple[str, Any]] = {
     bool: ("true or false", bool), int: ("a whole number", numbers.Integral), str: ("a text", str),
     float: ("a number", numbers.Real | str), Path: ("a path", str | Path),  # an infinity is a text in JSON
 }  # fmt: skip
-"""Types of fields: what a value is called that is one, and what it may be before it is converted."""
+"""Types of fields: the word for such a value in messages, and the types that are converted to it."""
 
 
 def to_dict(config: Any) -> dict:
@@ -42,7 +42,7 @@ def _plain(value: Any) -> Any:
 
 
 def with_plain_numbers(value: Any) -> Any:
-    """A configuration with Python's numbers in place of NumPy's, which neither JSON nor Warp take for numbers."""
+    """A configuration with Python's numbers in place of NumPy's, which neither JSON nor Warp accepts as numbers."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, tuple):
@@ -54,9 +54,9 @@ def with_plain_numbers(value: Any) -> Any:
 
 
 def require_readable(config: Any) -> None:
-    """Raise ``ValueError`` if a configuration would not come back from a run's folder, naming what is in the way.
+    """Raise ``ValueError`` if a configuration could not be read back from a run's folder, naming the cause.
 
-    Python asks for no types: ``evaluation="no"`` is true, and a folder that says so could not be read any more.
+    Python does not check types: ``evaluation="no"`` is true, but a folder that says so could no longer be read.
     """
     from_dict(type(config), to_dict(config))
 
@@ -71,7 +71,7 @@ def kind(config: EnvConfig | SelectorConfig) -> str:
     name = plugins.name_of(package, type(config).__module__)  # without importing the others, one of which may be broken
     if name is None or plugins.load(package, name).Config is not type(config):
         raise ValueError(
-            f"{type(config)} is not the Config of a plugin of {package.__name__}; register its module by "
+            f"{type(config)} is not the Config of a plugin of {package.__name__}; register its module with "
             "deimos.plugins.register, or install it."
         )
     return name
@@ -83,9 +83,9 @@ def from_dict(cls: type, data: dict, *, stored: bool = False) -> Any:
     Args:
         cls: Its class.
         data: Its fields. A missing one takes its default.
-        stored: Whether an earlier version may have written them. Then a missing field takes the value that was the only
-            one before there was the field, ``before`` in its metadata, where that is not the default. A field that
-            there was before is left out where it has the value that is the only one today, in the class's ``former``.
+        stored: Whether an earlier version may have written them. A missing field then takes the only value that there
+            was before the field existed, ``before`` in its metadata, if that is not the default. A field that no
+            longer exists is dropped if it has the only value that there is today, in the class's ``former``.
 
     Raises:
         ValueError: If a field is unknown or a value is not allowed.
@@ -119,7 +119,7 @@ def multiplied(config: Any, factors: Mapping[str, Any]) -> Any:
 
     Args:
         config: A dataclass.
-        factors: Numbers by the names of fields, or such tables where a field is a configuration. A field of an
+        factors: Numbers by the names of fields, or nested tables where a field is a configuration. A field of an
             environment that is ``None`` counts as what it stands for there, see ``EnvConfig.implied``.
 
     Raises:
@@ -147,7 +147,7 @@ def _product(config: Any, name: str, factor: Any) -> Any:
 
 
 def _typed(name: str, hint: Any, value: Any, stored: bool) -> Any:
-    """The value of a field as the type that ``hint`` asks for, where JSON cannot say it."""
+    """The value of a field as the type that ``hint`` asks for, where JSON cannot express it."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         if value is None:
             return None

@@ -9,13 +9,13 @@ OWN_GROUPS = Path("/proc/self/cgroup")
 
 
 def cores() -> int:
-    """CPU cores that this process may use: those of its affinity, but whole ones of its container's quota at most."""
+    """CPU cores that this process may use: those of its affinity, at most the whole cores of its container's quota."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([count, *map(int, _quotas())]))
 
 
 def _quotas() -> Iterator[float]:
-    """CPU time per second that each control group around this process may take [cores]; Linux alone has such."""
+    """CPU time per second that each control group around this process may use [cores]; only on Linux."""
     for group in _groups():
         try:
             if group.is_relative_to(CONTROL_GROUPS / "cpu"):  # version 1

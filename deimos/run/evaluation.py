@@ -1,7 +1,7 @@
 """How good and how safe a policy is: against uniform goals (Naive) and against attackers.
 
-Every policy meets the same worlds, and under uniform goals the same goals: the i-th of a world depends on the
-evaluation's seed, the world and i alone. An attacker that learns is trained after the policy, so that it knows this
+Every policy meets the same worlds, and under uniform goals the same goals: the i-th of a world depends only on
+the evaluation's seed, the world and i. An attacker that learns is trained after the policy, so that it knows this
 policy's weaknesses and not those of some training run.
 """
 
@@ -38,7 +38,7 @@ _ROW: dict[str, Any] = {
     "goals": str, "weights": str, "worlds": int, "steps": int, "goal_period": int,
     "crash_rate": int | float | None, "score": int | float | None,
 }  # fmt: skip
-"""What every row of it says, and of what kind that is."""
+"""What every row of it has, and of what type."""
 
 Progress = Callable[[str, float], None]
 """Called now and then with the stage's name and the share of it that is done."""
@@ -55,7 +55,7 @@ class EvalConfig:
     seed: int = 1_000_003
     """Seed of the worlds and their goals, in [0, 2^32 - 2). The same for all policies that are to be compared."""
     attackers: tuple[str, ...] = ("argmax", "scripted")
-    """Who attacks the policy, by name, each at most once (docs/how_to/evaluate.md)."""
+    """Attackers of the policy, by name, each at most once (docs/how_to/evaluate.md)."""
     adversary_steps: int = 1500
     """Steps of every world that ``argmax``, the thesis's Adversary, learns from, at least 1. Other attackers that learn
     take a multiple of it, the same for every policy."""
@@ -64,13 +64,12 @@ class EvalConfig:
     pool: Path | None = None
     """File of the attacker ``pooled``, which ``deimos pool`` makes."""
     oracle_worlds: int = 200
-    """How many of the worlds meet the attacker oracle, which tries goals in clones at N T steps per goal; at least
-    1."""
+    """Worlds that meet the attacker oracle, which tries goals in clones at N T steps per goal; at least 1."""
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps", "adversary_steps", "oracle_worlds"):
             check_at_least(name, getattr(self, name), 1)
-        check_seed(self.seed, spare=2)  # the next one is of what attackers learn from, the one after it of the shield
+        check_seed(self.seed, spare=2)  # the next one is for what attackers learn from, the one after it for the shield
         check_is("fear", self.fear, FearConfig)
         check_names("attackers", self.attackers)
         for name in self.attackers:
@@ -86,7 +85,7 @@ class EvalConfig:
 
 
 Scale = tuple[str, float, float]
-"""What a score is made of, and its values that make 0 and 1."""
+"""What a score is made of, and its values at scores 0 and 1."""
 Once = Callable[[dict, Callable[[], Scale]], Scale]
 """Gives a scale, from what it depends on and a function that computes it."""
 
@@ -111,9 +110,9 @@ def evaluate_run(
 ) -> list[dict]:  # fmt: skip
     """Evaluate the policy of a run, and keep the rows in its ``evaluation.json``.
 
-    There they replace the rows of the same evaluation of the same weights. One of another T, size, seed or engine, or
-    of an Adversary that was trained otherwise, is another evaluation, and stays beside them. Rows that the folder has
-    are made ``again`` or given back as they are; for the other arguments see ``evaluate``.
+    There they replace the rows of the same evaluation of the same weights. One with another T, size, seed or engine, or
+    with an Adversary that was trained differently, is another evaluation, and is kept. Rows that the folder has are
+    made ``again`` or returned as they are; for the other arguments see ``evaluate``.
 
     Returns:
         The rows of this evaluation, those of ``evaluate`` with the policy's ``weights_hash``.
@@ -123,13 +122,13 @@ def evaluate_run(
     weights = {"weights": weights_hash(policy.actor)}
     known = read_evaluation(folder)
     identities = [(identity | weights).items() for identity in _identities(env_config, config)]
-    same = [row for row in known if any(row.items() >= identity for identity in identities)]
+    same = [row for identity in identities for row in known if row.items() >= identity]
     if len(same) == len(identities) and not again:
         return same
     folder.require_writable()
 
     def keep(row: dict) -> None:
-        """Write a row as soon as it is made: a kill loses the one that is under way."""
+        """Write a row as soon as it is made: a kill loses only the one in progress."""
         made = row | weights
         identity = next(identity for identity in identities if made.items() >= identity)
         with folder.adding(EVALUATION):
@@ -146,7 +145,7 @@ def read_evaluation(folder: RunFolder) -> list[dict]:
     """The rows of a run's ``evaluation.json``; none if there is no such file.
 
     Raises:
-        RunError: If it cannot be read, or a row lacks what it is told by.
+        RunError: If it cannot be read, or a row lacks what every row has.
     """
     rows = folder.read_rows(EVALUATION)
     for number, row in enumerate(rows, 1):
@@ -179,7 +178,7 @@ def require_pool(config: EvalConfig) -> None:
 
 
 def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
-    """Rows of the folder that differ from these of an evaluation in nothing but the engine: how it did elsewhere."""
+    """Rows of the folder that differ from these of an evaluation only in the engine."""
 
     def identity(row: dict) -> list:
         keys = ("goals", "goal_period", "seed", "worlds", "steps", "environment", "adversary_setting", "weights")
@@ -192,7 +191,7 @@ def elsewhere(folder: RunFolder, rows: list[dict]) -> list[dict]:
 
 
 def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
-    """What each row of an evaluation says of how it was made, which tells it from the rows of other evaluations."""
+    """What each row of an evaluation says of how it was made, which distinguishes it from those of others."""
     shared = {name: value for name, value in to_dict(config).items() if name in ("worlds", "seed", "fear")}
     environment, engine = (
         _environment(env_config),
@@ -208,7 +207,7 @@ def _identities(env_config: EnvConfig, config: EvalConfig) -> list[dict]:
 
 
 def _environment(env_config: EnvConfig) -> str:
-    """A hash of a task as it is evaluated, but for what rows say apart; of its files, of what is in them."""
+    """A hash of a task as it is evaluated, except for what rows say themselves; files count by their contents."""
     try:
         files = env_config.file_hashes()
     except OSError as error:
@@ -222,7 +221,7 @@ def _digest(data: dict) -> str:
 
 
 def _setting(shared: dict, config: EvalConfig, name: str) -> str:
-    """A hash of all that fixes how an attacker was made, but for the policy."""
+    """A hash of all that determines how an attacker was made, except for the policy."""
     made = shared | {"adversary_steps": config.adversary_steps, "attacker": name} | to_dict(attacker(name))
     if attacker(name).needs_pool:
         assert config.pool is not None
@@ -246,22 +245,22 @@ def evaluate(
     """Evaluate a policy against uniform goals and against attackers.
 
     Args:
-        policy: What acts; of a Gaussian policy, its deterministic (mean) actions.
+        policy: Gives the actions; for a Gaussian policy, the deterministic (mean) ones.
         env_config: The environment that it was trained in; randomisations are switched off.
         config: Sizes, seed and attackers.
         device: Where to simulate.
-        progress: Told how far it is.
-        known: Rows of this policy that there are: they are given back and not made again.
+        progress: Called with the progress.
+        known: Existing rows of this policy: they are returned and not made again.
         keep: Called with each row that is made, before the next is begun.
         once: Gives the scale of the score, from what it depends on and a function that computes it; a study keeps it.
 
     Returns:
-        A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` gives, and ``score``: for
-        robots the place of its ``matching`` between standing still (0) and perfect tracking (1); else that of its
+        A row for ``naive`` and one for every attacker: in ``goals`` its name, what ``play`` returns, and ``score``: for
+        robots the place of its ``matching`` between standing still (0) and perfect tracking (1); otherwise that of its
         ``return_per_step`` between the policy that does nothing (0) and the environment's reference policy (1), both
-        under Naive goals; NaN where there is none. Who crashes may be below 0. For an attacker also its facts, see
-        ``deimos.run.attack``, and ``adversary_setting``, a hash of all that fixed how it was made but the policy. In
-        ``environment`` each has a hash of the task.
+        under Naive goals; NaN where there is none, or both are equal. A policy that crashes may be below 0. For an
+        attacker also its facts, see ``deimos.run.attack``, and ``adversary_setting``, a hash of all that determined how
+        it was made, except for the policy. In ``environment`` each has a hash of the task.
 
     Raises:
         ValueError: If ``steps`` is below 2 T: no interaction would end in time.
@@ -286,7 +285,7 @@ def evaluate(
         env = target.build(identity["worlds"], config.seed)
         row = play(env, policy, attack.selector(env), config.steps, partial(progress, goals))
         facts = attack.facts_beside(["score", *row, *identity], goals)
-        score = (row[measure] - low) / (high - low)
+        score = (row[measure] - low) / (high - low) if high != low else math.nan
         rows.append({"goals": goals} | row | facts | {"score": score} | identity)
         keep(rows[-1])
     return rows
@@ -305,15 +304,15 @@ def worst(policies: Sequence[Sequence[dict]]) -> list[dict]:
     """The worst that attackers did to each policy, among those that every policy has met.
 
     The largest of several noisy rates is too large. So the attacker is chosen by its crashes in worlds of even number
-    and reported by those in worlds of odd number. Where there are kinds of worlds, those of each are numbered apart, so
-    that both halves stand on the same ground.
+    and reported by those in worlds of odd number. Where there are kinds of worlds, those of each are numbered
+    separately, so that both halves have the same mix.
 
     Args:
         policies: For each, the rows of one evaluation; those of ``naive`` goals do not count.
 
     Returns:
-        For each policy the ``attacker``, its ``crash_rate``, and how many ``interactions`` that is the rate of; empty
-        where no attacker met all of them. Of attackers that tie it is the first.
+        For each policy the ``attacker``, its ``crash_rate``, and the number of ``interactions`` behind that rate; empty
+        where no attacker met all of them. Of attackers that tie, it is the first.
     """
     by_name = [
         {row["goals"]: halves for row in rows if row["goals"] != "naive" and (halves := _halves(row))}
@@ -332,7 +331,7 @@ def worst(policies: Sequence[Sequence[dict]]) -> list[dict]:
 def _halves(row: dict) -> tuple[float, float, int] | None:
     """Share of interactions that crashed in even worlds, in odd ones, and how many there were in odd ones."""
     even = row.get("even_interactions") or 0
-    if not 0 < even < row["interactions"]:  # of an earlier version, or too few to tell
+    if not 0 < even < row["interactions"]:  # from an earlier version, or too few
         return None
     crashed, odd = row["even_interaction_crashes"], row["interactions"] - even
     return crashed / even, (row["interaction_crashes"] - crashed) / odd, odd
@@ -341,7 +340,7 @@ def _halves(row: dict) -> tuple[float, float, int] | None:
 def score_scale(
     build: Callable[[int, int], Env], config: EvalConfig, progress: Progress = lambda stage, share: None
 ) -> Scale:
-    """What the score is made of, and its values that make 0 and 1; see ``evaluate``."""
+    """What the score is made of, and its values at scores 0 and 1; see ``evaluate``."""
     env = build(config.worlds, config.seed)
     rest = env.tracking_at_rest()
     if rest is not None:
@@ -366,13 +365,13 @@ def play(
     Returns:
         ``reward`` per transition, ``crashes``, ``crashes_per_1000`` transitions, ``interactions`` (issued early enough
         to end in time), ``crash_rate`` (share of those that crashed), those of worlds of even number (see ``worst``)
-        apart, and steps and crashes under first goals.
+        separately, and steps and crashes under first goals.
         ``return_per_step`` is the mean over interactions of (sum of the rewards over the T steps, 0 from a crash on) /
-        T: unlike the reward per transition it has nothing from the steps after a crash, but later interactions may gain
-        by one, which puts a particle far from every wall. ``matching``, where goals have several groups of components,
-        is the same of their tracking, weighted by ``Env.goal_group_weights``. ``tracking`` has the mean of every group
-        over transitions, ``strata`` the same and more by kind of world, where there are kinds, and ``errors`` the
-        median of each of ``Env.errors`` over all goals that were survived, at the end of their period.
+        T: unlike the reward per transition it excludes the steps after a crash, but later interactions may gain by one,
+        which puts a particle far from every wall. ``matching``, where goals have several groups of components, is the
+        same for their tracking, weighted by ``Env.goal_group_weights``. ``tracking`` has the mean of every group over
+        transitions, ``strata`` the same and more by kind of world, where there are kinds, and ``errors`` the median of
+        each of ``Env.errors`` over all goals that were survived, at the end of their period.
     """
     loop = GoalLoop(env, selector, window=steps, guard=guard)
     totals = torch.zeros(4, env.num_envs, dtype=torch.float64, device=env.device)
@@ -390,7 +389,7 @@ def play(
             values[t] = torch.where(met, env.errors[name], torch.nan)
         first_goal_steps += first
         first_goal_crashes += first & step.terminated
-        loop.advance(step)
+        loop.advance(step, in_time=True)
         if t % 100 == 0:
             progress(t / steps)
     env.check()
@@ -430,7 +429,7 @@ def _numbers(kinds: Sequence[str], device: torch.device) -> Tensor:
 
 
 def _matching(env: Env, done: Resolved) -> float:
-    """Mean tracking over interactions, 0 from a crash on, in [0, 1]; NaN where nothing has a weight."""
+    """Mean tracking over interactions, 0 from a crash on, in [0, 1]; NaN if all weights are 0."""
     counts = env.goal_group_weights or [1.0] * len(env.goal_groups)
     weights = torch.tensor(counts, dtype=torch.float64, device=done.tracking.device)
     return (done.tracking.double().mean(0) @ weights / weights.sum()).item()

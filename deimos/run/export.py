@@ -1,8 +1,8 @@
 """A trained policy as a folder that a robot's own software reads, without Deimos and without torch.
 
-``policy.onnx`` and ``fear.onnx`` are the networks, ``deploy.json`` says all that a deployment has to know about them,
-``controller.py`` is an example of one and checks the others. A legged robot has ``robot.xml`` too, and ``deploy.yaml``
-in the shape of Unitree's tools. No number is rounded.
+``policy.onnx`` and ``fear.onnx`` are the networks, ``deploy.json`` has all that a deployment has to know about them,
+``controller.py`` is an example of one and checks the others. A legged robot also has ``robot.xml``, and ``deploy.yaml``
+in the format of Unitree's tools. No number is rounded.
 """
 
 import hashlib
@@ -39,7 +39,7 @@ from deimos.sim.legged.task import Locomotion
 SCHEMA = 1  # of deploy.json
 ROBOTS = 64  # that walk in the check, and times that their observations are kept
 SECONDS = 10.0  # that they walk
-STEPS = 512  # of a check in worlds that have no seconds
+STEPS = 512  # of a check in environments without seconds
 CANDIDATES = 5  # for every decision of the fear network in the check
 
 
@@ -51,10 +51,11 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
     Args:
         folder: The run.
         out: The folder, which must not exist.
-        check: Whether it gets ``check.npz``, what ``controller.py`` compares with.
+        check: Whether to write ``check.npz``, which ``controller.py`` compares with.
 
     Raises:
-        RunError: If ``out`` exists, the run is broken, or something cannot be written.
+        RunError: If ``out`` exists, or the run is broken.
+        OSError, RunError: If something cannot be written.
     """
     if os.path.lexists(out):
         raise RunError(f"{out} exists and is not overwritten; choose another folder.")
@@ -63,7 +64,7 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
         steps = round(SECONDS / run.config.env.physics.control_period)
     env = SavedRun.open(folder.path, goal_period=steps).build(ROBOTS, run.config.eval.seed, 0)
     policy, afraid = run.policy(env), run.fear(env)
-    # Half a folder would be taken for a whole one: it gets its name when it is whole, so that a kill leaves none.
+    # A partial folder would be taken for a whole one: it gets its name when it is whole, in case of a kill.
     unfinished = out.with_name(f"{out.name}.{secrets.token_hex(4)}{PARTIAL}")
     try:
         unfinished.mkdir(parents=True)
@@ -79,7 +80,7 @@ def export_run(folder: RunFolder, out: Path, *, check: bool) -> None:
 def _write(
     folder: RunFolder, config: TrainConfig, policy: Policy, env: Env, afraid: FearSelector | None, out: Path
 ) -> None:
-    """Write everything but what the check compares with."""
+    """Write everything except what the check compares with."""
     weights = weights_hash(policy.actor)
     facts = {"weights": weights, "environment": kind(config.env), "units": "physical; see deploy.json"}
     goal = policy.goal_slice
@@ -103,7 +104,7 @@ def _write(
 def _describe(
     folder: RunFolder, config: TrainConfig, policy: Policy, env: Env, afraid: FearSelector | None, files: dict
 ) -> dict[str, Any]:
-    """``deploy.json``, but for the entry ``robot``."""
+    """``deploy.json``, except for the entry ``robot``."""
     stored = folder.read_json("config.json")
     sees = torch.zeros(env.obs_dim, dtype=torch.bool)
     sees[policy.actor.seen] = True
@@ -135,7 +136,7 @@ def _describe(
 
 
 def _entry(field: ObsField) -> dict[str, Any]:
-    """An entry of an observation: what the networks' files expect, in physical units, and what they make of it."""
+    """An entry of an observation: what the networks' files expect, in physical units, and how they scale it."""
     bound = export_robot.CLIPS.get(field.name)
     return {
         "name": field.name, "size": field.size, "unit": field.unit,
@@ -164,7 +165,7 @@ def _plain(values: Tensor) -> list[float | None]:
 
 
 def _play(env: Env, policy: Policy, afraid: FearSelector | None, steps: int) -> dict[str, np.ndarray]:
-    """Let the policy act from where the worlds are, each under one goal: what the exported files have to repeat."""
+    """Let the policy act from where the worlds are, each under one goal: what the exported files must reproduce."""
     walk = export_robot.Walk(env) if isinstance(env, Locomotion) else None
     rows = torch.arange(env.num_envs)
     kept: list[tuple[Tensor, Tensor]] = []
@@ -177,7 +178,7 @@ def _play(env: Env, policy: Policy, afraid: FearSelector | None, steps: int) -> 
             walk.note(step.terminated, step.truncated, step.tracking)
     obs, candidates = (torch.cat(parts) for parts in zip(*kept, strict=True))
     physical, goal_scale = obs / policy.scale, policy.scale[policy.goal_slice]
-    seen = physical * policy.scale  # what the division has rounded is rounded for both
+    seen = physical * policy.scale  # so that both have the division's rounding
     facts = {"policy.observation": physical[:, policy.actor.seen], "policy.action": policy.scaled(seen)}
     if afraid is not None:
         goals = candidates / goal_scale

@@ -1,4 +1,4 @@
-"""A controller for an exported policy, and its check, on NumPy and onnxruntime alone; its simulation needs MuJoCo.
+"""A controller for an exported policy, and its check, with NumPy and onnxruntime alone; its simulation needs MuJoCo.
 
 ``deimos export`` copies this file to the folder that it writes, as ``controller.py``. There it reads ``deploy.json``,
 ``policy.onnx``, ``fear.onnx`` and ``robot.xml``, and nothing else::
@@ -25,11 +25,11 @@ class Network:
     """An ONNX file whose contents are those that ``deploy.json`` names.
 
     Args:
-        folder: Where it lies.
+        folder: The exported folder.
         entry: Its entry in ``deploy.json``.
 
     Raises:
-        ValueError: If the file is another one.
+        ValueError: If the file is a different one.
     """
 
     def __init__(self, folder: Path, entry: dict) -> None:
@@ -51,7 +51,7 @@ def read(folder: Path) -> dict:
     """``deploy.json`` of a legged robot.
 
     Raises:
-        ValueError: If it is that of another environment.
+        ValueError: If it belongs to another environment.
     """
     deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
     if deploy["robot"] is None:
@@ -60,10 +60,10 @@ def read(folder: Path) -> dict:
 
 
 class Controller:
-    """From what one or several robots measure to the target angles of their joints.
+    """Computes the target angles of the joints from the measurements of one or several robots.
 
     Args:
-        folder: What ``deimos export`` has written.
+        folder: The folder that ``deimos export`` has written.
         robots: How many robots it controls at a time.
 
     Raises:
@@ -77,22 +77,22 @@ class Controller:
         """The last action as the joints took it, shape (robots, joints)."""
 
     def reset(self, robots: Any = slice(None)) -> None:
-        """Begin an episode, as those of the training began: with a last action of zero.
+        """Begin an episode as in training: with a last action of zero.
 
         Args:
-            robots: Which robots, an index of NumPy; by default all.
+            robots: Which robots, a NumPy index; by default all.
         """
         self.action[robots] = 0.0
 
     def targets(self, measured: dict[str, np.ndarray]) -> np.ndarray:
         """Target angles of the joints [rad], shape (robots, joints), in the order of ``deploy.json``.
 
-        Where it raises, the controller is as it was before the call: a program that goes on must keep its last targets,
-        or damp the joints, until what it measures is sound.
+        If it raises, the controller is as it was before the call: a program that goes on must keep its last targets, or
+        damp the joints, until its measurements are sound.
 
         Args:
-            measured: By name, the entries of ``deploy.json``'s observation in the units that it says, finite, shape
-                (robots, size) each; all but ``last_action``, which the controller knows.
+            measured: By name, the entries of ``deploy.json``'s observation in the units given there, finite, shape
+                (robots, size) each; all except ``last_action``, which the controller knows.
 
         Raises:
             KeyError: If one is missing.
@@ -126,9 +126,9 @@ class Simulation:
     """Robots in MuJoCo, one after the other, with the sensors of ``deploy.json``.
 
     Args:
-        folder: What ``deimos export`` has written.
-        qpos: Where they start, shape (robots, nq).
-        qvel: Shape (robots, nv).
+        folder: The folder that ``deimos export`` has written.
+        qpos: Initial positions, shape (robots, nq).
+        qvel: Initial velocities, shape (robots, nv).
 
     Raises:
         ValueError: If the export is not that of a legged robot.
@@ -148,12 +148,12 @@ class Simulation:
             data.qpos[:], data.qvel[:] = position, velocity
 
     def measure(self, goal: np.ndarray) -> dict[str, np.ndarray]:
-        """What the robots measure, by the names of the observation, with their goals."""
+        """The robots' measurements, by the names of the observation, with their goals."""
         qpos, qvel = (np.array([getattr(data, name) for data in self.robots]) for name in ("qpos", "qvel"))
         turn = self._turns(qpos[:, 3:7])  # from the base's frame to the world's
         measured = {
             "linear_velocity": np.einsum("nij,ni->nj", turn, qvel[:, :3]),
-            "angular_velocity": qvel[:, 3:6],  # MuJoCo has it in the base's frame
+            "angular_velocity": qvel[:, 3:6],  # in the base's frame, as MuJoCo has it
             "gravity": -turn[:, 2],
             "goal": goal,
             "joint_position": qpos[:, 7:] - self.pose,
@@ -168,7 +168,7 @@ class Simulation:
         return measured
 
     def step(self, targets: np.ndarray) -> np.ndarray:
-        """Simulate one control period; gives whether the base of each robot was pressed on the ground."""
+        """Simulate one control period; return whether the base of each robot was pressed on the ground."""
         fell = np.zeros(len(self.robots), bool)
         for i, data in enumerate(self.robots):
             data.ctrl[:] = targets[i]
@@ -178,7 +178,7 @@ class Simulation:
         return fell
 
     def _read_ground(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Samples of the ground [m], x along the first axis, the place of the first one, and their distance [m]."""
+        """Samples of the ground [m], x along the first axis, the position of the first one, and their spacing [m]."""
         if not self.model.nhfield:
             return np.zeros((2, 2)), np.zeros(2), 1.0
         shape, middle = (self.model.hfield_nrow[0], self.model.hfield_ncol[0]), self.model.geom_pos[self.ground]
@@ -202,19 +202,19 @@ class Simulation:
         return found.reshape(-1, 3, 3)
 
     def _points(self, qpos: np.ndarray, level: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Points of the frame of a robot's yaw in the world [m], shape (robots, points, 2)."""
+        """World positions of points given in the frame of each robot's yaw [m], shape (robots, points, 2)."""
         along, across = level[:, None], np.stack([-level[:, 1], level[:, 0]], axis=1)[:, None]
         return qpos[:, None, :2] + points[:, :1] * along + points[:, 1:] * across
 
     def _cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The ground's samples around points [m], shape (2, 2, robots, points), and where in their cells these are."""
+        """The ground's samples around points [m], shape (2, 2, robots, points), and their places in their cells."""
         place = np.clip((points - self.corner) / self.cell, 0, np.array(self.heights.shape) - 1)
         i, j = np.moveaxis(np.minimum(place.astype(int), np.array(self.heights.shape) - 2), 2, 0)
         samples = [[self.heights[i, j], self.heights[i, j + 1]], [self.heights[i + 1, j], self.heights[i + 1, j + 1]]]
         return np.array(samples), place[..., 0] - i, place[..., 1] - j
 
     def _lowest(self, points: np.ndarray) -> np.ndarray:
-        """The ground at points as the policy was shown it: the least of three samples of each one's cell [m]."""
+        """The ground at points as the policy was shown it: the lowest of three samples of each point's cell [m]."""
         samples, _, _ = self._cells(points)
         return np.minimum(np.minimum(samples[0, 0], samples[1, 0]), samples[0, 1])
 
@@ -225,7 +225,7 @@ class Simulation:
         return near + s * (far - near)
 
     def _end_effectors(self, qpos: np.ndarray, turn: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Where the end effectors are, as the arm's part of a goal there would be, shape (robots, 3)."""
+        """Where the end effectors are, expressed like the arm's part of a goal, shape (robots, 3)."""
         arm = self.robot["arm"]
         point = np.tile(arm["offsets"][-1], (len(qpos), 1))
         first = qpos.shape[1] - len(arm["axes"])
@@ -260,7 +260,7 @@ def track(measured: dict[str, np.ndarray], variance: float) -> np.ndarray:
 
 
 def compare_networks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -> bool:
-    """Print how far the networks' outputs are from those of the export; gives whether all are the same."""
+    """Print how far the networks' outputs are from those of the export; return whether all are the same."""
     jobs: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = [("policy", ("observation",), ("action",))]
     if deploy["fear"]:
         jobs.append(("fear", ("state", "goal", "candidates"), tuple(deploy["fear"]["outputs"])))
@@ -276,13 +276,13 @@ def compare_networks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -
                 size = np.abs(wanted) if key == "logit" else 0.1 * np.abs(known[f"{name}.{key}"]).max()
                 scale = np.maximum(1.0, size)  # float32 does not have 1e-5 of actions far beyond 10
                 worst = float(np.maximum(worst, (np.abs(value - wanted) / scale).max()))  # max() would drop a NaN
-        passed &= worst <= TOLERANCE  # no NaN is
+        passed &= worst <= TOLERANCE  # False for NaN
         print(f"{deploy[name]['file']}, batches of {', '.join(map(str, sizes))}: largest difference {worst:.2g}")
     return passed
 
 
 def compare_walks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -> bool:
-    """Print how the robots walk here and how they did at the export; gives whether they walk as well."""
+    """Print how the robots walk here and how they did at the export; return whether they walk as well."""
     goal, steps, fell_there = known["walk.goal"], known["walk.steps"], known["walk.fell"]
     controller, worlds = Controller(folder, len(goal)), Simulation(folder, known["walk.qpos"], known["walk.qvel"])
     fell = np.zeros(len(goal), bool)
@@ -301,7 +301,7 @@ def compare_walks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -> b
 
 
 def main(folder: Path) -> bool:
-    """Check an exported folder; gives whether it does what it did at the export."""
+    """Check an exported folder; return whether it does what it did at the export."""
     deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
     with np.load(folder / "check.npz") as file:
         known = dict(file)

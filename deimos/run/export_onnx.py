@@ -1,6 +1,6 @@
 """A policy and its fear network as ONNX, written from the layers themselves: no tracer, a dynamic batch, one file each.
 
-What a network needs is inside its file: the scale of every observation, the normaliser's statistics, the calibration.
+All that a network needs is in its file: the scale of every observation, the normaliser's statistics, the calibration.
 Inputs are in physical units.
 """
 
@@ -18,8 +18,8 @@ from deimos.nn.normalizer import EPSILON
 if TYPE_CHECKING:
     import onnx
 
-OPSET = 17  # old enough for the onnxruntime of 2022, and all that an MLP needs
-IR_VERSION = 8  # the file format's, which came with that opset
+OPSET = 17  # old enough for the onnxruntime of 2022, and enough for an MLP
+IR_VERSION = 8  # of the file format, which came with that opset
 _OPERATORS = {nn.ReLU: "Relu", nn.ELU: "Elu", nn.Tanh: "Tanh"}
 
 
@@ -31,7 +31,7 @@ class _Graph:
         self.constants: dict[str, onnx.TensorProto] = {}
 
     def constant(self, name: str, value: Tensor | np.ndarray | float) -> str:
-        """Keep a constant, as float32 unless it is an array of whole numbers; gives its name."""
+        """Keep a constant, as float32 unless it is an array of whole numbers; return its name."""
         from onnx import numpy_helper
 
         array = value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
@@ -40,7 +40,7 @@ class _Graph:
         return name
 
     def add(self, operator: str, *inputs: str, out: str | None = None, **attributes: int) -> str:
-        """Add a node; gives the name of its output."""
+        """Add a node; return the name of its output."""
         from onnx import helper
 
         name = out or f"{operator.lower()}_{len(self.nodes)}"
@@ -62,7 +62,7 @@ class _Graph:
         return x
 
     def model(self, name: str, inputs: dict[str, list], outputs: dict[str, list], facts: dict[str, str]) -> bytes:
-        """The model in ONNX's format, checked; inputs and outputs by name with their shapes."""
+        """The model in ONNX format, checked; inputs and outputs by name with their shapes."""
         from onnx import TensorProto, checker, helper
 
         shown = [
@@ -78,12 +78,12 @@ class _Graph:
 
 
 def policy_model(policy: Policy, facts: dict[str, str]) -> bytes:
-    """A policy: physical observations ``observation`` (batch, n) to mean actions ``action`` (batch, action_dim).
+    """A policy, from physical observations ``observation`` (batch, n) to mean actions ``action`` (batch, action_dim).
 
     The n components are those that the actor sees, in the order of ``Policy.layout``.
 
     Args:
-        policy: What is exported.
+        policy: The policy.
         facts: Texts that are kept in the file's metadata.
     """
     graph, actor = _Graph(), policy.actor
@@ -102,7 +102,7 @@ def policy_model(policy: Policy, facts: dict[str, str]) -> bytes:
 
 
 def fear_outputs(afraid: FearSelector) -> tuple[str, ...]:
-    """What the file of a fear network says of goals: ``logit``, and ``probability`` where that is what it is."""
+    """Outputs of the file of a fear network: ``logit``, and ``probability`` where that is calibrated."""
     return ("logit", "probability") if afraid.is_calibrated else ("logit",)
 
 
@@ -115,8 +115,8 @@ def fear_model(afraid: FearSelector, scale: Tensor, goal_scale: Tensor, facts: d
 
     Args:
         afraid: The selector that the network belongs to.
-        scale: What components of a state are multiplied by, shape (state_dim,).
-        goal_scale: What components of a goal are multiplied by, shape (goal_dim,).
+        scale: Factors on the components of a state, shape (state_dim,).
+        goal_scale: Factors on the components of a goal, shape (goal_dim,).
         facts: Texts that are kept in the file's metadata.
     """
     graph, (first, *others) = _Graph(), list(afraid.fear.network)

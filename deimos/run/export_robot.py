@@ -1,4 +1,4 @@
-"""What a deployment needs of a legged robot beside its policy: the model, its numbers, and how it walked here."""
+"""What a deployment needs of a legged robot besides its policy: the model, its numbers, and how it walked here."""
 
 import ctypes
 import itertools
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import mujoco
 
 GROUND = "ground.bin"
-DIGITS = 17  # significant ones that tell any two numbers of double precision apart
+DIGITS = 17  # significant ones, enough to distinguish any two numbers of double precision
 SOURCES = {
     "linear_velocity": "velocity of the base in its own frame; a state estimator",
     "angular_velocity": "rate of the base in its own frame; a gyroscope",
@@ -34,12 +34,12 @@ SOURCES = {
     "joint_position": "angles minus default_position, in the order of robot.joints; encoders",
     "joint_velocity": "in the order of robot.joints; encoders",
     "last_action": "the last action, within action.low and action.high",
-    "end_effector": "where it is, as the arm's part of a goal there would be; forward kinematics and the base's height",
+    "end_effector": "where it is, expressed like the arm's part of a goal; forward kinematics and the base's height",
     "heights": "base minus standing_height minus ground, at robot.heights.points in the frame of the yaw; a height map",
 }
 """What every entry of a robot's observation is, and what measures it."""
 CLIPS = {"heights": HEIGHT_BOUND, "end_effector": SEEN_BOUND}
-"""Bounds of entries of the observation on either side, in their units."""
+"""Symmetric bounds of entries of the observation, in their units."""
 
 
 def write_model(env: Locomotion, folder: Path) -> None:
@@ -52,7 +52,7 @@ def write_model(env: Locomotion, folder: Path) -> None:
 
     spec = build_spec(env.robot, env.physics.terrain, env.config.physics, visual=True)
     for foot in itertools.chain.from_iterable(env.robot.parts[1:5]):
-        spec.geom(foot).friction[0] = env.config.friction[0]  # worlds without randomness have one, not the robot's own
+        spec.geom(foot).friction[0] = env.config.friction[0]  # worlds without randomness use this, not the robot's own
     wanted = spec.compile()
     for field in spec.hfields:  # in the XML itself it would be some fifty megabytes
         data = np.asarray(field.userdata, np.float32)
@@ -72,12 +72,12 @@ def write_model(env: Locomotion, folder: Path) -> None:
 
 
 def _to_xml(spec: "mujoco.MjSpec") -> str:
-    """The model as MJCF with all digits, where this MuJoCo can: by default it writes six of them."""
+    """The model as MJCF with all digits, if this MuJoCo can write them: by default it writes six."""
     import mujoco
 
     home = Path(mujoco.__file__).parent  # with libmujoco.so.X, libmujoco.X.dylib or mujoco.dll
     libraries = [ctypes.CDLL(str(path)) for path in home.iterdir() if re.match(r"(lib)?mujoco\.", path.name)]
-    named = [f"_mjPRIVATE__{verb}_xml_precision" for verb in ("set", "get")]  # not promised
+    named = [f"_mjPRIVATE__{verb}_xml_precision" for verb in ("set", "get")]  # not a public interface
     change, ask = (next((getattr(each, name, None) for each in libraries), None) for name in named)
     if change is None or ask is None:
         return spec.to_xml()
@@ -90,10 +90,10 @@ def _to_xml(spec: "mujoco.MjSpec") -> str:
 
 
 def _numbers(model: "mujoco.MjModel") -> dict[str, np.ndarray]:
-    """A model's arrays that physics depends on, by name: all but looks and where texts are.
+    """A model's arrays that physics depends on, by name: all except appearance and the addresses of texts.
 
-    Looks are visual geoms too: MuJoCo keeps meshes about their own middle, and writes the last bit of where that leaves
-    their geoms otherwise.
+    Visual geoms are appearance too: MuJoCo centres meshes on their own middle, and writes the resulting positions of
+    their geoms with a different last bit.
     """
     looks = ("vis", "mat_", "tex_", "light_", "cam_", "geom_rgba", "site_rgba", "name", "paths", "text_")
     arrays = {
@@ -141,7 +141,7 @@ def _describe_arm(arm: Arm, standing_height: float) -> dict[str, Any]:
 
 
 class Walk:
-    """How robots of an environment walk from where they are, for the check of an export; a goal may not change.
+    """How robots of an environment walk from where they are, for the check of an export; goals must not change.
 
     Args:
         env: The robots, just built.
@@ -157,7 +157,7 @@ class Walk:
         self._met = torch.zeros(env.num_envs, len(env.goal_groups), dtype=torch.float64)
 
     def note(self, terminated: Tensor, truncated: Tensor, tracking: Tensor) -> None:
-        """Take note of a step; see ``Step``. Who has left the terrain counts no more, who has fallen tracks nothing."""
+        """Take note of a step; see ``Step``. Robots off the terrain no longer count, fallen ones track nothing."""
         self._left |= truncated & ~terminated
         self._fell |= terminated & ~self._left
         self._steps += ~self._left

@@ -1,26 +1,27 @@
-"""``deploy.yaml``, as ``unitree_rl_lab`` writes it for the controllers of its folder ``deploy``.
+"""``deploy.yaml``, as ``unitree_rl_lab`` writes it for the controllers in its folder ``deploy``.
 
-Its source is ``source/unitree_rl_lab/unitree_rl_lab/utils/export_deploy_cfg.py`` of that repository, which rounds to
-three digits; nothing is rounded here. A controller of theirs multiplies observations by their ``scale`` and then runs
-a network, but those of ``policy.onnx`` are physical, scaled inside: so every ``scale`` is 1. Their ``last_action`` is
-what the network gave, ours what the joints took of it; they differ where a target is beyond a joint's range.
+The model is ``source/unitree_rl_lab/unitree_rl_lab/utils/export_deploy_cfg.py`` of that repository, which rounds to
+three digits; nothing is rounded here. Its controllers multiply observations by their ``scale`` and then run
+a network, but ``policy.onnx`` takes physical ones and scales them itself: so every ``scale`` is 1. Their
+``last_action`` is the network's output, ours is what the joints took of it; they differ where a target is beyond a
+joint's range.
 """
 
 from pathlib import Path
 from typing import Any
 
 UNITREE = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
-"""Where our leg joints are among the motors of Unitree's quadrupeds: front right, front left, rear right, rear left."""
+"""Numbers of our leg joints among the motors of Unitree's quadrupeds: front right and left, rear right and left."""
 _TERMS = {
     "linear_velocity": "base_lin_vel", "angular_velocity": "base_ang_vel", "gravity": "projected_gravity",
     "goal": "velocity_commands", "joint_position": "joint_pos_rel", "joint_velocity": "joint_vel_rel",
     "last_action": "last_action", "heights": "height_scan",
 }  # fmt: skip
-"""What Isaac Lab calls the entries of an observation."""
+"""Isaac Lab's names of the entries of an observation."""
 
 
 def describe(deploy: dict[str, Any]) -> dict[str, Any]:
-    """What ``deploy.yaml`` says.
+    """The contents of ``deploy.yaml``.
 
     Args:
         deploy: ``deploy.json``, of a legged robot.

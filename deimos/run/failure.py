@@ -1,4 +1,4 @@
-"""What a run leaves behind when its numbers are no numbers any more, so that whoever mends it can see why."""
+"""What a run leaves behind when its numbers are no longer finite, so that the cause can be found."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ SCHEMA = 1  # of both files
 
 
 def check_finite(trainer: Trainer) -> None:
-    """Raise ``SimulationError`` if a number is not finite that a checkpoint would keep and that must be, or is huge."""
+    """Raise ``SimulationError`` if a number that a checkpoint would keep is huge, or not finite although it must be."""
     for name, bad in unsound("", _parts(trainer)):
         raise SimulationError(
             f"Iteration {trainer.iteration}: {int(bad.sum())} of the {bad.numel()} numbers of {name} are not finite, "
@@ -29,7 +29,7 @@ def check_finite(trainer: Trainer) -> None:
 
 
 def dump(trainer: Trainer, folder: RunFolder, error: SimulationError, versions: dict[str, str]) -> None:
-    """Write down what stopped a run: ``failure.json`` for reading, ``failure.pt`` with all its numbers.
+    """Record what stopped a run: ``failure.json`` for reading, ``failure.pt`` with all its numbers.
 
     The report lists every tensor with a number that is not finite, or that is huge: its shape, how many there are, and
     in which worlds (or rows, where a tensor has no worlds); and the first steps of the rollout on which a world broke,
@@ -38,6 +38,8 @@ def dump(trainer: Trainer, folder: RunFolder, error: SimulationError, versions: 
     """
     worlds = trainer.env.num_envs
     rollout = {name: value for name, value in vars(trainer.rollout).items() if isinstance(value, Tensor)}
+    cut_off = trainer.rollout.truncated.unsqueeze(2)
+    rollout["last_obs"] = trainer.rollout.last_obs.where(cut_off, 0.0)  # elsewhere is what the memory held before
     found = [*unsound("", _parts(trainer)), *unsound("rollout", rollout)]
     report = {
         "schema": SCHEMA, "error": str(error), "rank": error.rank, "iteration": trainer.iteration, "versions": versions,
@@ -78,7 +80,7 @@ def _places(bad: Tensor, worlds: int | None = None) -> list[int]:
 
 @contextlib.contextmanager
 def dumped(trainer: Trainer, folder: RunFolder, versions: Callable[[], dict[str, str]]) -> Iterator[None]:
-    """Write down what a ``SimulationError`` within the context was about, and raise it with the place of the report."""
+    """Report on a ``SimulationError`` raised within the context, and raise it with the path of the report."""
     try:
         yield
     except SimulationError as error:
@@ -86,6 +88,6 @@ def dumped(trainer: Trainer, folder: RunFolder, versions: Callable[[], dict[str,
             with together():
                 if error.rank == place().rank:
                     dump(trainer, folder, error, versions())
-        except RunError:  # the disk is full too: the first error is the one to tell
+        except RunError:  # the disk is full too: the first error is the one to report
             raise error from None
-        raise SimulationError(f"{error} What it was about is in {folder.path / REPORT}.") from error
+        raise SimulationError(f"{error} Details are in {folder.path / REPORT}.") from error

@@ -1,4 +1,4 @@
-"""Who chose the goals of a run, as it has learnt, for whoever asks it after the training."""
+"""The selector of a run's goals, with what it has learnt, for use after the training."""
 
 from dataclasses import replace
 
@@ -13,14 +13,14 @@ from deimos.sim.env import Env
 
 
 def load_selector(folder: RunFolder, config: TrainConfig, env: Env) -> GoalSelector | None:
-    """The selector of a run with all that it has learnt; ``None`` where it has no fear network that has learnt.
+    """The selector of a run with all that it has learnt; ``None`` if it has no fear network that has learnt.
 
-    It may be asked to propose, but must not be told what it issued: it is one for the worlds of the training.
+    It may be asked to propose, but must not be told what it issued: its state belongs to the worlds of the training.
 
     Args:
         folder: The run.
         config: Its configuration.
-        env: Worlds of its environment, where the networks shall be.
+        env: Worlds of its environment, on the device that the networks are to be on.
 
     Raises:
         RunError: If there is no checkpoint, or it does not fit.
@@ -30,7 +30,7 @@ def load_selector(folder: RunFolder, config: TrainConfig, env: Env) -> GoalSelec
     afraid = fear_selector(selector)
     if afraid is None:
         return None
-    state = load_checkpoint(folder).get("loop", {}).get("selector", {})  # some hold networks alone
+    state = load_checkpoint(folder).get("loop", {}).get("selector", {})  # some hold only networks
     try:
         _restore(selector, state)
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -40,7 +40,7 @@ def load_selector(folder: RunFolder, config: TrainConfig, env: Env) -> GoalSelec
 
 
 def _restore(selector: GoalSelector, state: dict) -> None:
-    """Continue from a state of any version: what it lacks stays as it is."""
+    """Continue from a state of any version: what it lacks is left as it is."""
     for part, saved in zip(selector.parts, state.get("parts", [state]), strict=False):  # a Mix was saved as its method
         _restore(part, saved)
     own = {name: value for name, value in state.items() if name != "parts"}
@@ -48,7 +48,7 @@ def _restore(selector: GoalSelector, state: dict) -> None:
 
 
 def learnt_fear(selector: GoalSelector | None) -> FearSelector | None:
-    """The selector with a fear network that has learnt, of those that ``selector`` is made of."""
+    """The part of ``selector`` that has a fear network that has learnt; ``None`` if there is no such part."""
     afraid = None if selector is None else fear_selector(selector)
     return afraid if afraid is not None and afraid.fear.fitted else None
 

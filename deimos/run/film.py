@@ -1,7 +1,7 @@
-"""A policy at work, as pictures. ``python -m deimos.run.film RUN POLICY VIDEO`` makes a clip for the logs of a run.
+"""Pictures of a policy in action. ``python -m deimos.run.film RUN POLICY VIDEO`` makes a clip for the logs of a run.
 
-Clips are made by a process of their own, ``deimos.run.clips`` begins it: what MuJoCo renders with is decided when it is
-imported, and neither OpenGL nor a codec can take a training with it.
+``deimos.run.clips`` makes clips in a separate process: MuJoCo's renderer is chosen when it is imported, and a crash of
+OpenGL or a codec must not end the training.
 """
 
 import sys
@@ -22,13 +22,13 @@ from deimos.sim.drawing import with_caption
 from deimos.sim.env import Env
 from deimos.sim.rendering import choose_renderer, load_renderer, view
 
-PACE = 50.0  # steps per second of video, in worlds that have no seconds
-SEED = 1_000_003  # of the world that is shown, and its goals
+PACE = 50.0  # steps per second of video, in environments without seconds
+SEED = 1_000_003  # of the world that is shown, and of its goals
 SIZE = (320, 240)  # of a clip for the logs [pixels]
 SECONDS, FPS = 4.0, 12.5  # of such a clip
 
 Caption = Callable[[int, int], str]
-"""What stands in a picture, by the step and the number of crashes so far."""
+"""The caption of a picture, from the step and the number of crashes so far."""
 
 
 def seconds_per_step(env: Env) -> float:
@@ -53,7 +53,7 @@ def film(
     env: Env, policy: Policy, writer: AbstractContextManager[Write], size: tuple[int, int], every: int, count: int,
     caption: Caption,
 ) -> Iterator[int]:  # fmt: skip
-    """Let a policy act under uniform goals, and write pictures of world 0; gives the step of each one written.
+    """Let a policy act under uniform goals, and write pictures of world 0; yield the step of each one written.
 
     Args:
         env: The worlds.
@@ -62,7 +62,7 @@ def film(
         size: Width and height [pixels].
         every: Steps from one picture to the next.
         count: Steps in all.
-        caption: What stands in them.
+        caption: Their captions.
 
     Raises:
         RunError: If there is nothing to render, or nothing to render with.
@@ -89,7 +89,7 @@ def caption(env: Env, t: int, crashes: int) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Make a clip of what the arguments name; returns the exit code, and says in a line why there is none."""
+    """Make a clip of what the arguments name; return the exit code. If it fails, one line on stderr says why."""
     path, policy, target = map(Path, arguments)
     torch.set_num_threads(1)
     choose_renderer()

@@ -1,4 +1,4 @@
-"""A run's folder: what is written where, so that it survives a kill at any moment."""
+"""A run's folder: what is written where, and how it survives a kill at any moment."""
 
 import csv
 import io
@@ -17,13 +17,13 @@ from deimos.lock import hold
 
 OF_TRAINING = ("config.json", "checkpoint.pt", "policy.pt", "progress.csv", "timing.csv")
 """Files that only the process that trains writes."""
-PATIENCE_SECONDS = 60.0  # to add to a file that another process is just adding to
+PATIENCE_SECONDS = 60.0  # to wait for a file that another process is adding to
 
 
 class RunFolder:
     """The files of one run: ``config.json``, ``progress.csv``, ``timing.csv``, ``checkpoint.pt`` and the rest.
 
-    What cannot be made, read or written raises ``RunError``.
+    Methods raise ``RunError`` if a file or folder cannot be created, read or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,7 +32,7 @@ class RunFolder:
 
     @staticmethod
     def require_new(path: Path) -> None:
-        """Refuse a folder of a new run that exists."""
+        """Refuse a folder for a new run that exists."""
         if path.exists():
             raise RunError(f"{path} exists and is not overwritten; choose another --out, or continue with --resume.")
 
@@ -43,7 +43,7 @@ class RunFolder:
         try:
             path.mkdir(parents=True)
         except OSError as error:
-            raise RunError(f"The run folder {path} cannot be made ({error.strerror}).") from error
+            raise RunError(f"The run folder {path} cannot be created ({error.strerror}).") from error
         return cls(path)
 
     @classmethod
@@ -54,7 +54,7 @@ class RunFolder:
         return cls(path)
 
     def require_writable(self) -> None:
-        """Refuse a folder that cannot be written to: for those who would find out after long work, which were lost."""
+        """Refuse a folder that cannot be written to, before long work whose result would be lost."""
         if not os.access(self.path, os.W_OK):
             raise RunError(f"{self.path} cannot be written to; work on a copy of it.")
 
@@ -67,7 +67,7 @@ class RunFolder:
             yield
 
     def adding(self, name: str) -> AbstractContextManager[None]:
-        """Hold a file while something is added to it; waits for another process that is just doing so."""
+        """Hold a file while something is added to it; waits for another process that is doing so."""
         return hold(self.path / f"{name}.lock", str(self.path / name), patience=PATIENCE_SECONDS)
 
     def write_json(self, name: str, data: Any) -> None:
@@ -95,11 +95,11 @@ class RunFolder:
         return rows
 
     def keep(self, name: str, read: Callable[[], tuple[bytes, str]]) -> str:
-        """Copy a file that a run is built from; gives what the copy is called.
+        """Copy a file that a run is built from; return the name of the copy.
 
         Args:
-            name: What the copy is called, without its ending.
-            read: Gives its contents and its ending.
+            name: Name of the copy, without its ending.
+            read: Returns its contents and its ending.
         """
         try:
             data, ending = read()
@@ -111,7 +111,7 @@ class RunFolder:
     def read_csv(self, name: str) -> list[dict[str, str]]:
         """All rows of a CSV file, each of numbers or empty cells; none if there is no file.
 
-        A last line without its end is that of a killed run, and left out.
+        A last line without a line break is that of a killed run, and left out.
 
         Raises:
             RunError: If it cannot be read, or is damaged; the message names the line.
@@ -124,7 +124,7 @@ class RunFolder:
         except OSError as error:
             raise RunError(f"{path} cannot be read ({error.strerror}).") from error
         except ValueError as error:
-            way_out = "mend it, or move it away: the run goes on without it."
+            way_out = "repair it, or move it away: the run goes on without it."
             raise RunError(f"{path}, {first_line(error)}; {way_out}") from error
 
     def cut_csv(self, name: str, iteration: int) -> None:
@@ -134,6 +134,7 @@ class RunFolder:
         path = self.path / name
         if not kept:
             path.unlink(missing_ok=True)
+            self._columns.pop(name, None)  # or the next row would go without their names
         elif len(kept) < len(rows) or not read_bytes(path).endswith(b"\n"):
             self._write_csv(name, kept[0], kept)
 
@@ -142,14 +143,14 @@ class RunFolder:
 
         Raises:
             RunError: If it cannot be written.
-            TypeError: If a value is no number.
+            TypeError: If a value is not a number.
         """
         path = self.path / name
         cells = {key: _cell(key, value) for key, value in row.items()}
         if name not in self._columns:
             self._columns[name] = [*next(iter(self.read_csv(name)), {})]
         columns = self._columns[name]
-        if columns and (new := [key for key in row if key not in columns]):  # of a version that says more
+        if columns and (new := [key for key in row if key not in columns]):  # from a version that writes more
             columns += new
             self._write_csv(name, columns, self.read_csv(name))
         try:
@@ -171,7 +172,7 @@ class RunFolder:
 
 
 def _cell(name: str, value: Any) -> str:
-    """A number as it is written, those of NumPy and one-element tensors as those of Python; NaN as nothing."""
+    """A number as it is written, NumPy's and one-element tensors like Python's; NaN as an empty text."""
     if isinstance(value, numbers.Integral):
         return repr(int(value))
     try:
@@ -182,8 +183,8 @@ def _cell(name: str, value: Any) -> str:
 
 
 def _rows(data: bytes) -> Iterator[dict[str, str]]:
-    """The rows of a CSV file of numbers whose iterations grow; ``ValueError`` names the first line that is none."""
-    lines = data.decode("utf-8-sig", "surrogateescape").split("\n")[:-1]  # after the last end there is half a line
+    """The rows of a CSV file of numbers whose iterations grow; ``ValueError`` names the first line that is not one."""
+    lines = data.decode("utf-8-sig", "surrogateescape").split("\n")[:-1]  # the last line is incomplete
     columns: list[str] = []
     last = 0
     for number, line in enumerate(lines, 1):

@@ -1,8 +1,8 @@
 """Where the numbers of a run are shown while it trains: ``--log tensorboard wandb``.
 
-``progress.csv`` and ``timing.csv`` are what a run is known by; these are views of them. A run that was killed has said
-things that the resumed one says again: each log says below how it comes to have every iteration once. A clip of the
-policy (``deimos.run.clips``) stands among the numbers of its iteration.
+``progress.csv`` and ``timing.csv`` are the record of a run; logs are views of them. A resumed run writes again what it
+wrote before it was killed: each log below explains how it gets every iteration once. A clip of the policy
+(``deimos.run.clips``) is logged with the numbers of its iteration.
 """
 
 import re
@@ -19,15 +19,15 @@ from deimos.checks import RunError, one_line
 from deimos.run.clips import clips
 from deimos.run.folder import RunFolder
 
-VIDEO = "policy"  # what clips are called in the logs
-WANDB = "wandb.json"  # in a run's folder: the name of the run among those of Weights & Biases
+VIDEO = "policy"  # name of the clips in the logs
+WANDB = "wandb.json"  # in a run's folder: the name of the run at Weights & Biases
 
 
 class Log(Protocol):
-    """Where numbers are shown."""
+    """What numbers are written to."""
 
     def write(self, iteration: int, row: dict[str, float], clip: Path | None) -> None:
-        """Show what an iteration has given: its numbers, and a GIF where one was made."""
+        """Write the results of an iteration: its numbers, and a GIF if one was made."""
 
     def flush(self) -> None:
         """Make what was written survive a kill: called before every checkpoint."""
@@ -39,15 +39,15 @@ class Log(Protocol):
 class TensorBoard:
     """Event files in the run's folder.
 
-    All that came before a checkpoint is on the disk when it is written, so nothing is missing before a resume; what an
-    earlier file says of later iterations, TensorBoard drops when it meets the first step of the next file.
+    All that came before a checkpoint is on the disk when it is written, so a resumed log has no gap; what an earlier
+    file says of later iterations, TensorBoard drops when it reads the first step of the next file.
     """
 
     def __init__(self, folder: RunFolder, facts: dict[str, Any], iteration: int) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         # Files are read in the order of their names, which have the second and then the process: a resumed run must not
-        # begin in the second of its predecessor.
+        # start in the same second as its predecessor.
         begun = (path.name.split(".")[3] for path in folder.path.glob("events.out.tfevents.*"))
         newest = max((int(second) for second in begun if second.isdigit()), default=0)
         time.sleep(min(max(newest + 1 - time.time(), 0.0), 1.0))
@@ -58,7 +58,7 @@ class TensorBoard:
         """See ``Log.write``."""
         for name, value in row.items():
             self._board.add_scalar(name, value, iteration)
-        if clip is not None:  # as ``SummaryWriter.add_video`` does, which encodes by moviepy
+        if clip is not None:  # as ``SummaryWriter.add_video`` does, which needs moviepy
             from tensorboard.compat.proto.summary_pb2 import Summary
 
             data = clip.read_bytes()
@@ -70,8 +70,8 @@ class TensorBoard:
 class WeightsAndBiases:
     """A run of Weights & Biases, under the same identity however often it is resumed; offline if WANDB_MODE says so.
 
-    A process of its own writes and sends the numbers, and what it had not done when the run was killed nobody knows. So
-    a resumed run begins the log anew from the tables of its folder: offline in place of the earlier files, online from
+    A separate process writes and sends the numbers, and what it had left to do when the run was killed is unknown. So a
+    resumed run writes the log again from the tables of its folder: offline in place of the earlier files, online from
     the first step that has not arrived.
     """
 
@@ -94,8 +94,8 @@ class WeightsAndBiases:
             )  # fmt: skip
         except wandb.Error as error:
             raise RunError(
-                f"Weights & Biases cannot be reached ({one_line(error)}); log in by `wandb login`, or set "
-                f"WANDB_MODE=offline and send the run by `wandb sync` later."
+                f"Weights & Biases cannot be reached ({one_line(error)}); log in with `wandb login`, or set "
+                f"WANDB_MODE=offline and send the run with `wandb sync` later."
             ) from error
         fps, made = {row["iteration"]: row["fps"] for row in folder.read_csv("timing.csv")}, clips(folder)
         for row in folder.read_csv("progress.csv"):
@@ -145,9 +145,9 @@ def open_logs(names: tuple[str, ...], folder: RunFolder, facts: dict[str, Any], 
 
     Args:
         names: Some of ``LOGS``.
-        folder: The run's.
-        facts: What is known of the run beforehand, as JSON types.
-        iteration: Iterations that are done.
+        folder: The run's folder.
+        facts: Configuration of the run, as JSON types.
+        iteration: Number of finished iterations.
 
     Raises:
         RunError: If one cannot be opened.

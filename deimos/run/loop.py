@@ -11,12 +11,12 @@ from deimos.goals.selector import GoalSelector, Spaces
 from deimos.sim.env import Env, Step
 
 GoalGuard = Callable[[Env, Tensor, Tensor], Tensor]
-"""Has the last word on goals: of the environment, the worlds, int64, shape (B,), and the goals, shape (B, goal_dim),
-that they are to get, it gives those that they do get."""
+"""Has the last word on goals: from the environment, the worlds, int64, shape (B,), and the goals that they are to get,
+shape (B, goal_dim), it returns those that they do get."""
 
 
 def spaces(env: Env, total_steps: int = 0) -> Spaces:
-    """What a selector needs to know about ``env`` and, where it is known, how long the training is."""
+    """What a selector needs to know about ``env`` and, if known, the length of the training."""
     return Spaces(
         num_envs=env.num_envs, state_dim=env.state_dim, goal_dim=env.goal_dim, goal_period=env.goal_period,
         device=env.device, groups=env.goal_groups, goal_start=env.goal_slice.start, total_steps=total_steps,
@@ -28,10 +28,10 @@ class GoalLoop:
 
     Args:
         env: The worlds.
-        selector: Who chooses their goals.
+        selector: Chooses their goals.
         window: Steps that resolved interactions are kept for; ``None`` for 2 T.
-        guard: Has the last word on the selector's goals; ``None`` for nobody. Interactions, which selectors and
-            attackers learn from, hold the goals that were asked for.
+        guard: Has the last word on the selector's goals; ``None`` for none. Interactions, which selectors and
+            attackers learn from, hold the goals that the selector asked for.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class GoalLoop:
         self.env, self._guard = env, guard
         self.core = GoalCore(selector, spaces(env), window)
         self.selector, self.interactions, self.weight = selector, self.core.interactions, self.core.weight
-        if selector.first_goals_scaled:  # the goals that the environment was built with are not
+        if selector.first_goals_scaled:  # those that the environment was built with are not
             env.restart(selector.goal_range())
 
     def start(self, mask: Tensor | None = None) -> None:
@@ -55,20 +55,29 @@ class GoalLoop:
         self.core.percentile.masked_fill_(mask, 50.0)
         self.begin(mask)
 
-    def advance(self, step: Step) -> None:
-        """Do what ``step`` calls for; ``env.obs`` is then what the policy acts on next.
+    def advance(self, step: Step, *, in_time: bool = False) -> None:
+        """Process the outcome of ``step``; ``env.obs`` is then what the policy acts on next.
 
         Interactions are resolved before anything is reset, so one whose T-th step is the time
-        limit keeps its label. Worlds that are done get a first goal, not one of the selector's.
+        limit keeps its label. Worlds that are done get a first goal, which the selector does not choose.
+
+        Args:
+            step: What the environment's step returned.
+            in_time: Whether to leave out goals that were issued less than T steps before the time limit: of these only
+                crashes would count, which biases a crash rate upwards. For measurements.
         """
+        if in_time and self.env.time_limit:
+            lasted = self.interactions.now + 1 - self.interactions.issued_at
+            last = self.env.episode_step - lasted + self.env.goal_period  # of the episode's steps, under the goal
+            self.interactions.active &= ~(step.terminated & (last > self.env.time_limit))
         self.renew(step, self.resolve(step))
 
     def resolve(self, step: Step) -> Changes:
         """The first half of ``advance``: the outcomes of the goals; nothing is reset yet.
 
-        A CPU lists the worlds that are due, which spares it the others. A GPU would wait for their number while it has
-        nothing to do, and scores the candidates of all worlds in less time; unless the selector, or a guard, wants to
-        be asked about those alone.
+        A CPU lists the worlds that are due, to skip the others. A GPU would idle until their number is known, and
+        scores the candidates of all worlds in less time; unless the selector, or a guard, must be asked about those
+        that are due only.
         """
         return self.core.advance(
             step.terminated, step.truncated, step.goal_due, step.reward, step.tracking, dense=self._dense
@@ -79,11 +88,11 @@ class GoalLoop:
         return on_gpu(self.env.device) and self.selector.dense and self._guard is None
 
     def graph_key(self) -> Hashable:
-        """What Python decides by in ``advance``; ``None`` where a CUDA graph cannot replay it, see ``why_eager``."""
+        """What Python branches on in ``advance``; ``None`` if a CUDA graph cannot replay it, see ``why_eager``."""
         return self.selector.graph_key() if self.env.recordable and self._dense else None
 
     def why_eager(self) -> str:
-        """Who keeps a CUDA graph from replaying steps, in a few words."""
+        """What keeps a CUDA graph from replaying steps, in a few words."""
         if not self.env.recordable:
             return f"{type(self.env).__name__} does not say that its steps can be replayed (Env.recordable)"
         who = type(self.selector).__name__ if self._guard is None else "a guard of goals"
@@ -116,7 +125,7 @@ class GoalLoop:
         self.weight.masked_fill_(mask, 1.0)
 
     def outcomes(self) -> Resolved:
-        """Interactions that were issued at least T steps ago: of later ones only the crashes are known yet."""
+        """Interactions that were issued at least T steps ago: of later ones only the crashes are known so far."""
         done = self.interactions.resolved()
         return done.where(done.issued <= self.interactions.now - self.env.goal_period)
 

@@ -1,7 +1,7 @@
-"""What a run needs of memory, estimated before it starts.
+"""The memory that a run needs, estimated before it starts.
 
-Systems promise more than they have, and would kill the process halfway. Each estimate counts only what is certain, so
-that nothing is refused that would fit.
+Systems promise more memory than they have, and would kill the process halfway. Each estimate counts only what is
+certain, so that nothing that would fit is refused.
 """
 
 import math
@@ -17,11 +17,11 @@ NUMBER_BYTES = 4  # float32
 _SHORTAGE = re.compile(
     "out of memory|allocate|alloc_failed|allowed dimension|too big|storage size|representable|overflow", re.IGNORECASE
 )
-"""How Warp, torch and NumPy each say that an array does not fit."""
+"""Words by which Warp, torch and NumPy report that an array does not fit."""
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Whether an error is one for want of memory."""
+    """Whether an error reports a lack of memory."""
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError | ValueError) and bool(
         _SHORTAGE.search(str(error))
     ))  # fmt: skip
@@ -38,10 +38,10 @@ def require(what: str, need: float, device: torch.device, way_out: str) -> None:
     """Raise ``RunError`` if something needs more memory [B] than a device has.
 
     Args:
-        what: What needs it, the first words of the message.
+        what: What needs it: the first words of the message.
         need: How much it needs at least [B].
-        device: Where it is kept.
-        way_out: What to do about it, the last words of the message.
+        device: Where it is allocated.
+        way_out: What to do about it: the last words of the message.
     """
     has = total(device)
     if need > has:
@@ -65,6 +65,6 @@ def require_candidates(num_envs: int, num_candidates: int, goal_dim: int, device
 
 
 def require_interactions(what: str, worlds: int, steps: int, period: int, device: torch.device, way_out: str) -> None:
-    """``require`` for all interactions of ``steps`` steps, one every ``period``; for the rest see there."""
+    """``require`` for all interactions of ``steps`` steps, one every ``period``; for the other arguments see there."""
     need = worlds * (steps / period + 1) * LEAST_BYTES
     require(f"{what}, {steps} steps of {worlds} worlds,", need, device, way_out)

@@ -1,7 +1,7 @@
-"""What would become of every candidate? Exact outcomes, by trying each in a clone of the world.
+"""What would be the outcome of every candidate? Exact answers, by trying each in a clone of the world.
 
-Robustness against a weak fear network is no robustness, and a fear network is judged against the truth.
-Both need worlds that can be cloned, and time: N candidates cost N T steps of a policy per decision.
+Robustness against a weak fear network is not robustness, and a fear network must be judged by the truth. Both need
+worlds that can be cloned, and time: N candidates cost N T steps of a policy per decision.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ MOST = {"cpu": 10_000, "cuda": 200_000}
 
 @runtime_checkable
 class SeesWorlds(Protocol):
-    """A selector that wants more than tensors; a training run shows it its worlds before the first choice."""
+    """A selector that needs more than tensors; a training run shows it its worlds before the first choice."""
 
     def see(self, env: Env, clones: "Clones") -> None:
         """Take note of the worlds.
@@ -38,14 +38,14 @@ class Clones:
     """Worlds to try candidates in.
 
     They come in sets of 1, 2, 4, ... times the candidates of a decision, each made when it is first needed: a set is
-    stepped as a whole, so that one world's decision should not wait for ten thousand clones.
+    stepped as a whole, and one world's decision should not wait for ten thousand clones.
 
     Args:
-        build: Makes worlds like those that are cloned, as many as it is told.
+        build: Makes a number of worlds like those that are cloned.
         act: The policy: observations (n, obs_dim) to actions (n, action_dim).
         limit: Largest number of clones at a time; a decision gets as many as it has candidates in any case. ``None``
             for ``MOST`` of the device: a GPU is idle with fewer, and a CPU's caches are full with more.
-        guard: Has the last word on the candidates that they pursue; ``None`` for nobody.
+        guard: Has the last word on the candidates that they pursue; ``None`` for none.
     """
 
     def __init__(
@@ -101,8 +101,8 @@ class Oracle(GoalSelector):
         clones: Where it tries candidates, with the policy that acts in ``env``.
         rule: How it picks; see ``picks.by_rule``.
         percentile: p, in [0, 100]; for the rule ``percentile`` only.
-        candidates: N: uniform candidates per decision.
-        fear: Ranks candidates that the truth ties; ``None`` leaves ties to chance.
+        candidates: N, uniform candidates per decision.
+        fear: Ranks candidates that tie by the truth; ``None`` leaves ties to chance.
     """
 
     def __init__(

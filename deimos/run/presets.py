@@ -1,8 +1,8 @@
-"""Ready configurations: what an environment is trained with unless somebody says otherwise.
+"""Ready-made configurations: what an environment is trained with by default.
 
 A module of ``deimos.sim.envs`` may hold ``PRESETS``: by name, the fields of ``TrainConfig`` that differ from its
 defaults, in plain dictionaries as ``config.json`` has them: those of the environment in ``env``, of the learner in
-``ppo``, of the evaluation in ``eval``. The one with the environment's own name is what ``env:NAME`` starts from. As on
+``ppo``, of the evaluation in ``eval``. The one with the environment's own name is where ``env:NAME`` starts from. As on
 the command line, hyphens and underscores in a name are the same.
 """
 
@@ -15,7 +15,7 @@ from deimos.sim import envs
 
 
 def _all() -> dict[str, tuple[str, dict[str, Any]]]:
-    """Environment and fields of every preset."""
+    """Environment and fields of every preset, by name."""
     found: dict[str, tuple[str, dict[str, Any]]] = {}
     for env, presets in plugins.load_all(envs, lambda module: dict(getattr(module, "PRESETS", {}))).items():
         own = {spelled(env): {}} | presets
@@ -37,12 +37,11 @@ def preset(name: str) -> TrainConfig:
     """The configuration of a preset.
 
     Raises:
-        ValueError: If there is no such preset; the message lists those that there are. Or if one of its fields is
-            unknown or not allowed.
+        ValueError: If there is no such preset (the message lists all), or one of its fields is unknown or not allowed.
     """
     found = _all()
     if spelled(name) not in found:
-        raise ValueError(f"There is no preset '{name}'; there are: {', '.join(sorted(found))}.")
+        raise ValueError(f"Unknown preset '{name}'; choose from: {', '.join(sorted(found))}.")
     env, fields = found[spelled(name)]
     return from_dict(TrainConfig, fields | {"env": {"kind": env} | fields.get("env", {})})
 

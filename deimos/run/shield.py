@@ -35,7 +35,7 @@ from deimos.sim.env import Env
 
 SHIELD = "shield.json"
 Rule = Callable[[Env, Tensor, Tensor], Tensor]
-"""How much risk goals have, shape (B, N): for worlds, int64, shape (B,), and goals, shape (B, N, goal_dim)."""
+"""The risk of goals, shape (B, N), for worlds, int64, shape (B,), and goals, shape (B, N, goal_dim)."""
 
 
 def without_pool() -> tuple[str, ...]:
@@ -50,7 +50,7 @@ class ShieldConfig:
     alpha: float = 0.1
     """Largest share of the goals that would crash the policy that the shield lets through, in (0, 1)."""
     mode: Mode = "stop"
-    """What becomes of a goal that is refused: ignore keeps the active goal, project takes the nearest acceptable one,
+    """What replaces a refused goal: ignore keeps the active goal, project takes the nearest acceptable one,
     stop the safe one. Against the worst attacker stop is the strongest: project gives it the worst acceptable goal."""
     guarantee: Guarantee = "conditional"
     """What stays below alpha: marginal, the mean over calibrations; conditional, this calibration with a confidence of
@@ -60,7 +60,7 @@ class ShieldConfig:
     candidates: int = 100
     """Uniform goals that project may take, at least 1."""
     alphas: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
-    """Miss rates that are tried under Naive and ``argmax`` for the trade-off, as far as the crashes allow."""
+    """Values of alpha to try under Naive and ``argmax`` for the trade-off, as far as the crashes allow."""
 
     def __post_init__(self) -> None:
         for alpha in (self.alpha, *self.alphas):
@@ -74,12 +74,12 @@ class ShieldConfig:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Uniform goals, one from each world, and what became of them."""
+    """Uniform goals, one from each world, and their outcomes."""
 
     score: Tensor
     """Logits of the fear network at issue, shape (n,)."""
     crashed: Tensor
-    """Bool, shape (n,)."""
+    """Whether each goal led to a crash, bool, shape (n,)."""
 
     def half(self, odd: bool) -> "Outcomes":
         """Those of every other world."""
@@ -92,22 +92,22 @@ def collect(
     target: Target, afraid: FearSelector, worlds: int, steps: int, seed: int,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Outcomes:  # fmt: skip
-    """Let a policy act under uniform goals and take one goal from each world, any of those that ended, at random.
+    """Let a policy act under uniform goals and take one goal from each world, at random among those that ended.
 
-    Goals of one world follow from each other; those of different worlds are independent, as a calibration needs them.
+    Goals in one world depend on each other; those in different worlds are independent, as a calibration needs.
 
     Args:
         target: The policy.
-        afraid: Whose fear network scores the goals.
+        afraid: Selector whose fear network scores the goals.
         worlds: Number of worlds, at least 1.
         steps: Steps of each, at least 2 T.
         seed: Seed of the worlds.
-        progress: Told the share that is done.
+        progress: Called with the share that is done.
     """
     env = target.build(worlds, seed)
     loop = GoalLoop(env, uniform_goals(env), window=steps)
     for t in range(steps):
-        loop.advance(env.step(target.policy(env.obs)))
+        loop.advance(env.step(target.policy(env.obs)), in_time=True)
         if t % 100 == 0:
             progress(t / steps)
     env.check()
@@ -126,12 +126,12 @@ def fear_rule(afraid: FearSelector) -> Rule:
 
 
 def random_rule(env: Env, rows: Tensor, goals: Tensor) -> Tensor:
-    """A uniform number in [0, 1) for every decision, one that neither Naive nor an attacker uses."""
+    """A uniform random number in [0, 1) for every decision, which neither Naive nor an attacker uses."""
     return env.draw(rows)[:, 3:].clone().expand(goals.shape[:2])
 
 
 def plain_rule(env: Env) -> tuple[str, Rule] | None:
-    """What a person would go by: how close to the wall, or how tilted a robot is; ``None`` where neither is known."""
+    """A rule that a person might use: closeness to the wall, or a robot's tilt; ``None`` if neither is known."""
     if env.place(torch.zeros(1, dtype=torch.int64, device=env.device)) is not None:
 
         def near(env: Env, rows: Tensor, goals: Tensor) -> Tensor:
@@ -148,11 +148,11 @@ def plain_rule(env: Env) -> tuple[str, Rule] | None:
 
 
 class Guard:
-    """A shield in the loop, a ``GoalGuard``; counts what it is asked and what it refuses.
+    """A shield in the loop, a ``GoalGuard``; counts the goals that it is asked about and those that it refuses.
 
     Args:
-        shield: Decides.
-        rule: By what.
+        shield: The shield.
+        rule: Gives the risk that it decides by.
         candidates: Uniform goals that it may take instead, at least 1.
     """
 
@@ -167,7 +167,7 @@ class Guard:
             lambda goals: self._rule(env, rows, goals), env.goal[rows], goal.detach(), candidates
         )
         self._asked += len(rows)
-        self._refused = self._refused.to(env.device) + made.refused.sum()  # read when somebody asks: that synchronises
+        self._refused = self._refused.to(env.device) + made.refused.sum()  # only read on demand: reading synchronises
         return made.goal
 
     @property
@@ -181,10 +181,10 @@ class Trial:
 
     Args:
         target: The policy, and what attackers may spend on it.
-        afraid: Whose fear network the shields go by.
+        afraid: Selector whose fear network the shields use.
         config: How they are made.
-        eval_config: How the policy is evaluated, and who attacks it.
-        progress: Told how far it is.
+        eval_config: How the policy is evaluated, and its attackers.
+        progress: Called with the progress.
     """
 
     def __init__(
@@ -202,30 +202,30 @@ class Trial:
         self._calibration, self._test = self.outcomes.half(False), self.outcomes.half(True)
 
     def threshold(self, alpha: float) -> float:
-        """The threshold of a miss rate; ``ValueError`` as ``goals.shield.threshold`` has it."""
+        """The threshold for a miss rate; ``ValueError`` as in ``goals.shield.threshold``."""
         return threshold(self._crashes, alpha, self.config.guarantee)
 
     def _is_possible(self, alpha: float) -> bool:
-        """Whether there are crashes enough for a miss rate."""
+        """Whether there are enough crashes for a miss rate."""
         return len(self._crashes) >= crashes_needed(alpha, self.config.guarantee)
 
     def _shield(self, score: float) -> Shield:
         return Shield(score, self.config.mode, self._safe, self._range.tolist())
 
     def _guard(self, rule: Rule, score: float) -> Callable[[], Guard]:
-        """Makes guards that have counted nothing yet; by a rule that tells no goals apart, project stops."""
+        """Makes guards with counts at 0; under a rule that does not distinguish goals, project stops."""
         return lambda: Guard(self._shield(score), rule, self.config.candidates)
 
     def run(self) -> dict[str, Any]:
-        """Calibrate, test, and try under Naive, under every attacker, and beside both baselines.
+        """Calibrate, test, and try under Naive and every attacker, compared with both baselines.
 
         Returns:
-            ``deploy``, what a deployment needs: see ``Shield.from_dict``, in physical units; ``test``, miss rates on
+            ``deploy``, what a deployment needs, see ``Shield.from_dict``, in physical units; ``test``, miss rates on
             worlds that it was not calibrated on; ``trials``, rows of ``measure``; and ``tradeoff``, the same for
             several miss rates.
 
         Raises:
-            RunError: If there are too few crashes to calibrate on; the message says how many it takes.
+            RunError: If there are too few crashes to calibrate on; the message says how many are needed.
         """
         attackers = self._eval.attackers
         try:
@@ -242,21 +242,21 @@ class Trial:
 
     @property
     def _crashes(self) -> Tensor:
-        """Scores of the crashes that it is calibrated on."""
+        """Scores of the crashes for the calibration."""
         return self._calibration.score[self._calibration.crashed]
 
     def _too_few(self, error: ValueError) -> str:
         """What to do about too few crashes."""
         need, there = crashes_needed(self.config.alpha, self.config.guarantee), len(self._crashes)
-        enough = need + 2.0 * math.sqrt(need)  # on average: two standard deviations less are as many as it takes
+        enough = need + 2.0 * math.sqrt(need)  # on average: two standard deviations below are still enough
         worlds = f"about {round(enough / there * self.config.worlds):,}" if there else "many more"
         return (
-            f"{error} In {len(self._calibration.score):,} goals, of half the worlds; calibrate in {worlds} worlds "
-            "(--worlds), or with a larger --alpha."
+            f"{error} These are from {len(self._calibration.score):,} goals, of half the worlds; calibrate in "
+            f"{worlds} worlds (--worlds), or with a larger --alpha."
         )
 
     def _beside(self, score: float, attackers: Sequence[str]) -> list[dict[str, Any]]:
-        """Rows of the shield with a threshold, and of baselines that refuse as many Naive goals."""
+        """Rows of the shield with a threshold, and of baselines that refuse equally many Naive goals."""
         rows = self.measure("shield", self._guard(fear_rule(self._afraid), score), attackers)
         share = rows[0]["refused"]
         rows += self.measure("random refusal", self._guard(random_rule, 1.0 - share), attackers)
@@ -268,7 +268,7 @@ class Trial:
         return rows
 
     def _scores(self, rule: Rule) -> Tensor:
-        """What a rule makes of uniform goals that nobody refuses, shape (n,)."""
+        """The risk that a rule gives uniform goals, none of them refused, shape (n,)."""
         env, scores = self._target.build(self._eval.worlds, self._eval.seed), []
 
         def note(env: Env, rows: Tensor, goal: Tensor) -> Tensor:
@@ -283,14 +283,14 @@ class Trial:
         """Try a shield under Naive and under attackers, which learn with it in their worlds.
 
         Args:
-            shield: What it is called.
+            shield: Its name.
             guard: Makes the shield's guards; ``None`` for no shield.
             attackers: Their names.
 
         Returns:
-            A row for each: who chose the goals, the share ``refused``, the ``crash_rate`` of the ``interactions``
-            (all that were asked for, refused or not), and ``tracking``, how well the goals that were given instead
-            are met, in [0, 1]; see ``evaluation.play``. With the facts of an attacker.
+            A row for each: what chose the ``goals``, the share ``refused``, the ``crash_rate`` of the ``interactions``
+            (all that were asked for, refused or not), and ``tracking``, how well the goals that the shield let through
+            or gave instead are met, in [0, 1]; see ``evaluation.play``. Also the facts of an attacker.
         """
         target, rows = replace(self._target, guard=guard and guard(), learnt=[]), []
         for goals in ("naive", *attackers):
@@ -312,7 +312,7 @@ class Trial:
         return rows
 
     def _for_deployment(self) -> dict[str, Any]:
-        """What a deployment needs, with goals in physical units; a guarantee that takes more crashes has no limit."""
+        """What a deployment needs, with goals in physical units; a guarantee without enough crashes has none."""
         alpha, known = self.config.alpha, self._crashes
         limits: dict[str, float | None] = {
             name: threshold(known, alpha, name) if len(known) >= crashes_needed(alpha, name) else None
@@ -329,14 +329,14 @@ class Trial:
         }  # fmt: skip
 
     def _tested(self, limit: float) -> dict[str, Any]:
-        """Misses among the crashes of worlds that it was not calibrated on, and refused goals."""
+        """Rates of misses and of refused goals in worlds that it was not calibrated on."""
         score, crashed = self._test.score, self._test.crashed
         missed, refused = (score[crashed] < limit).double().mean().item(), (score >= limit).double().mean().item()
         return {"crashes": int(crashed.sum()), "goals": len(score), "miss_rate": missed, "refused": refused}
 
 
 def _goal_scale(env: Env) -> Tensor:
-    """What the policy sees components of a goal multiplied by, shape (goal_dim,)."""
+    """Factors by which the policy sees the components of a goal, shape (goal_dim,)."""
     field = goal_field(env.layout)
     return torch.as_tensor(field.scale, dtype=torch.float32, device=env.device).expand(field.size)
 
@@ -352,7 +352,7 @@ def shield_run(
     folder: RunFolder, config: TrainConfig, shield: ShieldConfig, eval_config: EvalConfig, device: torch.device,
     progress: Progress = lambda stage, share: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Make the shield of a run and keep it, with what was found, in its ``shield.json``.
+    """Make the shield of a run and store it, with what was measured, in its ``shield.json``.
 
     Args:
         folder: The run.
@@ -360,7 +360,7 @@ def shield_run(
         shield: How the shield is made.
         eval_config: How it is tried.
         device: Where to simulate.
-        progress: Told how far it is.
+        progress: Called with the progress.
 
     Returns:
         See ``Trial.run``.
@@ -389,7 +389,7 @@ def shield_run(
 
 
 def read_shield(folder: RunFolder, weights: str) -> dict[str, Any] | None:
-    """What a deployment needs of a run's shield; ``None`` where there is none.
+    """What a deployment needs of a run's shield; ``None`` if the run has none.
 
     Args:
         folder: The run.
@@ -404,10 +404,10 @@ def read_shield(folder: RunFolder, weights: str) -> dict[str, Any] | None:
         shield = folder.read_json(SHIELD)["deploy"]
         known = shield["weights"]
     except (KeyError, TypeError) as error:
-        raise RunError(f"{folder.path / SHIELD} is not that of a shield; make it again by deimos shield.") from error
+        raise RunError(f"{folder.path / SHIELD} is not a shield file; make it again with deimos shield.") from error
     if known != weights:
         raise RunError(
-            f"{folder.path / SHIELD} was made for an earlier policy; make it again by deimos shield, or delete it."
+            f"{folder.path / SHIELD} was made for an earlier policy; make it again with deimos shield, or delete it."
         )
     return shield
 
@@ -419,20 +419,20 @@ def stored_guard(folder: RunFolder, policy: Policy, env: Env, afraid: FearSelect
         folder: The run.
         policy: Its policy.
         env: The worlds.
-        afraid: Whose fear network the shield was calibrated for: the run's.
-        mode: What becomes of the goals that it refuses.
+        afraid: The run's selector, whose fear network the shield was calibrated for.
+        mode: What replaces the goals that it refuses.
 
     Raises:
         RunError: If the run has no shield that fits.
     """
     stored = read_shield(folder, weights_hash(policy.actor))
     if stored is None or afraid is None:
-        raise RunError(f"{folder.path} has no shield; make one by deimos shield.")
+        raise RunError(f"{folder.path} has no shield; make one with deimos shield.")
     scale = _goal_scale(env).tolist()
     try:
         safe = [None if value is None else value * each for value, each in zip(stored["safe_goal"], scale, strict=True)]
         reach = [value * each for value, each in zip(stored["goal_range"], scale, strict=True)]
         shield = Shield.from_dict(stored | {"safe_goal": safe, "goal_range": reach}, mode)
     except (KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{folder.path / SHIELD} is not that of a shield for these goals: {one_line(error)}") from error
+        raise RunError(f"{folder.path / SHIELD} is not a shield for these goals: {one_line(error)}") from error
     return Guard(shield, fear_rule(afraid), ShieldConfig.candidates)

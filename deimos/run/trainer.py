@@ -41,7 +41,7 @@ from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
 from deimos.sim.graphs import MODES, Mode, recorder
 
-MOST_THREADS = 4096  # far more than that, and libraries of threads crash
+MOST_THREADS = 4096  # with far more, threading libraries crash
 
 _log = logging.getLogger(__name__)
 
@@ -53,10 +53,10 @@ class TrainConfig:
     env: EnvConfig = field(default_factory=particle.Config)
     """The environment."""
     method: str | None = None
-    """Who chooses the goals, by name (docs/reference/selectors.md): uniform, coop, p10, p25, p50, p75, p90,
-    antagonist, rnd, vds, cl, vds+p75, ... By default p25; or leave it out and set up a selector."""
+    """How goals are chosen, by name (docs/reference/selectors.md): uniform, coop, p10, p25, p50, p75, p90,
+    antagonist, rnd, vds, cl, vds+p75, ... By default p25; or leave it out and configure a selector."""
     selector: SelectorConfig | None = None
-    """Who chooses the goals, in detail."""
+    """How goals are chosen, in detail."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learner."""
     eval: EvalConfig = field(default_factory=EvalConfig)
@@ -66,24 +66,23 @@ class TrainConfig:
     seed: int = 0
     """Seed of the weights, the worlds, the goals and the exploration, in [0, 2^32)."""
     num_envs: int = 2000
-    """Parallel worlds, at least 1; of all processes together where torchrun starts several."""
+    """Parallel worlds, at least 1; in all processes together if torchrun starts several."""
     env_steps: int = 2000
     """Steps of every world, at least 1; rounded up to whole rollouts."""
     device: str = "auto"
-    """Where to simulate and learn: cpu, cuda, or cuda:N for one of several GPUs; auto takes the GPU where there is
-    one."""
+    """Where to simulate and learn: cpu, cuda, or cuda:N for one of several GPUs; auto takes a GPU if there is one."""
     tf32: bool = False
     """Whether a GPU may round the factors of float32 matrix products to 10 bits of mantissa (TF32), which is faster
     for large networks. CPUs never do."""
     threads: int = 0
     """CPU threads, at least 0; 0 takes one per core that this process may use. They change no number of a run."""
     graph: Mode = "auto"
-    """Whether a GPU replays rollouts and updates as CUDA graphs: auto does so where it can, on refuses to train where
-    it cannot, off launches every operation by itself."""
+    """Whether a GPU replays rollouts and updates as CUDA graphs: auto does so where possible, on refuses to train where
+    it is not, off launches every operation separately."""
     log: tuple[str, ...] = ("tensorboard",)
-    """Where its numbers are shown while it trains: tensorboard, wandb (Weights & Biases), both or nowhere."""
+    """Where its numbers are shown while it trains: tensorboard, wandb (Weights & Biases), both or neither."""
     video_every: int = 0
-    """Iterations from one video of the policy to the next, at least 0; 0 makes none. Each goes to ``videos`` in the
+    """Iterations from one video of the policy to the next, at least 0; 0 makes none. Each goes into ``videos`` in the
     run's folder and into its logs, and takes some seconds, during which training waits."""
     critic_warmup: int = 0
     """Rollouts at the start in which values are learnt and the policy stays as it is, at least 0; 10 in a branch."""
@@ -121,12 +120,12 @@ class TrainConfig:
 
     @property
     def goals(self) -> SelectorConfig:
-        """Who chooses the goals."""
+        """The configuration of what chooses the goals."""
         return self.selector or method(self.method or "p25")
 
     @property
     def label(self) -> str:
-        """Short name of who chooses the goals."""
+        """Short name of what chooses the goals."""
         return self.method or (kind(self.selector) if self.selector else "p25")
 
     @property
@@ -139,7 +138,7 @@ class Trainer:
     """Everything that a run holds in memory, and one iteration of it."""
 
     @own_settings()
-    @torch_on_one()  # sums of torch's depend on its threads; those of ``MLPs``, which has its own, do not
+    @torch_on_one()  # torch's sums depend on its threads; those of ``MLPs``, which has its own, do not
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.config = config
         num_envs = ranks.share("num_envs", config.num_envs)
@@ -147,8 +146,8 @@ class Trainer:
         self.env = config.env.build(num_envs, device, config.seed, self._first_world)
         if 0 < self.env.time_limit < 2 * self.env.goal_period:
             _log.warning(
-                "Episodes of %d steps have no room for two goals of T = %d: the first one is uniform, and none that is "
-                "chosen is survived to its end.", self.env.time_limit, self.env.goal_period,
+                "Episodes of %d steps have no room for two goals of T = %d: the first one is uniform, and no chosen "
+                "one is survived to its end.", self.env.time_limit, self.env.goal_period,
             )  # fmt: skip
         total_steps = config.iterations * config.ppo.num_steps
         window = window_between(self.env.goal_period, config.ppo.num_steps)
@@ -169,8 +168,8 @@ class Trainer:
         self.seconds = {"env": 0.0, "policy": 0.0, "goals": 0.0, "update": 0.0, "selector": 0.0}
         """Time spent so far in each part of an iteration [s]; on CUDA only where ``synchronise`` is set."""
         self.synchronise = False
-        """Whether to wait for the device at the end of every part, to tell their times apart; for benchmarks. Rollouts
-        are not replayed as graphs then."""
+        """Whether to wait for the device at the end of every part, to measure them separately; for benchmarks. Rollouts
+        are then not replayed as graphs."""
         self._first_step = torch.zeros((), dtype=torch.int64, device=device)  # of the rollout
         self._clock = _Clock(self)
         self._steps = Recorded[None](record)
@@ -188,7 +187,7 @@ class Trainer:
         self._clock.lap("env")  # all of a rollout that was replayed
 
     def _graph_key(self) -> Hashable:
-        """What Python decides by in a rollout; ``None`` where it is not replayed, which is said once."""
+        """What Python branches on in a rollout; ``None`` if it is not replayed, which is reported once."""
         key = None if self.synchronise else self.loop.graph_key()
         if key is None and self._says_why and not self.synchronise:
             self._says_why = False
@@ -218,13 +217,13 @@ class Trainer:
     @own_settings()
     @torch_on_one()
     def iterate(self) -> dict[str, float]:
-        """One rollout and what is learnt from it.
+        """Collect one rollout and learn from it.
 
         Returns:
             The row of ``progress.csv``.
 
         Raises:
-            SimulationError: If a number is not finite. This trainer cannot be used any more; the last checkpoint can.
+            SimulationError: If a number is not finite. The trainer is then unusable; the last checkpoint is not.
         """
         with tf32_products(self.config.tf32 and self.env.device.type == "cuda"):
             row = self._iterate()
@@ -258,7 +257,7 @@ class Trainer:
         return self._summary() | learner | selector | self.env.report()
 
     def _summary(self) -> dict[str, float]:
-        """What every run logs of a rollout, in the worlds of all ranks."""
+        """What every run logs of a rollout, over the worlds of all ranks."""
         rollout = self.rollout
         transitions = self.config.num_envs * rollout.num_steps
         crashes = int(ranks.sum_over_ranks(rollout.terminated.sum()))
@@ -283,7 +282,7 @@ class Trainer:
         """Continue from ``state_dict()``.
 
         Raises:
-            RunError: If it is that of another environment or another network size.
+            RunError: If it belongs to another environment or network size.
         """
         try:
             made_for = _completed(state["made_for"])
@@ -292,25 +291,25 @@ class Trainer:
             self.ppo.load_state_dict(state["ppo"])
             self.loop.load_state_dict(state["loop"])
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            text = "The checkpoint is that of another environment or network size: "
+            text = "The checkpoint belongs to another environment or network size: "
             raise RunError(text + one_line(error)) from error
         self.iteration = state["iteration"]
 
 
 def _identity(config: TrainConfig) -> dict:
     """What a checkpoint must have in common with the run that resumes from it."""
-    env = to_dict(config.env) | dict.fromkeys(config.env.files, "")  # wherever the run's copies lie
+    env = to_dict(config.env) | dict.fromkeys(config.env.files, "")  # wherever the run's copies are
     return {"env": env, "selector": to_dict(config.goals), "num_envs": config.num_envs}
 
 
 def _completed(identity: dict) -> dict:
-    """The identity that an older version wrote, with the defaults of fields that configurations have got since."""
+    """The identity that an older version wrote, with the defaults of fields that have been added since."""
     kinds = {"env": EnvConfig, "selector": SelectorConfig}
     return identity | {name: to_dict(from_dict(cls, identity[name], stored=True)) for name, cls in kinds.items()}
 
 
 def _check_obs(obs: Tensor) -> None:
-    """Raise ``SimulationError`` if an observation is not finite: what broke on a rollout's last step shows there."""
+    """Raise ``SimulationError`` if an observation is not finite: a fault on a rollout's last step shows there."""
     if not bool(obs.isfinite().all()):
         world = int((~obs.isfinite()).any(dim=1).nonzero()[0])
         raise SimulationError(f"World {world}: its observation is not finite.")

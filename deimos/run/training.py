@@ -1,4 +1,4 @@
-"""From nothing or from a checkpoint to a trained policy: how a run begins, resumes, is saved and ends."""
+"""From scratch or from a checkpoint to a trained policy: how a run begins, resumes, is saved and ends."""
 
 import platform
 import shutil
@@ -32,7 +32,7 @@ from deimos.sim.graphs import Mode
 from deimos.sim.shared import find_cuda
 
 SCHEMA = 1  # of config.json
-CHECKPOINT_SCHEMA = 3  # of checkpoint.pt; of earlier ones the networks can be loaded, but not the rest
+CHECKPOINT_SCHEMA = 3  # of checkpoint.pt; from earlier ones only the networks can be loaded
 CHECKPOINT_SECONDS = 30.0
 
 
@@ -40,7 +40,7 @@ def resolve_device(name: str) -> torch.device:
     """The device of a name: auto, cpu, cuda or cuda:N. Of several GPUs cuda is the first, or each rank's own.
 
     Raises:
-        RunError: If it names none, if there is no such device, or if torch sees a CUDA device and Warp does not.
+        RunError: If the name is invalid, there is no such device, or torch sees a CUDA device but Warp does not.
     """
     try:
         check_device("device", name)
@@ -56,7 +56,7 @@ def resolve_device(name: str) -> torch.device:
         raise RunError("There is no CUDA device here; use --device cpu.")
     if index >= count:
         there = ", ".join(f"cuda:{number}" for number in range(count))
-        raise RunError(f"There is no CUDA device {index} here; there are: {there}.")
+        raise RunError(f"There is no CUDA device {index} here; choose from: {there}.")
     return torch.device("cuda", index)
 
 
@@ -67,15 +67,15 @@ def provenance() -> dict[str, str]:
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "torch": str(torch.__version__),  # names its build (+cu130), which the version of PyPI's package does not
+        "torch": str(torch.__version__),  # includes its build (+cu130), which the package's version does not
         **{name: version(name) for name in ("warp-lang", "numpy")},
     }
 
 
 def _commit() -> str:
-    """The commit of the checkout that this file is in; unknown where it is installed, or without git."""
+    """The commit of the checkout that this file is in; unknown if it is installed, or without git."""
     home = Path(__file__).resolve().parents[2]
-    describe = ["git", "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]  # no repository around it
+    describe = ["git", "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]  # of no repository around it
     try:
         return subprocess.run(describe, cwd=home, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
@@ -94,7 +94,7 @@ def start(
         branch_from: Folder of a run that it branches off, see ``branch``.
 
     Raises:
-        RunError: If the folder exists, the other run does not fit, or ``config`` would not come back from the folder.
+        RunError: If the folder exists, the other run does not fit, or ``config`` could not be read back.
     """
     if init_from is not None and branch_from is not None:
         raise RunError("--init-from and --branch-from cannot be combined; the latter takes over the networks too.")
@@ -125,21 +125,21 @@ def start(
         with ranks.together():
             if first:
                 folder.write_json("config.json", _description(config, folder, init_from, branch_from))
-        save(trainer, folder)  # a run that is killed before its first checkpoint begins again from here
-    except BaseException:  # a plug-in's, or an interrupt: whatever it is
+        save(trainer, folder)  # a run that is killed before its next checkpoint starts again from here
+    except BaseException:  # even a plug-in's error, or an interrupt
         if first:
-            shutil.rmtree(folder.path, ignore_errors=True)  # nothing is in it yet, and it would be in the way
+            shutil.rmtree(folder.path, ignore_errors=True)  # it holds nothing yet, and would be in the way
         raise
     return trainer, folder
 
 
 def _stored_name(device: torch.device) -> str:
-    """What a run's configuration calls its device: where several ranks have one each, without a number."""
+    """The name of a device in a run's configuration: without a number if several ranks have one each."""
     return str(device) if ranks.place().size == 1 else device.type
 
 
 def _description(config: TrainConfig, folder: RunFolder, init_from: Path | None, branch_from: Path | None) -> dict:
-    """What ``config.json`` holds; keeps the files that the worlds are built from."""
+    """The contents of ``config.json``; copies the files that the worlds are built from."""
     return {
         "schema": SCHEMA, "config": to_dict(config), "versions": provenance(),
         "init_from": str(init_from) if init_from else None,
@@ -149,14 +149,14 @@ def _description(config: TrainConfig, folder: RunFolder, init_from: Path | None,
 
 
 def _new_folder(config: TrainConfig) -> RunFolder:
-    """A folder named after the run; the second of the same second ends in -2."""
+    """A folder named after the run and the time; a second one in the same second ends in -2."""
     name = f"{kind(config.env)}-{config.label}-s{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     path, number = Path("runs") / name, 1
     while True:
         try:
             return RunFolder.create(path)
         except RunError:
-            if not path.exists():  # it is not the name
+            if not path.exists():  # the name is not the cause
                 raise
         number += 1
         path = path.with_name(f"{name}-{number}")
@@ -166,7 +166,7 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
     """Make a trainer.
 
     Raises:
-        RunError: If its worlds do not fit in memory, or what the configuration names is not there or does not fit.
+        RunError: If its worlds do not fit in memory, or something that the configuration names does not exist or fit.
     """
     memory.require_worlds(config.num_envs // ranks.place().size, config.ppo.num_steps, device)
     if config.evaluation:
@@ -183,7 +183,7 @@ def build(config: TrainConfig, device: torch.device) -> Trainer:
 
 
 def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
-    """Load the networks of another run, whose observations must mean the same."""
+    """Load the networks of another run, whose observations must have the same meaning."""
     state = load_checkpoint(origin)
     try:
         policy = load_policy(origin.path)
@@ -192,7 +192,7 @@ def _load_weights(trainer: Trainer, origin: RunFolder) -> None:
             raise ValueError(f"it observes {layout}, this one {trainer.env.layout}")
         if activation != trainer.config.ppo.activation:
             raise ValueError(
-                f"ppo.activation must be {activation}, as it was there, got {trainer.config.ppo.activation}"
+                f"ppo.activation must be {activation}, as in the origin, got {trainer.config.ppo.activation}"
             )
         trainer.ppo.load_weights(state["ppo"])
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -211,17 +211,17 @@ def _take_over(trainer: Trainer, origin: RunFolder) -> None:
 
 
 def load_checkpoint(folder: RunFolder) -> dict:
-    """What a run's checkpoint holds, of this version or of an earlier one; ``RunError`` as ``load_tensors`` has it."""
+    """The contents of a run's checkpoint, of this version or an earlier one; ``RunError`` as in ``load_tensors``."""
     return load_tensors(folder.path / "checkpoint.pt", "checkpoint", CHECKPOINT_SCHEMA, oldest=1)
 
 
 def _load_current(folder: RunFolder) -> dict:
-    """The same of this version alone; raises ``RunError`` otherwise."""
+    """The same, of this version only; raises ``RunError`` otherwise."""
     state = load_checkpoint(folder)
     if state["schema"] != CHECKPOINT_SCHEMA:
         raise RunError(
             f"{folder.path / 'checkpoint.pt'} has the schema {state['schema']}, of an earlier version, and cannot be "
-            "resumed or branched off; evaluate its policy, or start a run with its networks by --init-from."
+            "resumed or branched off; evaluate its policy, or start a run from its networks with --init-from."
         )
     return state
 
@@ -230,7 +230,7 @@ def load(folder: RunFolder, config: TrainConfig) -> Trainer:
     """Rebuild a run as it was at its last checkpoint; writes nothing.
 
     Raises:
-        RunError: If the checkpoint is broken, foreign, or that of another environment or network size.
+        RunError: If the checkpoint is broken, or not of a run, this environment or this network size.
     """
     return _rebuild(_load_current(folder), config)
 
@@ -250,14 +250,14 @@ def resume(
 
     Raises:
         RunError: If it is not a run folder, its checkpoint is broken, the budget ``env_steps`` is smaller, or another
-            number of ranks has trained it: sums would be rounded otherwise.
+            number of ranks has trained it: sums would be rounded differently.
     """
     folder = RunFolder.open(path)
     with _held(folder), ranks.together():
         config = read_config(folder)
         if env_steps is not None:
             if env_steps < config.env_steps:
-                raise RunError(f"--env-steps must exceed the {config.env_steps} already set, got {env_steps}.")
+                raise RunError(f"--env-steps must be at least the {config.env_steps} already set, got {env_steps}.")
             config = replace(config, env_steps=env_steps)
         if device is not None:
             config = replace(config, device=_stored_name(resolve_device(device)))
@@ -267,7 +267,7 @@ def resume(
         _check_ranks(folder, state.get("ranks", 1))
         trainer = _rebuild(state, config)
         if ranks.place().first:
-            stored = folder.read_json("config.json")  # whose files keep the names that they were given by
+            stored = folder.read_json("config.json")  # whose files keep their names in the configuration
             stored["config"] |= {"env_steps": config.env_steps, "device": config.device, "graph": config.graph}
             folder.write_json("config.json", stored)
     return trainer, folder
@@ -279,7 +279,7 @@ def _check_ranks(folder: RunFolder, count: int) -> None:
         begin = "python train.py" if count == 1 else f"torchrun --nproc_per_node={count} train.py"
         raise RunError(
             f"The number of ranks that resume {folder.path} must be {count}, as in its training, got "
-            f"{ranks.place().size}: {begin} --resume {folder.path}, or start a run with its networks by --init-from."
+            f"{ranks.place().size}: {begin} --resume {folder.path}, or start a run from its networks with --init-from."
         )
 
 
@@ -301,7 +301,7 @@ def read_config(folder: RunFolder) -> TrainConfig:
     """
     data = folder.read_json("config.json")
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise RunError(f"{folder.path / 'config.json'} is not that of a run of schema {SCHEMA}.")
+        raise RunError(f"{folder.path / 'config.json'} does not belong to a run of schema {SCHEMA}.")
     try:
         config = from_dict(TrainConfig, data["config"] | {"eval": _today(data["config"].get("eval", {}))}, stored=True)
         kept = {name: str(folder.path / copy) for name, copy in data.get("files", {}).items()}
@@ -311,7 +311,7 @@ def read_config(folder: RunFolder) -> TrainConfig:
 
 
 def _today(evaluation: dict) -> dict:
-    """The options of an evaluation, of which 0.1.0 had more: budgets that depended on how much the policy crashed."""
+    """An evaluation's options without those of 0.1.0 alone: budgets that depended on the policy's crashes."""
     former = ("adversary_interactions", "adversary_crashes", "adversary_enough", "adversary_patience")
     kept = {name: value for name, value in evaluation.items() if name not in former}
     return {name: value for name, value in kept.items() if (name, value) != ("oracle_worlds", 0)}
@@ -321,8 +321,8 @@ def save(trainer: Trainer, folder: RunFolder) -> None:
     """Write the checkpoint and the policy; where several ranks share a run, all call it, and the first one writes.
 
     Raises:
-        SimulationError: If a number is not finite that must be; the previous ones are intact.
-        RunError: If they cannot be written; the previous ones are intact.
+        SimulationError: If a number that must be finite is not; the previous files are intact.
+        RunError: If they cannot be written; the previous files are intact.
     """
     with ranks.together():
         check_finite(trainer)
@@ -342,9 +342,9 @@ def train(
     trainer: Trainer, folder: RunFolder, report: Callable[[dict[str, float], float], None] = lambda row, fps: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> bool:  # fmt: skip
-    """Run all iterations that are left, and return whether the budget was used up.
+    """Run all remaining iterations, and return whether the budget was used up.
 
-    Rows and clips of later iterations that the folder has are made again. Meanwhile no other process can train the run.
+    Rows and clips of later iterations in the folder are made again. Meanwhile no other process can train the run.
     After every iteration ``report`` is called with its row and the frames per second, and ``stopped`` is asked: true
     ends the run early, with a checkpoint. Where several ranks share a run, the first one writes and reports, and any
     may end it.
@@ -362,7 +362,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Writer:
-    """What writes and shows the numbers of a run."""
+    """Writes and shows the numbers of a run."""
 
     folder: RunFolder
     logs: Logs
@@ -391,12 +391,12 @@ def _writer(
 
 
 def _iterate(trainer: Trainer, folder: RunFolder, writer: _Writer | None, stopped: Callable[[], bool]) -> bool:
-    """See ``train``; of several ranks, the first one has a writer."""
+    """See ``train``; of several ranks, only the first one has a writer."""
 
     def keep() -> None:
         with ranks.together():
             if writer is not None:
-                writer.logs.flush()  # first: what a resumed run does not say again must be there
+                writer.logs.flush()  # first: what a resumed run does not write again must be on the disk
         save(trainer, folder)
 
     transitions = trainer.config.num_envs * trainer.config.ppo.num_steps

@@ -1,4 +1,4 @@
-"""Pictures one after another, as a video or as files."""
+"""Sequences of pictures, as a video or as files."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -12,11 +12,11 @@ from deimos.checks import RunError
 from deimos.files import first_line, require_place
 
 CODECS = {".mp4": "libx264", ".mkv": "libx264", ".mov": "libx264", ".webm": "libvpx-vp9", ".gif": "gif"}
-"""What ffmpeg encodes a video with, by the ending of its file."""
+"""ffmpeg's codecs, by the ending of the file."""
 ENDINGS = (*CODECS, ".webp")
 PALETTES = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=dither=none:new=1"
-"""ffmpeg's filter that gives every picture 256 colours of its own, for GIF."""
-FASTEST_GIF = 50.0  # pictures per second; viewers slow down what is faster
+"""ffmpeg's filter that gives every picture its own 256 colours, for GIF."""
+FASTEST_GIF = 50.0  # pictures per second; viewers slow down faster ones
 WEBP: dict[str, Any] = {"quality": 50, "method": 4, "loop": 0}
 """How Pillow encodes WebP: a tenth of the size of a GIF."""
 
@@ -29,12 +29,12 @@ def pictures(folder: Path) -> Iterator[Write]:
     """Writes numbered PNG files into a new folder.
 
     Raises:
-        RunError: If the folder exists, or it cannot be made or written to.
+        RunError: If the folder exists, or it cannot be created or written to.
     """
     from PIL import Image
 
     if folder.exists():
-        raise RunError(f"{folder} exists already; name another folder.")
+        raise RunError(f"{folder} exists already; choose another folder.")
     with _writing(folder):
         folder.mkdir(parents=True)
     number = itertools.count()
@@ -56,15 +56,15 @@ def require_video(path: Path) -> None:
 
 @contextmanager
 def video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
-    """Writes a video, whose ending is one of ``ENDINGS``; one that is cut off does not stay.
+    """Writes a video, whose ending is one of ``ENDINGS``; an incomplete one is deleted.
 
     Args:
-        path: The file; what is there is overwritten once the new one is whole.
+        path: The file; an existing one is overwritten once the new one is complete.
         size: Width and height [pixels].
         fps: Pictures per second; a GIF has 50 at most.
 
     Raises:
-        RunError: If the ending is another, it cannot be written, or no picture was.
+        RunError: If the ending is a different one, the file cannot be written, or there were no pictures.
     """
     require_video(path)
     ending = path.suffix.lower()
@@ -82,7 +82,7 @@ def video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
 
             yield write
             if not next(count):
-                raise RunError(f"{path} could not be written (there is no picture to show).")
+                raise RunError(f"{path} could not be written (there are no pictures).")
         with _writing(path):
             unfinished.replace(path)
     finally:
@@ -123,7 +123,7 @@ def _webp(unfinished: Path, path: Path, fps: float) -> Iterator[Write]:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn what a system says that does not let a file be written into ``RunError``."""
+    """Turn a system's error about writing a file into ``RunError``."""
     try:
         yield
     except OSError as error:

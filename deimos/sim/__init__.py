@@ -1,1 +1,1 @@
-"""Simulated worlds: what an environment promises, and those that there are."""
+"""Simulated worlds: the interface of environments, and the environments."""

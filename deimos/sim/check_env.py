@@ -1,4 +1,4 @@
-"""Does an environment keep its promises? ``check_env`` tries one after another and names the first that is broken."""
+"""Does an environment keep the contract? ``check_env`` tests its claims in turn and names the first broken one."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
@@ -12,9 +12,9 @@ from deimos.nn.host import own_settings
 from deimos.sim.env import Env, EnvConfig, Step
 
 WORLDS = 6
-LONGEST_PERIOD = 6  # T of the copies: long enough to see that a goal is not due before
+LONGEST_PERIOD = 6  # T of the copies: long enough to see that a goal is not due earlier
 STEPS = 20  # through three goals
-UNTIL_CRASH = 200  # steps with one action, by which most worlds have come to an end of theirs
+UNTIL_CRASH = 200  # steps with one action, by which most worlds have crashed if they do
 PENALTY = 2.0  # in multiples of the largest reward
 COUNTS = ("episode_count", "goal_count")
 FLAGS = ("terminated", "truncated", "goal_due", "invalid")
@@ -22,16 +22,16 @@ FLAGS = ("terminated", "truncated", "goal_due", "invalid")
 Build = Callable[..., Env]
 """Makes another copy: ``num_envs``, ``seed``, ``env_offset`` and ``config`` may be given."""
 Claims = Iterator[tuple[bool | Tensor, str]]
-"""What must hold, everywhere where it is a tensor, and what to say where it does not."""
+"""What must hold, everywhere if it is a tensor, and the message if it does not."""
 
 
 @own_settings()
 def check_env(env: Env) -> None:
     """Raise ``ValueError`` if an environment breaks the contract of ``deimos.sim.env``; name what it forgot.
 
-    It builds small copies of the environment from its configuration, with a shorter goal period and, but for one check,
-    no penalty for crashes; ``env`` itself is left alone. Actions are random, so what only rare states would show is not
-    found, and what a crash costs only where random actions that go on for 200 steps crash a world.
+    It builds small copies of the environment from its configuration, with a shorter goal period and, except for one
+    check, no penalty for crashes; ``env`` itself is left alone. Actions are random, so faults that only rare states
+    show are not found, and the cost of a crash is only checked if a random action, held for 200 steps, crashes a world.
 
     Args:
         env: The environment, as ``Config.build`` gave it.
@@ -59,7 +59,7 @@ def _has_type(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dt
 
 
 def _are_equal(found: dict[str, Tensor], expected: dict[str, Tensor], message: str) -> Claims:
-    """Both hold the same numbers; else the message gets the name of those that differ."""
+    """Both hold the same numbers; otherwise the message gets the name of those that differ."""
     for name, value in expected.items():
         same = torch.allclose(found[name].double(), value.double(), rtol=0, atol=0, equal_nan=True)
         yield same, message.format(name=name)
@@ -94,14 +94,14 @@ def _results(step: Step) -> dict[str, Tensor]:
 
 
 def _spoil(step: Step) -> None:
-    """Leave no number of a step that the next one might pass off as its own."""
+    """Overwrite a step's numbers, so that the next one cannot pass them off as its own."""
     for tensor in (step.reward, step.tracking):
         if tensor is not None:
             tensor.fill_(torch.nan)
 
 
 def _advance(env: Env, action: Tensor) -> dict[str, Tensor]:
-    """One step, new goals and resets, as a loop has them; copies of the step's results and of all that follows."""
+    """One step, new goals and resets, as in a loop; copies of the step's results and of the state after it."""
     step = env.step(action)
     results = {f"Step.{name}": value for name, value in _results(step).items()}
     done = step.terminated | step.truncated
@@ -113,7 +113,7 @@ def _advance(env: Env, action: Tensor) -> dict[str, Tensor]:
 
 
 def _check_layout(env: Env, build: Build) -> Claims:
-    """The attributes that everybody reads agree with each other."""
+    """The public attributes agree with each other."""
     names = [field.name for field in env.layout]
     yield names.count("goal") == 1, f"layout must have one field named 'goal', got {', '.join(names)}."
     for field in env.layout:
@@ -147,7 +147,7 @@ def _check_views(env: Env, build: Build) -> Claims:
         step = env.step(action)
         return env.tensors | {name: getattr(step, name) for name in ("obs", "reward", *FLAGS)}
 
-    first = views(first_action)  # kept alive, so that no other memory can come to lie at their addresses
+    first = views(first_action)  # kept alive, so that no other memory can get their addresses
     for action in actions:
         _advance(env, action)
     for name, view in views(last_action).items():
@@ -179,9 +179,9 @@ def _check_start(env: Env, build: Build) -> Claims:
 
 
 def _check_observation(env: Env, build: Build) -> Claims:
-    """Kernels write all of the observation, nothing else where the goal is, and nothing behind it."""
-    if not hasattr(env, "beyond_obs"):  # no WarpEnv, by a question that needs no Warp
-        return  # others may keep their state in it
+    """Kernels write all of the observation, nothing but the goal into the goal's slot, and nothing behind it."""
+    if not hasattr(env, "beyond_obs"):  # not a WarpEnv, tested without Warp
+        return  # others may keep their state in obs
     made: Any = env
     state = torch.ones(env.obs_dim, dtype=torch.bool, device=env.device)
     state[env.goal_slice] = False
@@ -206,7 +206,7 @@ def _check_observation(env: Env, build: Build) -> Claims:
 
 
 def _check_draws(env: Env, build: Build) -> Claims:
-    """What a world draws depends on its global number alone."""
+    """What a world draws depends only on its global number."""
     shard, rows = build(WORLDS // 2, env_offset=WORLDS // 2), _rows(env)[WORLDS // 2 :]
     message = "draws must be addressed by world_offset + env: world 0 of a shard must be that of the whole ({name})."
     yield from _are_equal(shard.tensors, _at(env.tensors, rows), message)
@@ -217,13 +217,13 @@ def _check_draws(env: Env, build: Build) -> Claims:
 
 
 def _check_candidates(env: Env, build: Build) -> Claims:
-    """Candidates are valid shapes, repeatable, and independent of who else asks."""
+    """Candidates have valid shapes, are repeatable, and independent of the other worlds that ask."""
     every = _rows(env)
     goals = env.sample_goals(every, 8).clone()
     yield _has_type("sample_goals(rows, 8)", goals, (WORLDS, 8, env.goal_dim), torch.float32)
     yield goals.isfinite(), "sample_goals must give finite goals."
     few = env.sample_goals(every[[4, 1]], 8) == goals[[4, 1]]
-    yield few, "sample_goals must not depend on who else asks, or when."
+    yield few, "sample_goals must not depend on the other worlds that ask, or on when they do."
     yield env.sample_goals(every, 3) == goals[:, :3], "sample_goals must give the first ones of a longer list."
     env.set_goals(every, goals[:, 0])
     again = (env.sample_goals(every, 8) != goals).any(2)
@@ -231,7 +231,7 @@ def _check_candidates(env: Env, build: Build) -> Claims:
 
 
 def _check_step(env: Env, build: Build) -> Claims:
-    """A step gives what it promises, never resets and never changes a goal."""
+    """A step returns what it promises, never resets and never changes a goal."""
     wide = torch.zeros(WORLDS, env.action_dim + 1, dtype=torch.float32, device=env.device)
     yield _raises(ValueError, lambda: env.step(wide)), f"step must refuse actions of shape {tuple(wide.shape)}."
     groups = len(env.goal_groups)
@@ -264,8 +264,8 @@ def _check_clocks(env: Env, build: Build) -> Claims:
     for age, action in enumerate(_actions(env, env.goal_period + 1), 1):
         step = env.step(action)
         valid = step.goal_due | step.invalid if age >= env.goal_period else ~step.goal_due
-        due = "due from then on" if age >= env.goal_period else "not be due before"
-        yield valid, f"a goal must be {due} T = {env.goal_period} steps, but not so after {age} steps."
+        due = "be due after" if age >= env.goal_period else "not be due before"
+        yield valid, f"a goal must {due} T = {env.goal_period} steps, but this fails after {age} steps."
     if env.time_limit:
         env.restart()
         env.episode_step.fill_(env.time_limit - 1)
@@ -275,7 +275,7 @@ def _check_clocks(env: Env, build: Build) -> Claims:
 
 
 def _check_reset(env: Env, build: Build) -> Claims:
-    """A masked reset begins episodes where it is asked to, and touches nobody else."""
+    """A masked reset begins episodes where it is asked to, and leaves the other worlds alone."""
     for action in _actions(env, 3):
         env.step(action)
     before = env.state_dict()
@@ -292,7 +292,7 @@ def _check_reset(env: Env, build: Build) -> Claims:
 
 
 def _check_set_goals(env: Env, build: Build) -> Claims:
-    """New goals are seen as they were given, count, and touch nobody else."""
+    """New goals are seen as they were given, are counted, and leave the other worlds alone."""
     env.step(_actions(env, 1)[0])
     before = env.state_dict()
     rows, others = _rows(env, 4, 1), _rows(env, 0, 2, 3, 5)
@@ -312,7 +312,7 @@ def _check_set_goals(env: Env, build: Build) -> Claims:
 
 
 def _check_repeats(env: Env, build: Build) -> Claims:
-    """Two environments of one seed do the same, bit for bit."""
+    """Two environments with the same seed do the same, bit for bit."""
     twin, cause = build(), "draws must be addressed, and arrays, action_dim too, as large as what is read of them"
     for age, action in enumerate(_actions(env, STEPS), 1):
         message = f"the same seed must give the same numbers, but {{name}} differs after {age} steps: {cause}."
@@ -321,7 +321,7 @@ def _check_repeats(env: Env, build: Build) -> Claims:
 
 
 def _check_bounds(env: Env, build: Build) -> Claims:
-    """Actions beyond their range do what its ends do."""
+    """Actions beyond their range act like its bounds."""
     twin, (low, high) = build(), (end.to(env.device) for end in env.action_range)
     for sign in _actions(env, 3).sign():
         bound = torch.where(sign < 0, low, high)  # may be infinite
@@ -331,7 +331,7 @@ def _check_bounds(env: Env, build: Build) -> Claims:
 
 
 def _check_clones(env: Env, build: Build) -> Claims:
-    """Clones of worlds, in another environment too, stay equal under the same actions where nothing is drawn."""
+    """Clones of worlds, even in another environment, stay equal under the same actions if nothing is drawn."""
     quiet = env.config.for_evaluation()
     env, other = build(config=quiet), build(config=quiet, seed=1)
     actions = _actions(env, 3 + env.goal_period)
@@ -348,7 +348,7 @@ def _check_clones(env: Env, build: Build) -> Claims:
 
 
 def _check_resume(env: Env, build: Build) -> Claims:
-    """What goes on from a state dictionary equals what was never stopped."""
+    """A continuation from a state dictionary equals an uninterrupted one."""
     resumed = build()
     actions = _actions(env, STEPS + STEPS // 2)
     for action in actions[: STEPS // 2]:
@@ -362,7 +362,7 @@ def _check_resume(env: Env, build: Build) -> Claims:
 
 
 def _check_penalty(env: Env, build: Build) -> Claims:
-    """A crash costs its penalty on its step, after every clipping, and nothing else changes."""
+    """A crash costs its penalty on its step, after all clipping, and nothing else changes."""
     config = replace(env.config, crash_penalty=PENALTY)
     punished, cost = build(config=config), PENALTY * config.largest_reward
     yield punished.crash_penalty == cost, "crash_penalty must be the configuration's times its largest_reward."

@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 INK, PAPER, OUTSIDE = (40, 40, 40), (255, 255, 255), (232, 232, 232)
 BLUE, ORANGE, RED = (0, 114, 178), (230, 159, 0), (200, 30, 30)
 VIEWS = {"from above: x, y": (0, 1), "from the side: x, z": (0, 2)}
-REACH = 1.15  # half sides of the box that are seen
-TRAIL = 150  # pictures that the trail goes back
+REACH = 1.15  # visible half-width, in half sides of the box
+TRAIL = 150  # length of the trail [pictures]
 FINE = 2  # pixels drawn for every pixel shown, along both axes
-LETTERS = 1 / 32  # of a picture's width: as high as letters are, so that a phone shows them
-LINES = 4.6  # heights of letters that are kept free above the boxes, for the caption and the legend
+LETTERS = 1 / 32  # height of letters, as a share of a picture's width: legible on a phone
+LINES = 4.6  # space above the boxes for the caption and the legend, in heights of letters
 
 
 class Drawing:
-    """Draws world 0 of an environment with a ``sketch``, with the trail of its episode and where earlier ones ended.
+    """Draws world 0 of an environment with a ``sketch``, with the trail of its episode and the ends of earlier ones.
 
     Args:
         env: The environment.
@@ -39,18 +39,18 @@ class Drawing:
         self._legend = (("particle", BLUE), ("goal (or where it leads)", ORANGE), (ends, RED))
         self._trail: list[np.ndarray] = []
         self._ends: list[np.ndarray] = []
-        self._age = 0
+        self._episode = 0
 
     def __call__(self) -> np.ndarray:
         """The picture of this moment, uint8, shape (height, width, 3)."""
         from PIL import Image, ImageDraw
 
-        sketch, age = self._env.sketch(0), int(self._env.episode_step[0])
+        sketch, episode = self._env.sketch(0), int(self._env.tensors["episode_count"][0])
         assert sketch is not None
-        if age < self._age:  # another episode has begun
+        if self._trail and episode != self._episode:
             self._ends.append(self._trail[-1])
             self._trail.clear()
-        self._age = age
+        self._episode = episode
         self._trail = [*self._trail[-TRAIL:], sketch.position]
         picture = Image.new("RGB", (self._width, self._height), PAPER)
         gap = (self._width - 2 * self._side) // 3
@@ -64,7 +64,7 @@ class Drawing:
         return np.asarray(picture)
 
     def _view(self, sketch: Sketch, axes: tuple[int, int], name: str) -> "Image":
-        """The box seen along one axis."""
+        """The box, seen along one axis."""
         from PIL import Image, ImageDraw
 
         size, first, second = FINE * self._side, *axes

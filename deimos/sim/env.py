@@ -1,4 +1,4 @@
-"""What every environment promises.
+"""The interface of environments.
 
 The order of one step is part of the contract: physics; crash test; reward, against the goal that was
 active; clocks; the observation that the step ended in, still with the old goal. ``step`` never
@@ -30,12 +30,12 @@ DRAW_COUNTS = ("episode_count", "goal_count")  # the addresses of a world's draw
 
 @dataclass(frozen=True)
 class Step:
-    """What a step gave back. All tensors are views that the next step overwrites."""
+    """What a step returns. All tensors are views that the next step overwrites."""
 
     obs: Tensor
     """Observations that the step ended in, float32, shape (num_envs, obs_dim)."""
     reward: Tensor
-    """Rewards, at least 0 but for ``Env.crash_penalty``, float32, shape (num_envs,)."""
+    """Rewards, at least 0 except for ``Env.crash_penalty``, float32, shape (num_envs,)."""
     terminated: Tensor
     """True where the world crashed, bool, shape (num_envs,)."""
     truncated: Tensor
@@ -43,27 +43,27 @@ class Step:
     goal_due: Tensor
     """True where the goal has been active for its whole period and the state is valid, bool, shape (num_envs,)."""
     invalid: Tensor
-    """True where the state is not physical any more, bool, shape (num_envs,); truncated too, unless it crashed."""
+    """True where the state is no longer physical, bool, shape (num_envs,); truncated too, unless it crashed."""
     tracking: Tensor | None = None
     """How well each group of goal components is met, in [0, 1], float32, shape (num_envs, len(goal_groups));
-    ``None`` where there is one group and the reward itself says it."""
+    ``None`` if there is one group, whose reward says it."""
 
 
 @dataclass(frozen=True)
 class Sketch:
-    """What is to be seen of a world that is a point in a box. Lengths are in the world's own unit."""
+    """What to draw of a world that is a point in a box. Lengths are in the world's own unit."""
 
     half_side: float
     """Half side of the box, around the origin, whose walls the point must not cross."""
     position: np.ndarray
     """Where the point is, shape (3,)."""
     target: np.ndarray
-    """Where its goal is, or where the goal would lead it from here by the time that it ends; shape (3,)."""
+    """Where its goal is, or where the goal would lead it from here by the end of the goal's period; shape (3,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig(abc.ABC):
-    """What the ``Config`` of an environment promises: a frozen dataclass in a file of ``deimos.sim.envs`` or a plug-in.
+    """The interface of an environment's ``Config``: a frozen dataclass in a file of ``deimos.sim.envs`` or a plug-in.
 
     A subclass that checks its own fields in ``__post_init__`` calls this class's too.
     """
@@ -71,8 +71,8 @@ class EnvConfig(abc.ABC):
     goal_period: int = 100
     """T: steps that a goal is active, at least 1."""
     crash_penalty: float = 0.0
-    """What the step of a crash costs the learner, in multiples of the largest goal-matching reward of one step, at
-    least 0. Scores and reported rewards do not include it."""
+    """What a crash costs the learner, in multiples of the largest goal-matching reward of one step, at least 0. Scores
+    and reported rewards do not include it."""
 
     def __post_init__(self) -> None:
         check_at_least("goal_period", self.goal_period, 1)
@@ -96,7 +96,7 @@ class EnvConfig(abc.ABC):
         return {}
 
     def read_file(self, name: str) -> tuple[bytes, str]:
-        """What a run keeps of one of ``files``, whole in itself, and the ending of its copy."""
+        """What a run keeps of one of ``files``, self-contained, and the ending of its copy."""
         return read_bytes(self.files[name]), self.files[name].suffix
 
     @final
@@ -115,7 +115,7 @@ class EnvConfig(abc.ABC):
         return 1.0
 
     def implied(self, name: str) -> float | None:
-        """What a field that is ``None`` stands for; ``None`` where that is no number."""
+        """What a field that is ``None`` stands for; ``None`` if that is not a number."""
         return None
 
     @final
@@ -129,7 +129,7 @@ class EnvConfig(abc.ABC):
         return replace(self.without_randomness(), crash_penalty=0.0)
 
     def resolved(self, device: torch.device) -> Self:
-        """The same task with what ``auto`` stands for on a device, so that a run goes on with it elsewhere."""
+        """The same task with what ``auto`` stands for on a device, so that a run keeps it on another device."""
         return self
 
     def without_randomness(self) -> Self:
@@ -138,43 +138,43 @@ class EnvConfig(abc.ABC):
 
 
 class Env(abc.ABC):
-    """Many worlds, simulated in parallel, each pursuing a goal of its own; built with an episode begun in each."""
+    """Many worlds, simulated in parallel, each pursuing its own goal; once built, every world has begun an episode."""
 
     config: EnvConfig
     num_envs: int
     device: torch.device
     layout: tuple[ObsField, ...]
-    """What stands where in the observation; the field named ``goal`` is the goal slot."""
+    """Fields of the observation, in order; the one named ``goal`` is the goal slot."""
     action_dim: int
     action_bound: float
     """Bound of every component of an action, in absolute value; may be infinite. See ``action_range``."""
     dt: float
-    """Duration of a step [s]; 1 where the world has no seconds."""
+    """Duration of a step [s]; 1 where the environment has no seconds."""
     goal_period: int
     """T: steps that a goal is active."""
     time_limit: int
     """Steps after which an episode is truncated; 0 for never."""
     crash_penalty: float = 0.0
-    """What was subtracted from the reward of a step that ended in a crash: add it to report rewards."""
+    """What is subtracted from the reward of a step that ends in a crash: add it to report rewards."""
     obs: Tensor
     """The current observations: the same memory as ``Step.obs``, refreshed by ``reset`` and ``set_goals``."""
     steps: int = 0
     """Steps since it was built."""
     recordable: bool = False
-    """Whether a CUDA graph may replay steps, resets and draws: work on the device alone, but for counting ``steps``."""
+    """Whether a CUDA graph may replay steps, resets and draws: all work is on the device, except counting ``steps``."""
     may_go_on_invalid: bool = False
-    """Whether the run continues where a world becomes invalid; else ``check`` stops it."""
+    """Whether the run continues if a world becomes invalid; otherwise ``check`` stops it."""
     goal_groups: tuple[slice, ...] = (slice(None),)
     """Components of a goal that are met or missed together."""
     goal_group_names: tuple[str, ...] = ("goal",)
-    """What each of them is called."""
+    """Their names."""
     goal_group_weights: tuple[float, ...] = ()
-    """How much each of them counts in the score, at least 0; empty where all count alike."""
+    """Weight of each of them in the score, at least 0; empty if all weigh the same."""
     goal_range: Tensor | None = None
     """Half side of the box that goals are drawn from, in physical units, shape (goal_dim,); ``None`` for no box."""
     errors: Mapping[str, Tensor] = MappingProxyType({})
     """How far each world was from its goal at the end of the last step, in physical units; by name and unit, views of
-    shape (num_envs,). Empty where ``Step.tracking`` says enough."""
+    shape (num_envs,). Empty where ``Step.tracking`` is enough."""
     episode_step: Tensor
     """Steps since the last reset, int32, shape (num_envs,); a view."""
     tensors: dict[str, Tensor]
@@ -189,7 +189,7 @@ class Env(abc.ABC):
             action: Actions, float32, shape (num_envs, action_dim).
 
         Raises:
-            ValueError: If the shape is another.
+            ValueError: If the shape is a different one.
         """
 
     @abc.abstractmethod
@@ -238,15 +238,15 @@ class Env(abc.ABC):
         """
 
     def scene(self, world: int) -> "tuple[mujoco.MjModel, mujoco.MjData] | None":
-        """One world as MuJoCo's model and data, for rendering; ``None`` where MuJoCo cannot show it."""
+        """One world as MuJoCo's model and data, for rendering; ``None`` if MuJoCo cannot show it."""
         return None
 
     def sketch(self, world: int) -> Sketch | None:
-        """One world as a drawing, for rendering where there is no ``scene``; ``None`` where it is no point in a box."""
+        """One world as a drawing, for rendering without a ``scene``; ``None`` if it is not a point in a box."""
         return None
 
     def goal_point(self, world: int) -> np.ndarray | None:
-        """Where the goal of one world is in its ``scene`` [m], shape (3,); ``None`` where a goal is no place."""
+        """Where the goal of one world is in its ``scene`` [m], shape (3,); ``None`` if a goal is not a place."""
         return None
 
     @property
@@ -255,7 +255,7 @@ class Env(abc.ABC):
         return self.dt != 1
 
     def goal_bounds(self, rows: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The box of the valid goals of the listed worlds; ``None`` where not all goals of a box are valid.
+        """The box of the valid goals of the listed worlds; ``None`` if not all goals of a box are valid.
 
         Args:
             rows: Worlds, int64, shape (B,).
@@ -268,7 +268,7 @@ class Env(abc.ABC):
     def rest_goal(self) -> tuple[float | None, ...]:
         """The goal that asks a world to stay where it is, as the policy sees it.
 
-        By default all zeros: no speed, no way to go, the middle of the box. ``None`` for components that stay.
+        By default all zeros: no speed, no distance to go, the middle of the box. ``None`` for components that stay.
         """
         return (0.0,) * self.goal_dim
 
@@ -280,33 +280,33 @@ class Env(abc.ABC):
             goal: A valid uniform goal for each, shape (B, goal_dim), for the components that are left to chance.
 
         Returns:
-            Valid goals as the policy sees them, shape (B, goal_dim); ``None`` where the environment has no idea.
+            Valid goals as the policy sees them, shape (B, goal_dim); ``None`` if the environment defines none.
         """
         return None
 
     def achieved(self, obs: Tensor) -> Tensor | None:
-        """The goals that observations meet exactly, for learners that hand out goals in hindsight.
+        """The goals that observations meet exactly, for learners that relabel goals in hindsight.
 
         Args:
             obs: Observations that steps ended in, shape (n, obs_dim).
 
         Returns:
-            Shape (n, goal_dim); ``None`` where a reward also depends on other things than these and the goal.
+            Shape (n, goal_dim); ``None`` if a reward depends on more than these and the goal.
         """
         return None
 
     def goal_reward(self, achieved: Tensor, goal: Tensor) -> Tensor:
-        """Rewards of steps that achieved one thing and whose goal was another, without ``crash_penalty``.
+        """Rewards of steps with the given achievements and goals, without ``crash_penalty``.
 
         Args:
-            achieved: What ``achieved`` gave, shape (n, goal_dim).
+            achieved: What ``achieved`` returned, shape (n, goal_dim).
             goal: Goals as the policy sees them, shape (n, goal_dim).
 
         Returns:
             Float32, shape (n,).
 
         Raises:
-            ValueError: If ``achieved`` gives ``None`` here.
+            ValueError: If ``achieved`` returns ``None`` here.
         """
         raise ValueError(f"The rewards of {type(self).__name__} depend on more than what was achieved and the goal.")
 
@@ -317,7 +317,7 @@ class Env(abc.ABC):
             rows: Worlds, int64, shape (B,).
 
         Returns:
-            Shape (B, goal_dim), in [-1, 1] inside; ``None`` where there is no such box.
+            Shape (B, goal_dim), in [-1, 1] inside; ``None`` if there is no such box.
         """
         return None
 
@@ -325,31 +325,31 @@ class Env(abc.ABC):
         """Put worlds where any goal is dangerous and where none is, to ask a fear network about both.
 
         Returns:
-            The former and the latter, int64, shapes (m,) and (n,); ``None`` where the environment knows no such places.
+            The former and the latter, int64, shapes (m,) and (n,); ``None`` if the environment knows no such places.
             Their goals are uniform. A later reset may give others.
         """
         return None
 
     def strata(self) -> list[str]:
-        """What kind of world each one is, such as the ground that it stands on, for evaluation; empty for no kinds."""
+        """The kind of each world, such as the ground that it stands on, for evaluation; empty for no kinds."""
         return []
 
     def report(self) -> dict[str, float]:
-        """What a log wants to know of the steps since the last call, the same keys every time; reads the device.
+        """Numbers for the log on the steps since the last call, the same keys every time; reads the device.
 
-        Where several ranks share a run, all call it, and the log has what the first one gives: see ``deimos.nn.ranks``.
+        Where several ranks share a run, all call it, and the first one's result is logged: see ``deimos.nn.ranks``.
         """
         return {}
 
     def reference_policy(self) -> Callable[[Tensor], Tensor] | None:
-        """A scripted policy (obs -> action) that fixes 1 on the normalised score; ``None`` where there is none."""
+        """A scripted policy (obs -> action) that sets 1 on the normalised score; ``None`` if there is none."""
         return None
 
     def tracking_at_rest(self) -> float | None:
-        """Weighted tracking of uniform goals by a robot that stands still, in [0, 1]: what fixes 0 on the score.
+        """Weighted tracking of uniform goals by a robot that stands still, in [0, 1]: it sets 0 on the score.
 
-        Perfect tracking is 1 then. The robots of this environment stand for a while to find out. ``None`` where scripts
-        fix the score (``reference_policy``), or nothing does.
+        Perfect tracking is then 1. The robots of this environment stand for a while to find out. ``None`` if scripts
+        set the score (``reference_policy``), or nothing does.
         """
         return None
 
@@ -366,7 +366,7 @@ class Env(abc.ABC):
 
     @property
     def goal_slice(self) -> slice:
-        """Where the goal sits in the observation."""
+        """The components of the observation that hold the goal."""
         return goal_slice(self.layout)
 
     @property
@@ -392,7 +392,7 @@ class Env(abc.ABC):
         return torch.cat([obs[..., : goal.start], obs[..., goal.stop :]], dim=-1)
 
     def restart(self, goal_scale: Tensor | None = None) -> None:
-        """Begin every world's first episode again, as it was when the environment was built, its first goal apart.
+        """Begin every world's first episode again, as it was when the environment was built, except for its first goal.
 
         Args:
             goal_scale: Share of the goal range that first goals come from; see ``reset``.
@@ -404,7 +404,7 @@ class Env(abc.ABC):
     def copy_worlds(self, source: Tensor, target: Tensor, origin: "Env | None" = None) -> None:
         """Make worlds ``target`` exact clones of worlds ``source``, clocks and counts included.
 
-        A clone keeps its own global number, so what it draws later is its own.
+        A clone keeps its own global number, so its later draws are its own.
 
         Args:
             source: Worlds to copy, int64, shape (n,).
@@ -416,13 +416,13 @@ class Env(abc.ABC):
             tensor[target] = origin.tensors[name][source]
 
     def take_worlds(self, state: dict[str, Tensor]) -> None:
-        """Continue where the worlds of another environment are, with draws of this one's own.
+        """Continue where the worlds of another environment are, with this one's own draws.
 
         Args:
-            state: Its ``state_dict()``. What only one of the two has, since another engine simulates it, is left out.
+            state: Its ``state_dict()``. What only one of the two has, because engines differ, is left out.
 
         Raises:
-            ValueError: If it is that of another task or another number of worlds.
+            ValueError: If it belongs to another task or number of worlds.
         """
         for name, tensor in self.tensors.items():
             if name in state and name not in DRAW_COUNTS:
@@ -439,12 +439,12 @@ class Env(abc.ABC):
         """Continue from ``state_dict()``.
 
         Raises:
-            ValueError: If ``state`` is that of another environment or another number of worlds.
+            ValueError: If ``state`` belongs to another environment or number of worlds.
         """
         state = {name: own_rows(tensor) for name, tensor in state.items()}
         expected = {name: tuple(tensor.shape) for name, tensor in self.tensors.items()}
         found = {name: tuple(tensor.shape) for name, tensor in state.items()}
         if expected != found:
-            raise ValueError(f"state must hold {expected}, got {found}; it is that of another environment.")
+            raise ValueError(f"state must hold {expected}, got {found}; it belongs to another environment.")
         for name, tensor in self.tensors.items():
             tensor.copy_(state[name])

@@ -1,4 +1,4 @@
-"""CUDA graphs of torch's and Warp's work at once: many small calls for the price of one."""
+"""CUDA graphs of torch's and Warp's work together: many small calls for the price of one."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -14,20 +14,20 @@ from deimos.sim.shared import warp_device
 
 Mode = Literal["auto", "on", "off"]
 MODES: tuple[Mode, ...] = get_args(Mode)
-CAPTURE_MODE = "thread_local"  # of torch's names, Warp's default: threads that log may use the device meanwhile
+CAPTURE_MODE = "thread_local"  # torch's name for Warp's default: threads that log may use the device meanwhile
 
 
 class CudaGraph:
     """What torch and Warp launch on the current stream, recorded as one CUDA graph.
 
-    torch begins the capture, so that its allocator keeps the memory for the graph alone, and Warp is told of it, as
-    both document. A loop of Warp's whose end the device decides (``wp.capture_while``, in mujoco-warp's solver) ends
-    that capture and begins another one to the same graph, by whose number torch's allocator does not know that memory
-    belongs to it any more; so all that this thread allocates comes from a pool of its own.
+    torch begins the capture, so that its allocator reserves the memory for the graph, and Warp is told of it, as both
+    document. A Warp loop whose end the device decides (``wp.capture_while``, in mujoco-warp's solver) ends that capture
+    and begins another one into the same graph, whose number torch's allocator does not recognise; so everything that
+    this thread allocates comes from a separate pool.
 
     Args:
-        work: What is recorded; run once, and nothing is done yet.
-        device: Where; enter ``one_stream`` before.
+        work: What is recorded; called once, without any effect on the device yet.
+        device: Where; enter ``one_stream`` first.
     """
 
     def __init__(self, work: Callable[[], Any], device: torch.device) -> None:
@@ -45,14 +45,14 @@ class CudaGraph:
 
 
 RECORDERS: dict[str, Callable[[Callable[[], Any], torch.device], Recording[Any]]] = {"cuda": CudaGraph}
-"""What records work, by the type of the device."""
+"""Recorders, by the type of the device."""
 
 
 def recorder(mode: Mode, device: torch.device) -> Recorder | None:
-    """Who records work on a device, and raises ``RunError`` if that fails; ``None`` for nobody.
+    """The recorder for a device, which raises ``RunError`` if recording fails; ``None`` for no recording.
 
     Raises:
-        RunError: If work is to be recorded where nothing can.
+        RunError: If the mode is on and the device cannot record.
     """
     found = RECORDERS.get(device.type)
     if mode == "on" and found is None:
@@ -71,9 +71,9 @@ def recorder(mode: Mode, device: torch.device) -> Recorder | None:
 
 @contextmanager
 def no_garbage_collected(device: torch.device) -> Iterator[None]:
-    """Keep Python from finalising what is left of earlier graphs: on CUDA, freeing their memory would be recorded."""
+    """Keep Python from finalising remains of earlier graphs: on CUDA, freeing their memory would be recorded."""
     if device.type == "cuda":
-        gc.collect()  # it takes a tenth of a second
+        gc.collect()  # takes a tenth of a second
     was_enabled = gc.isenabled()
     gc.disable()
     try:

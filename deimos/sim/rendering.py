@@ -1,4 +1,4 @@
-"""Pictures of a world: by MuJoCo where it simulates it, else as a drawing."""
+"""Pictures of a world: by MuJoCo if it simulates the world, otherwise as a drawing."""
 
 import os
 import sys
@@ -19,17 +19,17 @@ RED = np.array([0.9, 0.15, 0.1, 0.9], np.float32)
 
 
 def choose_renderer() -> None:
-    """Have MuJoCo render without a display, as the user says or by EGL; call it before MuJoCo is imported."""
+    """Have MuJoCo render without a display, as MUJOCO_GL says or with EGL; call it before MuJoCo is imported."""
     if sys.platform.startswith("linux"):
         os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL") or "egl"
 
 
 @contextmanager
 def rendering() -> Iterator[None]:
-    """Turn whatever goes wrong into a ``RunError`` that says how to render, but for a missing MuJoCo."""
+    """Turn any error except a missing MuJoCo into a ``RunError`` that says how to render."""
     try:
         yield
-    except Exception as error:  # of MuJoCo, PyOpenGL and what they load: ImportError, AttributeError, GLError, ...
+    except Exception as error:  # from MuJoCo, PyOpenGL and what they load: ImportError, AttributeError, GLError, ...
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
             raise
         raise RunError(
@@ -39,17 +39,17 @@ def rendering() -> Iterator[None]:
 
 
 def load_renderer() -> None:
-    """Import MuJoCo after ``choose_renderer``, where it finds what it renders with.
+    """Import MuJoCo after ``choose_renderer``, which is when it loads its renderer.
 
     Raises:
         RunError: If nothing can be rendered here.
     """
     with rendering():
-        import mujoco  # noqa: F401 (it decides now how it will render)
+        import mujoco  # noqa: F401 (the import chooses the renderer)
 
 
 def renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Renderer":
-    """What renders a model in pictures of a size [pixels].
+    """A renderer of a model, for pictures of a size [pixels].
 
     Raises:
         RunError: If nothing can be rendered here.
@@ -63,7 +63,7 @@ def renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Render
 
 @contextmanager
 def view(env: Env, width: int, height: int) -> Iterator[Callable[[], np.ndarray]]:
-    """Gives the function that shows world 0 as it is, uint8, shape (height, width, 3).
+    """Yields a function that renders world 0 as it is, uint8, shape (height, width, 3).
 
     Args:
         env: The environment.

@@ -25,13 +25,13 @@ class Shared:
 
     @classmethod
     def zeros(cls, shape: int | tuple[int, ...], dtype: type, device: torch.device) -> "Shared":
-        """Allocate zeros of a Warp dtype; where it is a vector, the tensor has one axis more than ``shape``."""
+        """Allocate zeros of a Warp dtype; if it is a vector, the tensor has one axis more than ``shape``."""
         array = wp.zeros(shape, dtype=dtype, device=warp_device(device))
         return cls(array, wp.to_torch(array))
 
 
 def warp_device(device: torch.device) -> str:
-    """Warp's name of a torch device."""
+    """Warp's name for a torch device."""
     return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
 
 
@@ -53,7 +53,7 @@ def one_stream(device: torch.device) -> Iterator[None]:
 
 @functools.cache
 def _stream(device: str) -> wp.Stream:
-    wp.init()  # a stream does not do it by itself
+    wp.init()  # creating a stream does not do it
     return wp.Stream(device)
 
 
@@ -70,15 +70,15 @@ def check_stream(device: torch.device) -> None:
 
 
 def find_cuda() -> int:
-    """How many CUDA devices torch and Warp both see.
+    """The number of CUDA devices, if torch and Warp both see some.
 
     Raises:
-        RunError: If torch sees one and Warp does not, which simulates.
+        RunError: If torch sees one but Warp, which simulates, does not.
     """
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if count and not wp.get_cuda_device_count():
         raise RunError(
-            f"torch {torch.__version__} sees a CUDA device and Warp {wp.config.version} does not: PyPI's Warp needs an "
+            f"torch {torch.__version__} sees a CUDA device but Warp {wp.config.version} does not: PyPI's Warp needs an "
             f"NVIDIA driver R580 or newer; update the driver, install the +cu12 wheel of Warp from its releases on "
             f"GitHub, or use --device cpu."
         )

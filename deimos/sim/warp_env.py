@@ -1,4 +1,4 @@
-"""Environments on Warp kernels: memory that torch sees too, recorded launches, the drawing of goals."""
+"""Environments on Warp kernels: memory shared with torch, recorded launches, drawing goals."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,46 +17,46 @@ from deimos.nn.layout import goal_field
 from deimos.sim.env import Env, EnvConfig, ObsField, Step
 from deimos.sim.shared import Shared, check_stream, warp_device
 
-MAX_INVALID_SHARE = 1e-3  # of all world-steps; more of them stop the run
-GUARD = 64  # rows behind the observations, which take what a kernel writes beyond the last one
-WINDOW = 10_000  # world-steps that the share is of at least, however often it is looked at
+MAX_INVALID_SHARE = 1e-3  # of all world-steps; a larger share stops the run
+GUARD = 64  # rows behind the observations, which catch what a kernel writes beyond the last one
+WINDOW = 10_000  # world-steps, at least, that the share is taken of, however often it is checked
 
 
 class WarpEnv(Env):
     """An environment on Warp kernels.
 
-    A subclass calls this constructor, allocates its own state by ``allocate``, and at last calls ``begin`` with a
+    A subclass calls this constructor, allocates its own state with ``allocate``, and finally calls ``begin`` with a
     kernel for the step (physics, reward, crash, observation) and one for the reset; see ``deimos.kernels.episodes`` for
-    what these share, and docs/add_an_environment.md for a whole one. Masks, worlds, goals and shares of another shape
-    or kind than ``Env`` says are refused by a ``ValueError``: nothing is broadcast.
+    what these share, and docs/add_an_environment.md for a complete example. Masks, worlds, goals and shares whose shape
+    or dtype is not as ``Env`` says raise a ``ValueError``: nothing is broadcast.
 
     Args:
         config: The task.
         num_envs, device, seed, env_offset: See ``EnvConfig.build``.
-        layout: What stands where in the observation. Goals are shown times the scale of the field ``goal``.
+        layout: Fields of the observation, in order. Goals are shown times the scale of the field ``goal``.
         goal_range: Half side of the box that goals are drawn from along every component, in physical units.
         action_dim: Components of an action.
         action_bound: The environment clips actions to [-action_bound, action_bound].
-        dt: Duration of a step [s]; 1 where the world has no seconds.
+        dt: Duration of a step [s]; 1 where the environment has no seconds.
         time_limit: Steps after which an episode is truncated; 0 for never.
         stagger: Whether the goal clock of every world's first episode starts at a random step.
 
     Raises:
-        ValueError: If ``num_envs`` or ``seed`` is out of its range, or goals have other components than their field.
+        ValueError: If ``num_envs`` or ``seed`` is out of its range, or goals and their field differ in size.
     """
 
     quantities: tuple[str, ...] = ("action",)
     """What may be broken in an invalid world, by the bits of the cause that the step's kernel gives ``end_step``."""
     worlds: Worlds
-    """What all environments have for their worlds, for the kernels."""
+    """The arrays that all environments have for their worlds, for the kernels."""
     action: Shared
     """The actions of the step: ``worlds.action``."""
     goal_range: Tensor
     """See ``Env.goal_range``."""
     beyond_obs: Tensor
-    """Memory behind ``obs`` that no kernel may write, for ``check_env``."""
+    """Memory behind ``obs`` that no kernel may write to, for ``check_env``."""
     launch_step: Callable[[], None]
-    """Simulates one step under the actions that are in ``action``, for benchmarks too."""
+    """Simulates one step with the actions in ``action``; also for benchmarks."""
 
     def __init__(
         self, config: EnvConfig, num_envs: int, device: torch.device, seed: int, env_offset: int, *,
@@ -90,7 +90,7 @@ class WarpEnv(Env):
         views = {name: wp.to_torch(getattr(self.worlds, name)) for name in WORLDS.names}
         self._views = views
         self._memory = [views[name] for name in (*Step.__dataclass_fields__, *RESUMED)]
-        # Observations are kept, not computed anew: what a policy saw is part of a bit-exact resume.
+        # Observations are stored, not recomputed: what a policy saw is part of a bit-exact resume.
         self.tensors = {name: views[name] for name in RESUMED}
         step = {name: views[name] for name in Step.__dataclass_fields__}
         self._step = Step(**step | {"tracking": views["tracking"] if groups > 1 else None})
@@ -108,7 +108,7 @@ class WarpEnv(Env):
         self._nobody = torch.full((num_envs,), -1, dtype=torch.int64, device=device)
         self._candidates: dict[int, tuple[Shared, list[wp.Launch]]] = {}
         self.invalid_steps = 0
-        """Invalid world-steps that ``check`` has found."""
+        """Number of invalid world-steps that ``check`` has found."""
         self._no_fault = views["fault"].clone()
         self._window_began = self._faults_known = 0
 
@@ -118,7 +118,7 @@ class WarpEnv(Env):
 
         Args:
             table: The struct and the shapes of its arrays, of which ``num_envs`` is known.
-            resume: Whether a bit-exact resume needs them; then their first axis must be the worlds.
+            resume: Whether a bit-exact resume needs them; their first axis must then be the worlds.
             sizes: The other sizes in the table.
 
         Returns:
@@ -135,7 +135,7 @@ class WarpEnv(Env):
 
     @final
     def record(self, kernel: wp.Kernel, *inputs: object) -> Callable[[], None]:
-        """Record a kernel over all worlds, of the arguments ``worlds`` and ``inputs``.
+        """Record a kernel over all worlds, with the arguments ``worlds`` and ``inputs``.
 
         Replaying a launch costs half of making it (18 us against 34 us on a CPU).
         """
@@ -149,11 +149,11 @@ class WarpEnv(Env):
         """Begin every world's first episode: the last thing that a constructor does.
 
         Args:
-            step: Simulates one step under the actions in ``action``.
+            step: Simulates one step with the actions in ``action``.
             reset: Begins an episode in the worlds of ``worlds.mask``.
-            valid_goals: Given candidate goals as the policy sees them, float32, shape (num_envs, count, goal_dim),
-                that are uniform in their box for the worlds of ``_row``: records what makes valid goals of them, by a
-                launch of two axes, rows first. ``None`` where all are valid.
+            valid_goals: Records a launch with two axes, rows first, that turns candidates into valid goals. It takes
+                candidates as the policy sees them, uniform in their box for the worlds of ``_row``, float32, shape
+                (num_envs, count, goal_dim). ``None`` if all are valid.
         """
         self.launch_step, self._launch_reset, self._valid_goals = step, reset, valid_goals
         self._launch_goals = set_goals(self._row.array, self._new_goal.array, self.worlds)
@@ -162,7 +162,7 @@ class WarpEnv(Env):
             world_offset=self._offset, record=True,
         )  # fmt: skip
         for tensor in self._memory:
-            tensor.zero_()  # what recording has done is undone
+            tensor.zero_()  # undo the effects of recording
         self._clear_faults()
         self.reset(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
 
@@ -237,9 +237,9 @@ class WarpEnv(Env):
         self._launch_goals.launch()
 
     def take_worlds(self, state: dict[str, Tensor]) -> None:
-        """See ``Env.take_worlds``. Goals that lasted longer there keep their place in a period of this T.
+        """See ``Env.take_worlds``. Clocks of goals that lasted longer there are taken modulo this T.
 
-        So goals that fell due evenly go on doing so, in place of most of them at the first step.
+        So goals that fell due evenly continue to do so, instead of most of them at the first step.
         """
         super().take_worlds(state)
         self.tensors["goal_clock"].remainder_(self.goal_period)
@@ -248,9 +248,9 @@ class WarpEnv(Env):
     def check(self) -> None:
         """See ``Env.check``. An action that is not finite stops the run at once.
 
-        So does any invalid world, unless ``may_go_on_invalid``. Then single ones are reset and left out of learning,
-        and too many stop the run: more than a share of the world-steps since the window began, which is at least
-        ``WINDOW`` of them and ends with the next check.
+        So does any invalid world, unless ``may_go_on_invalid``. In that case single ones are reset and left out of
+        learning, and too many stop the run: more than a share of the world-steps since the window began. A window ends
+        with the first check after at least ``WINDOW`` of them.
         """
         faults, world, actor = self._views["fault"].tolist()
         self.invalid_steps += faults - self._faults_known
@@ -271,7 +271,7 @@ class WarpEnv(Env):
             raise SimulationError(message)
 
     def describe_fault(self, world: int) -> str:
-        """What was wrong with an invalid world when it last was."""
+        """What was wrong with a world when it was last invalid."""
         cause = int(self._views["cause"][world])
         broken = " and ".join(name for bit, name in enumerate(self.quantities) if cause & 1 << bit)
         return f"its {broken or 'state'} is not finite"
@@ -291,13 +291,13 @@ class WarpEnv(Env):
         return candidates, launches
 
     def _set_rows(self, rows: Tensor) -> None:
-        if rows.dtype not in (torch.int32, torch.int64):  # a mask would be taken for worlds 0 and 1
+        if rows.dtype not in (torch.int32, torch.int64):  # a mask would be read as worlds 0 and 1
             raise ValueError(f"rows must be whole numbers of worlds, got {rows.dtype}.")
         self._row.tensor[: len(rows)] = rows
 
 
 class _Share:
-    """A share of a range, in memory that a kernel reads; the whole of it is written only where it was another."""
+    """A share of a range, in memory that a kernel reads; the whole range is written only after another share."""
 
     def __init__(self, whole: Tensor, out: Tensor) -> None:
         self._whole, self._out = whole, out
@@ -320,7 +320,7 @@ def _require_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
 
 
 def _require_mask(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
-    """Raise ``ValueError`` unless a tensor is a mask of this shape: numbers of worlds would be taken for one."""
+    """Raise ``ValueError`` unless a tensor is a mask of this shape: numbers of worlds could pass for one."""
     _require_shape(name, tensor, shape)
     if tensor.dtype != torch.bool:
         raise ValueError(f"{name} must be bool, got {tensor.dtype}.")

@@ -1,6 +1,6 @@
-"""One step and one reset of the arm on a legged robot: how well it does, and what the policy sees of it.
+"""One step and one reset of the arm on a legged robot: its tracking, and what the policy sees of it.
 
-Where arm and goals are is in ``arm_goals``, the terms of the reward are in ``arm_rewards``.
+The positions of arm and goals are in ``arm_goals``, the terms of the reward in ``arm_rewards``.
 """
 
 import warp as wp
@@ -34,7 +34,7 @@ from .step import bounded_action, find_fault
 wp.set_module_options({"enable_backward": False})
 
 GROUP = 2  # of the goal's components: the arm's
-SEEN_BOUND = 2.0  # what the policy sees of the end effector is clipped to this on either side
+SEEN_BOUND = 2.0  # the policy's view of the end effector is clipped to this, on either side
 
 
 @wp.func
@@ -92,10 +92,10 @@ def _evaluate_arms(
 
 
 def evaluate_arms(legged: LeggedWorlds, arm: Arm) -> None:
-    """Evaluate what the arms have done: their terms, tracking and part of the observation, and ``arm.error``.
+    """Evaluate a step of the arms: their terms, tracking and part of the observation, and ``arm.error``.
 
-    To be followed by ``evaluate_step``, which adds the terms to the legs' and clears them in worlds that are not
-    physical any more; nothing else is written in such a world. The terms are written from column ``NUM_COLUMNS`` on,
+    Must be followed by ``evaluate_step``, which adds the terms to the legs' and clears them in worlds that are no
+    longer physical; nothing else is written in such a world. The terms are written from column ``NUM_COLUMNS`` on,
     the tracking in column ``GROUP``, the observation at ``arm.obs_start``.
     """
     legged.launch(
@@ -133,6 +133,6 @@ def _reset_arms(
 def reset_arms(legged: LeggedWorlds, arm: Arm) -> None:
     """Finish what ``reset_worlds`` has begun in every world of ``worlds.mask``.
 
-    The arm's part of the first goal becomes a valid one, and observation and ``arm.error`` say where the arm is.
+    The arm's part of the first goal becomes a valid one, and observation and ``arm.error`` describe the arm.
     """
     legged.launch(_reset_arms, legged.worlds.num_envs, arm, legged.ground, legged.sim)

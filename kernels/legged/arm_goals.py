@@ -2,13 +2,13 @@
 
 The arm's joints follow those of the legs, and the last three components of a goal are the arm's: where the end
 effector should be, relative to an origin that is ``Arm.origin`` above the ground below the robot and
-turns with the base's yaw alone. They are its distance, pitch (up positive) and yaw, each mapped linearly to [-1, 1]::
+turns only with the base's yaw. They are its distance, pitch (up positive) and yaw, each mapped linearly to [-1, 1]::
 
     distance = 0.30 m + 0.15 m g_0        in [0.15, 0.45] m
     pitch    = 7.5 deg + 52.5 deg g_1     in [-45, 60] deg
     yaw      = 108 deg g_2                in [-108, 108] deg
 
-and the wanted place is distance (cos pitch cos yaw, cos pitch sin yaw, sin pitch). The numbers of a goal do not
+and the wanted position is distance (cos pitch cos yaw, cos pitch sin yaw, sin pitch). The numbers of a goal do not
 change while it is active. Goals inside the robot's own body, or less than ``Arm.clearance`` above the ground
 where the robot is when they are drawn, are not valid and are drawn again. On level ground the lowest are 0.17 m
 above it.
@@ -37,22 +37,22 @@ SHELL_LOW = (0.15, math.radians(-45), math.radians(-108))  # distance [m], pitch
 SHELL_HIGH = (0.45, math.radians(60), math.radians(108))
 _MIDDLE = wp.constant(wp.vec3(*((low + high) / 2 for low, high in zip(SHELL_LOW, SHELL_HIGH, strict=True))))
 _HALF = wp.constant(wp.vec3(*((high - low) / 2 for low, high in zip(SHELL_LOW, SHELL_HIGH, strict=True))))
-GOAL_COMPONENT = 3  # of a goal: where the arm's begin
+GOAL_COMPONENT = 3  # where the arm's begin in a goal
 FOOTPRINT = (0.38, 0.25)  # [m] along and across a Go1's trunk: what counts as below the robot
-MAX_DRAWS = 64  # of a goal; on level ground one in eight is not valid, so all of them fail once in 10^57
-FIRST_REDRAW = 2  # block of the draws of a goal that redraws begin with; six components take two
+MAX_DRAWS = 64  # per goal; on level ground one in eight is not valid, so all of them fail once in 10^57
+FIRST_REDRAW = 2  # block of a goal's draws that redraws begin with; six components take two
 
 
 @wp.struct
 class Arm:
-    """The arm and what it is asked for."""
+    """The arm and the parameters of its goals."""
 
     offset: wp.array[wp.vec3]  # of every joint, and of the end effector, in the frame before it [m]
     axis: wp.array[wp.vec3]  # of every joint
     origin: wp.vec3  # of the goals, in the frame of the base's yaw, above the ground below the robot [m]
-    body_low: wp.vec3  # corners of what goals keep out of, relative to the origin [m]
+    body_low: wp.vec3  # corners of the box that goals stay out of, relative to the origin [m]
     body_high: wp.vec3
-    clearance: float  # of goals above the ground [m]
+    clearance: float  # least height of goals above the ground [m]
     weight: vecA  # of the reward's terms
     obs_start: int  # where the end effector starts in the observation
     error: wp.array[float]  # distance of the end effector from its goal at the end of the last step [m]
@@ -62,7 +62,7 @@ ARM = StructTable(Arm, {"offset": ("num_links",), "axis": ("num_arm_joints",)})
 
 
 def check_arm(arm: Arm, legged: LeggedWorlds) -> None:
-    """Raise ``ValueError`` unless ``arm`` has the joints of ``legged`` that are not the legs'. Call it once."""
+    """Raise ``ValueError`` unless ``arm`` fits the joints of ``legged`` that are not the legs'. Call it once."""
     joints = legged.sizes["num_joints"] - LEG_JOINTS
     ARM.require("arm", arm, legged.worlds.goal, num_arm_joints=joints, num_links=joints + 1, **legged.sizes)
 
@@ -209,7 +209,7 @@ def _locate_goals(
 
 
 def locate_goals(legged: LeggedWorlds, arm: Arm) -> wp.array:
-    """Where in the world the arms' goals are [m], vec3, shape (num_envs,); for pictures."""
+    """Positions of the arms' goals in the world [m], vec3, shape (num_envs,); for pictures."""
     point = wp.empty(legged.worlds.num_envs, dtype=wp.vec3, device=arm.error.device)
     legged.launch(_locate_goals, len(point), arm, legged.ground, legged.sim, point)
     return point
@@ -241,11 +241,11 @@ def _redraw_candidates(
 
 
 def redraw_candidates(legged: LeggedWorlds, arm: Arm, row: wp.array, scale: wp.array, candidate: wp.array) -> wp.Launch:
-    """Record what puts valid goals in the place of those of ``draw_candidates`` that are not.
+    """Record a launch that replaces invalid candidates of ``draw_candidates`` with valid ones.
 
     The arm's part of such a candidate is drawn again from the same box until it is valid, which makes it uniform over
-    the valid goals. What comes out depends on (seed, world, the number of the goal, k) alone where the ground is level;
-    elsewhere also on where the robot is. For ``row``, ``scale`` and ``candidate`` see ``draw_candidates``.
+    the valid goals. On level ground the result depends only on (seed, world, the number of the goal, k); elsewhere also
+    on where the robot is. For ``row``, ``scale`` and ``candidate`` see ``draw_candidates``.
 
     Returns:
         The launch, a thread for each candidate of each row.

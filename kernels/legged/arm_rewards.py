@@ -1,8 +1,8 @@
 """The arm's part of a legged robot's reward: one ``@wp.func`` per term and one weight per term.
 
 To add a term, write its function and give it a weight of the same name in ``ArmWeights``: kernels, command line and
-log find it by that name. Every term is multiplied by its weight and by the step's duration, and joins those of the legs
-(``deimos.kernels.legged.rewards``) before their sum is clipped at 0.
+log find it by that name. Every term is multiplied by its weight and the step's duration, and added to those of the
+legs (``deimos.kernels.legged.rewards``) before their sum is clipped at 0.
 """
 
 from dataclasses import dataclass, fields
@@ -13,7 +13,7 @@ from .terms import functions_of
 
 wp.set_module_options({"enable_backward": False})
 
-PRECISION_DISTANCE = 0.05  # [m]; a goal missed by as much is worth half
+PRECISION_DISTANCE = 0.05  # [m]; a goal missed by this much is worth half
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class ArmWeights:
     arm_energy: float = -0.004
     """Sum of the arm's joints' |torque x speed| [W]."""
     arm_action_rate: float = -0.01
-    """Sum of the squared differences of the arm's actions of two steps."""
+    """Sum of the squared changes of the arm's actions between two steps."""
 
 
 ARM_TERMS = tuple(field.name for field in fields(ArmWeights))

@@ -1,4 +1,4 @@
-"""Which part of a robot pushes how hard on the terrain, from the simulator's own contact arrays.
+"""How hard each part of a robot pushes on the terrain, from the simulator's own contact arrays.
 
 Every collision geom belongs to a *part* (the base, a foot, a limb) or to the terrain. For every
 substep of a control step the normal forces of all contacts between a part and the terrain are summed;
@@ -96,7 +96,7 @@ def gather_contacts(contacts: Contacts, *, substep: int) -> None:
     """Add the normal forces between each part and the terrain to one substep of ``part_force``; raise ``peak``.
 
     Args:
-        contacts: The contacts of this substep, as ``CONTACTS`` says; only the substep is checked here.
+        contacts: The contacts of this substep, checked by ``CONTACTS`` before; only the substep is checked here.
         substep: Which substep this is, in [0, substeps).
 
     Raises:

@@ -55,7 +55,7 @@ def scan_points(length: float = 1.6, width: float = 1.0, spacing: float = 0.1) -
     Args:
         length: Extent along x [m], a multiple of ``spacing``.
         width: Extent along y [m], a multiple of ``spacing``.
-        spacing: Distance of two points [m], positive.
+        spacing: Distance between neighbouring points [m], positive.
 
     Returns:
         Points in the frame of the robot's yaw [m], float32, shape (num_points, 2); (187, 2) by default.

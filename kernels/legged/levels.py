@@ -1,11 +1,11 @@
-"""Levels of the legged robots' terrain: who does well goes to harder tiles, who does not to easier ones.
+"""Levels of the legged robots' terrain: robots that do well go to harder tiles, others to easier ones.
 
 An episode's worth is a number in [0, 1]: the mean linear tracking, or, by the rule of displacements, the mean over the
 episode's goals of how well the robot's displacement agrees with that of the commanded path (the smaller of the two over
-the larger). The path of a goal (v_x, v_y, w) is an arc where yaw is asked for; in t seconds it leads |v| t away where
-w = 0, and |v| |2 sin(w t / 2) / w| elsewhere. Goals that lead less than ``SHORTEST`` away say nothing. (Legged Gym
-compares with half of the straight way that the last goal would ask for in a whole episode: who walks in circles, as
-told, goes down by it.)
+the larger). The path of a goal (v_x, v_y, w) is an arc if yaw is asked for; in t seconds it leads |v| t away if w = 0,
+and |v| |2 sin(w t / 2) / w| otherwise. Goals that lead less than ``SHORTEST`` away do not count. (Legged Gym compares
+with half of the straight distance that the last goal would ask for in a whole episode: a robot that walks in circles,
+as commanded, goes down.)
 """
 
 import warp as wp
@@ -16,9 +16,9 @@ from .state import Ground, LeggedWorlds, LevelRule, LocomotionParams, Locomotion
 
 wp.set_module_options({"enable_backward": False})
 
-PROMOTED, DEMOTED = 0.8, 0.5  # what an episode must be worth to lift a world's level, and below what it lowers it
-SHORTEST = 0.3  # [m] of displacement that counts
-STRAIGHT = 1.0e-3  # [rad]; an arc of less is a line
+PROMOTED, DEMOTED = 0.8, 0.5  # worth of an episode from which it raises a world's level, and below which it lowers it
+SHORTEST = 0.3  # [m], least displacement that counts
+STRAIGHT = 1.0e-3  # [rad]; a smaller arc is a line
 
 
 @wp.func
@@ -119,7 +119,7 @@ def _update_levels(
 
 
 def update_levels(legged: LeggedWorlds) -> None:
-    """Give every world of ``worlds.mask`` the level that its last episode earned; call it before anything is reset.
+    """Give every world of ``worlds.mask`` the level due to its last episode; call it before anything is reset.
 
     Worlds whose last step did not end the episode, or was not physical, keep their level.
     """

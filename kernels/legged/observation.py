@@ -1,4 +1,4 @@
-"""The legged robots' observation: what the robot feels, then the heights around it and the noise."""
+"""The legged robots' observation: proprioception, then the heights around the robot and the noise."""
 
 import warp as wp
 
@@ -109,15 +109,15 @@ def _finish_obs(
 def finish_obs(legged: LeggedWorlds, mask: wp.array, *, wanted: bool) -> None:
     """Write the heights around every robot and add the noise, in the worlds where ``mask`` is ``wanted``.
 
-    A height is seen as 5 clip(z - standing height - ground, -1 m, 1 m), z being the base's, at points that turn with
-    the robot's yaw alone. Legged Gym subtracts 0.5 m from every robot; with the robot's own height the inputs are
-    around 0 on level ground. Inputs that are all the same and far from 0 act as one bias with a hundred times
-    the learning rate of the other weights.
+    A height is seen as 5 clip(z - standing height - ground, -1 m, 1 m), z being the base's, at points that turn only
+    with the robot's yaw. Legged Gym subtracts 0.5 m from every robot; with the robot's own height the inputs are
+    around 0 on level ground. Inputs that are all equal and far from 0 act as a bias with a hundred times the
+    learning rate of the other weights.
 
     Args:
         legged: The worlds; their observations are updated, their clocks address the draws.
         mask: One of their masks, bool, shape (num_envs,).
-        wanted: Value of ``mask`` where to write.
+        wanted: Value of ``mask`` in the worlds to write.
     """
     n, obs_dim = legged.worlds.obs.shape
     threads = (1, 1) if is_serial(mask.device) else (n, (obs_dim + 3) // 4)

@@ -1,4 +1,4 @@
-"""The legged robots' resets: what happens between two steps."""
+"""The legged robots' resets, between two steps."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 ARM_SPREAD = 0.2  # [rad] about the pose that an arm's joints start in; more, and it may hit the trunk
 SPAWN_SAMPLES = 5  # heights along each side of the square below the base
-BLOCK_PLACE, BLOCK_SPEED, BLOCK_CLOCK, BLOCK_JOINTS = 0, 1, 3, 4  # of the draws of a reset
+BLOCK_PLACE, BLOCK_SPEED, BLOCK_CLOCK, BLOCK_JOINTS = 0, 1, 3, 4  # blocks of the draws of a reset
 
 
 @wp.func

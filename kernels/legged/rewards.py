@@ -6,7 +6,7 @@ and log find it by that name.
 The terms and their weights are those of Legged Gym's A1 (Rudin et al., *Learning to Walk in Minutes Using
 Massively Parallel Deep Reinforcement Learning*, CoRL 2021, table 2, with the A1's configuration), plus
 ``tilt``. Every term is multiplied by its weight and by the step's duration, and their sum is clipped at
-0 from below, so that a longer life is never a worse one, as the thesis assumes (3.1).
+0 from below, so that a longer life is never worse, as the thesis assumes (3.1).
 """
 
 from dataclasses import dataclass, fields
@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 LEG_JOINTS = 12
 TRACKING_VARIANCE = 0.25  # [m^2/s^2] and [rad^2/s^2]
-MOVING = 0.1  # [m/s]; a goal that asks for less calls for no steps
+MOVING = 0.1  # [m/s]; a goal that asks for less needs no steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +39,11 @@ class RewardWeights:
     torque: float = -2e-4
     """Sum of the legs' squared torques [N^2 m^2]."""
     joint_acceleration: float = -2.5e-7
-    """Sum of the legs' squared joint accelerations [rad^2/s^4], as differences of the velocities of two steps."""
+    """Sum of the legs' squared joint accelerations [rad^2/s^4], from the velocities of two steps."""
     action_rate: float = -0.01
-    """Sum of the squared differences of the legs' actions of two steps."""
+    """Sum of the squared changes of the legs' actions between two steps."""
     joint_limit: float = -10.0
-    """Sum of what the legs' joints are beyond 0.9 of their range [rad]."""
+    """Sum of the angles by which the legs' joints are beyond 0.9 of their range [rad]."""
     collision: float = -1.0
     """Number of thighs and calves that push on the terrain with more than 0.1 N."""
     air_time: float = 1.0

@@ -1,8 +1,8 @@
-"""MuJoCo's rows of doubles beside the arrays of the kernels: into a control step of the native engine and out of it.
+"""Copies between the kernels' arrays and MuJoCo's rows of doubles, around a control step of the native engine.
 
-A row is the integration state of a world. Between control steps the arrays hold the truth in single precision, but for
-the warm start, which stays in the row: a control step widens positions, velocities and targets once, and narrows what
-came of them once.
+A row is the integration state of a world. Between control steps the state is that of the arrays, in single precision,
+except for the warm start, which stays in the row: a control step widens positions, velocities and targets once, and
+narrows the results once.
 """
 
 import warp as wp
@@ -19,13 +19,13 @@ class Rows:
 
     state: wp.array2d[wp.float64]  # the rows
     rest: wp.array[wp.float64]  # the row of a world at the model's defaults
-    qpos: wp.array2d[wp.float64]  # a part of the rows, as the two that follow
+    qpos: wp.array2d[wp.float64]  # a part of the rows, like the next two
     qvel: wp.array2d[wp.float64]
     ctrl: wp.array2d[wp.float64]
     torque: wp.array2d[wp.float64]  # of the last substep [N m]
     contact: wp.array3d[wp.vec3d]  # of every substep, in slots: forces in the contact's frame, the normal one first [N]
-    part: wp.array[int]  # whose contact a slot holds
-    warning: wp.array3d[int]  # of every kind: its last detail, and how many there were
+    part: wp.array[int]  # part of the robot whose contact a slot holds
+    warning: wp.array3d[int]  # of every kind: its last detail, and its count
 
 
 ROWS = StructTable(Rows, {
@@ -107,23 +107,23 @@ def widen(sim: Simulation, rows: Rows) -> None:
     """Write positions, velocities and targets into every world's row.
 
     Args:
-        sim: The arrays of the kernels, as ``SIMULATION`` says.
-        rows: MuJoCo's memory, as ``ROWS`` says.
+        sim: The kernels' arrays, as in ``SIMULATION``.
+        rows: MuJoCo's memory, as in ``ROWS``.
     """
     wp.launch(_widen, dim=rows.state.shape[0], inputs=[sim, rows], device=rows.state.device)
 
 
 def narrow(rows: Rows, sim: Simulation) -> None:
-    """Read back what a control step made of every world: state, torques, forces of the parts, and warnings.
+    """Read back the results of a control step in every world: state, torques, forces of the parts, and warnings.
 
     The force of a part is the sum of the normal forces in its slots. A warning of kind i sets bit i of
-    ``sim.overflow``, and is taken off MuJoCo's count. The arguments are those of ``widen``.
+    ``sim.overflow``, and MuJoCo's count of it is reset. The arguments are those of ``widen``.
     """
     wp.launch(_narrow, dim=rows.state.shape[0], inputs=[rows, sim], device=rows.state.device)
 
 
 def reset_rows(mask: wp.array, rows: Rows, sim: Simulation) -> None:
-    """Put every world of ``mask`` to the model's defaults, its row and its arrays; all others stay as they are.
+    """Set every world of ``mask`` to the model's defaults, its row and its arrays; leave the others alone.
 
     Args:
         mask: bool, shape (num_envs,).

@@ -7,11 +7,11 @@ The observation is Legged Gym's (Rudin et al. 2021)::
     velocity 3, angular velocity 3, gravity 3, goal G, joint angles J, joint velocities J, last action J,
     the arm's, heights
 
-with G components of the goal and J joints. Frames are the base's own but for the goal, which is meant in
-the same frame, and the heights.
+with G components of the goal and J joints. Vectors are in the base's own frame, the goal's too, except for
+the heights.
 
-Every array is in a struct, and every struct has a table of shapes. ``LeggedWorlds`` puts the structs together and
-checks them, once: the launchers take it as it is.
+Every array is in a struct, and every struct has a table of shapes. ``LeggedWorlds`` combines the structs and checks
+them once: the launchers do not check again.
 """
 
 from collections.abc import Sequence
@@ -30,15 +30,15 @@ wp.set_module_options({"enable_backward": False})
 VELOCITY_SCALE = 2.0  # the policy sees velocities [m/s] times this
 RATE_SCALE = 0.25  # and angular velocities [rad/s]
 JOINT_SPEED_SCALE = 0.05  # and joint velocities [rad/s]
-HEIGHT_SCALE = 5.0  # and heights [m]: how much the base is above the ground, beyond its height on level ground
+HEIGHT_SCALE = 5.0  # and heights [m]: of the base above the ground, minus its height on level ground
 HEIGHT_BOUND = 1.0  # [m]; clipped to this on either side
 GOAL_START = 9  # where the goal starts in the observation
 
 BASE_PART, FIRST_FOOT, FIRST_LIMB = 0, 1, 5  # parts of a robot, as in ``deimos.kernels.legged.contacts``
 NUM_FEET, NUM_PARTS = 4, 13
 CRASH_FORCE = 1.0  # [N] between base and terrain
-FOOT_FORCE = 1.0  # [N] that makes a contact of a foot
-LIMB_FORCE = 0.1  # [N] that makes a collision of a thigh or calf
+FOOT_FORCE = 1.0  # [N] from which a foot is in contact
+LIMB_FORCE = 0.1  # [N] from which a thigh or calf has collided
 
 BROKEN = ("action", "position", "velocity", "speed", "contacts", "goal")  # causes of an invalid world, by their bit
 
@@ -47,7 +47,7 @@ class LevelRule(IntEnum):
     """How the level of a world changes at the end of an episode."""
 
     FROZEN = 0
-    """World i stands on tile (i // columns) % levels for ever: for evaluation."""
+    """World i always stands on tile (i // columns) % levels: for evaluation."""
     REWARD = 1
     """Up if the mean linear tracking is at least 0.8 without a crash, down if it is below 0.5 or after a crash."""
     DISPLACEMENT = 2
@@ -56,7 +56,7 @@ class LevelRule(IntEnum):
 
 @wp.struct
 class LocomotionParams:
-    """What all worlds share."""
+    """Parameters that all worlds share."""
 
     dt: float  # duration of a step [s]
     stagger: wp.bool  # whether the clocks of a world's first episode start at random steps
@@ -77,7 +77,7 @@ class LocomotionParams:
     spawn_speed: float  # bound of every component of the base's first velocity [m/s] and [rad/s]
     spawn_reach: float  # half side of the square below the base whose highest ground counts [m]
     level_rule: int  # one of LevelRule
-    start_levels: int  # levels that first episodes are drawn from, all where there are fewer
+    start_levels: int  # levels that first episodes are drawn from, all if there are fewer
     cell: float  # of the height grid [m]
     corner: wp.vec2  # its first sample [m]
     low: wp.vec2  # least and largest x and y of the terrain; beyond them an episode is truncated [m]
@@ -89,7 +89,7 @@ class Joints:
     """The robot's joints."""
 
     pose: wp.array[float]  # angles at an action of zero [rad]
-    action_scale: wp.array[float]  # what an action of one adds to the target [rad]
+    action_scale: wp.array[float]  # what an action of 1 adds to the target [rad]
     low: wp.array[float]  # range [rad]
     high: wp.array[float]
     action_low: wp.array[float]  # actions are clipped to what takes the target to an end of the range
@@ -128,9 +128,9 @@ class LocomotionState:
 
 @wp.struct
 class LocomotionStep:
-    """What a step gives back beyond ``Worlds``, whose ``tracking`` begins with linear and yaw."""
+    """What a step returns beyond ``Worlds``, whose ``tracking`` begins with linear and yaw."""
 
-    term: wp.array2d[float]  # what the reward is the sum of: ``COLUMNS``, then the arm's terms
+    term: wp.array2d[float]  # terms of the reward: ``COLUMNS``, then the arm's
     value: wp.array[float]  # the value that was at fault on the last invalid step of this world
 
 
@@ -146,7 +146,7 @@ class Simulation:
     overflow: wp.array[int]  # bits of what the simulator ran out of
 
 
-COLUMNS = (*TERMS, "clipping")  # of ``LocomotionStep.term``; what clipping at 0 added comes last
+COLUMNS = (*TERMS, "clipping")  # of ``LocomotionStep.term``; the last one is what clipping at 0 added
 NUM_COLUMNS = len(COLUMNS)
 
 JOINTS = StructTable(Joints, dict.fromkeys(Joints.vars, ("num_joints",)))
@@ -167,7 +167,7 @@ TABLES = {
 
 
 def build(table: StructTable, device: str, **values: Any) -> Any:
-    """A struct of these values, one for every array of its table: numbers are copied, Warp arrays kept as they are."""
+    """A struct of these values, one for every array of its table: numbers are copied, Warp arrays are kept."""
     struct = table.struct()
     for name in table.names:
         value = values[name]
@@ -198,7 +198,7 @@ def sizes(
     terrain, and ``arm_fields`` the components of the observation between the last action and the heights.
 
     Raises:
-        ValueError: If there are less than the first ones of something.
+        ValueError: If a size is less than these first ones need.
     """
     found = {
         "num_envs": num_envs, "num_origins": 0, "num_joints": num_joints, "action_dim": num_joints,
@@ -219,10 +219,10 @@ class LeggedWorlds:
     """All that the kernels of legged robots read and write, checked once.
 
     Args:
-        sizes: What ``sizes`` gives.
+        sizes: What ``sizes`` returns.
 
     Raises:
-        ValueError: If an array has another shape, dtype or device than its table says.
+        ValueError: If an array does not have the shape, dtype and device that its table requires.
     """
 
     sizes: dict[str, int]
@@ -240,11 +240,11 @@ class LeggedWorlds:
             table.require(name, getattr(self, name), self.worlds.goal, **self.sizes)
 
     def rows(self, rows: slice, fault: wp.array) -> "LeggedWorlds":
-        """Some of these worlds, for a thread of their own; draws stay those of the worlds' global numbers.
+        """Some of these worlds, for a separate thread; draws stay those of the worlds' global numbers.
 
         Args:
             rows: Which, from a start to a stop.
-            fault: What the kernels write in place of ``worlds.fault``, int32, shape (3,); it counts from the first row.
+            fault: Replaces ``worlds.fault``, int32, shape (3,); worlds in it count from the first row.
         """
         parts = {name: table.rows(getattr(self, name), rows) for name, table in TABLES.items()}
         worlds = parts["worlds"]
@@ -253,5 +253,5 @@ class LeggedWorlds:
         return LeggedWorlds(sizes=self.sizes | {"num_envs": worlds.num_envs}, params=self.params, **parts)
 
     def launch(self, kernel: wp.Kernel, dim: Any, *inputs: Any) -> None:
-        """Launch a kernel of these worlds; its first arguments are ``worlds`` and ``params``, then come ``inputs``."""
+        """Launch a kernel on these worlds with the arguments ``worlds``, ``params`` and ``inputs``."""
         wp.launch(kernel, dim, inputs=[self.worlds, self.params, *inputs], device=self.worlds.goal.device)

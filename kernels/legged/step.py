@@ -1,4 +1,4 @@
-"""One control step of the legged robots, around the simulator's: what goes in, and what came out of it."""
+"""One control step of the legged robots, around the simulator's: what goes into it, and what comes out."""
 
 import warp as wp
 
@@ -75,7 +75,7 @@ def _apply_actions(
 def apply_actions(legged: LeggedWorlds) -> None:
     """Turn actions into target angles, push the robots that are due, and clear the simulator's overflow bits.
 
-    Actions are clipped to what the joints can do. A push sets the horizontal velocity of the base, as in Legged Gym.
+    Actions are clipped to the joints' ranges. A push sets the horizontal velocity of the base, as in Legged Gym.
     ``worlds.fault[2]`` is lowered to the lowest world whose action is not finite.
     """
     legged.launch(_apply_actions, legged.worlds.num_threads, legged.joints, legged.sim)
@@ -257,15 +257,14 @@ def _evaluate_step(
 
 
 def evaluate_step(legged: LeggedWorlds) -> None:
-    """Evaluate what the simulator has done: health, crash, reward, clocks, observation without heights and noise.
+    """Evaluate the simulator's step: faults, crash, reward, clocks, observation without heights and noise.
 
-    Nothing is reset and no goal changes. A world whose state is not physical any more (not finite, too
-    fast, or with contacts lost), or whose goal is not finite, is marked ``invalid`` and cut off: it gets a reward
-    of 0, keeps the observation of the step before, and no goal falls due in it. A crash on the same step counts
-    all the same.
+    Nothing is reset and no goal changes. A world whose state is no longer physical (not finite, too fast, or with
+    contacts lost), or whose goal is not finite, is marked ``invalid`` and cut off: it gets a reward of 0, keeps the
+    observation of the previous step, and no goal falls due in it. A crash on the same step still counts.
 
-    What ``evaluate_arms`` wrote before counts as it is, unless the world is invalid: terms from column ``NUM_COLUMNS``
-    on join the reward, and tracking beyond linear and yaw stays.
+    What ``evaluate_arms`` wrote before is kept unless the world is invalid: terms from column ``NUM_COLUMNS`` on are
+    added to the reward, and tracking beyond linear and yaw stays.
     """
     legged.launch(
         _evaluate_step, legged.worlds.num_threads, legged.joints, legged.sim, legged.state, legged.out

@@ -12,7 +12,7 @@ def functions_of(weights: type, namespace: Mapping[str, Any]) -> list[wp.Functio
 
     Args:
         weights: A dataclass with one number for every term.
-        namespace: Where the functions are, by name: ``globals()`` of the module that defines them.
+        namespace: The functions by name: ``globals()`` of the module that defines them.
 
     Raises:
         NameError: If a weight has no function of its name.

@@ -12,7 +12,7 @@ from ..shape import Ramp, TileShape, at
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Rectangles at random places, later ones over earlier ones; the middle is left level.
+    """Rectangles at random positions, later ones over earlier ones; the middle stays level.
 
     Each is at -h, -h/2, h/2 or h. Where two of them meet, the step is up to 2 h.
     """
@@ -22,9 +22,9 @@ class Shape(TileShape):
     count: int = 20
     """Number of rectangles, at least 0."""
     sides: tuple[float, float] = (1.0, 2.0)
-    """Shortest and longest side of a rectangle [m], positive, at most the tile less two ``raster``."""
+    """Shortest and longest side of a rectangle [m], positive, at most the tile minus two ``raster``."""
     raster: float = 0.4
-    """Places, and sides beyond the shortest, are multiples of this [m], positive."""
+    """Positions, and sides minus the shortest, are multiples of this [m], positive."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

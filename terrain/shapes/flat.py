@@ -13,7 +13,7 @@ class Shape(TileShape):
     """Flat ground at every difficulty."""
 
     def step(self, difficulty: float) -> float:
-        """None: no face is vertical."""
+        """No step: no face is vertical."""
         return 0.0
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:

@@ -10,7 +10,7 @@ from ..shape import Ramp, TileShape, at
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """A flat middle that is cut off by a trench."""
+    """A flat middle, cut off by a trench."""
 
     width: Ramp = (0.0, 1.0)
     """Width of the trench at difficulty 0 and at 1 [m], each at least 0; Legged Gym's 1.0 d."""

@@ -1,4 +1,4 @@
-"""Uniformly noised ground."""
+"""Ground with uniform noise."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from ..shape import Ramp, TileShape, at
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """Independent uniform heights on a lattice, with planes in between."""
+    """Independent uniform heights on a lattice, with planes between them."""
 
     platform: float = 1.0
     """Side of the middle without noise [m], positive and smaller than the tile."""
@@ -23,14 +23,14 @@ class Shape(TileShape):
     quantum: float = 0.005
     """Heights are multiples of this [m], positive."""
     spacing: float = 0.2
-    """Distance of two heights [m], positive, at most a quarter of the tile."""
+    """Distance between heights [m], positive, at most a quarter of the tile."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range("spacing", self.spacing, 0.01, self.tile / 4)
 
     def step(self, difficulty: float) -> float:
-        """None: no face is vertical."""
+        """No step: no face is vertical."""
         return 0.0
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:

@@ -25,7 +25,7 @@ class Shape(TileShape):
     quantum: float = 0.005
     """Noise is a multiple of this [m], positive."""
     spacing: float = 0.2
-    """Distance of two noise values [m], bilinear in between; positive, at most a quarter of the tile."""
+    """Distance between noise values [m], bilinear between them; positive, at most a quarter of the tile."""
     room: float = 1.0
     """Side of the square in the middle without noise [m], positive, at most the platform."""
 
@@ -36,7 +36,7 @@ class Shape(TileShape):
             raise ValueError(f"room must be at most platform = {self.platform:g} m, got {self.room:g} m.")
 
     def step(self, difficulty: float) -> float:
-        """None: no face is vertical."""
+        """No step: no face is vertical."""
         return 0.0
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:

@@ -11,10 +11,10 @@ from ..shape import Ramp, TileShape, at
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(TileShape):
-    """A pyramid with a flat top, or the same as a hollow.
+    """A pyramid with a flat top, or a hollow of that shape.
 
     The gradient is Legged Gym's, 0.4 d. There the height is a product of two ramps, so its gradient
-    falls towards the corners; here the four faces are planes.
+    decreases towards the corners; here the four faces are planes.
     """
 
     direction: Literal["up", "down"] = "up"
@@ -23,7 +23,7 @@ class Shape(TileShape):
     """Rise over run at difficulty 0 and at 1, each at least 0."""
 
     def step(self, difficulty: float) -> float:
-        """None: no face is vertical."""
+        """No step: no face is vertical."""
         return 0.0
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:

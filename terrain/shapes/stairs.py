@@ -14,11 +14,11 @@ from ..shape import Ramp, TileShape, at
 class Shape(TileShape):
     """Square steps around a flat middle, with vertical risers.
 
-    The first tread is at height 0 along the edge of the tile. As many steps follow as leave the platform free.
+    The first tread is at height 0 along the edge of the tile. As many steps follow as fit around the platform.
     """
 
     platform: float = 2.6
-    """Least side of the flat middle [m], positive and smaller than the tile. Legged Gym asks for 3 m, and its
+    """Least side of the flat middle [m], positive and smaller than the tile. Legged Gym asks for 3 m, but its
     loop ends at 2.6 m."""
     direction: Literal["up", "down"] = "up"
     """Way out of the middle: up out of a hollow, or down a hill."""

@@ -16,7 +16,7 @@ class Shape(TileShape):
     """Side of a stone at difficulty 0 and at 1 [m], each positive; Legged Gym's 1.5 (1.05 - d). Changed as little
     as needed for whole rows to fill the tile."""
     gap: Ramp = (0.05, 0.1)
-    """Distance of two stones at difficulty 0 and at 1 [m], each positive. Legged Gym's is 0.05 m at 0, else 0.1 m."""
+    """Distance between stones at difficulty 0 and at 1 [m], each positive. Legged Gym's is 0.05 m at 0, then 0.1 m."""
     depth: float = 1.0
     """Depth of the floor [m], positive."""
     rim: float = 0.5
@@ -35,7 +35,7 @@ class Shape(TileShape):
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:
         """See ``TileShape.surface``."""
         gap = at(self.gap, difficulty)
-        bed = self.tile / 2 - self.rim  # half side of what the stones stand in
+        bed = self.tile / 2 - self.rim  # half side of the floor around the stones
         count = max(1, round((2 * bed - gap) / (at(self.side, difficulty) + gap)))
         pitch = (2 * bed - gap) / count
         first = -bed + gap + pitch * np.arange(count)
@@ -43,7 +43,7 @@ class Shape(TileShape):
         for front in first:
             left = (np.arange(-1, count) + generator.uniform(1 / 3, 2 / 3)) * pitch - bed + gap
             ends = np.stack([np.maximum(left, -bed + gap), np.minimum(left + pitch - gap, bed - gap)], axis=1)
-            ends = ends[ends[:, 1] - ends[:, 0] > (pitch - gap) / 4]  # a foot finds no hold on less
+            ends = ends[ends[:, 1] - ends[:, 0] > (pitch - gap) / 4]  # smaller ones are no foothold
             x.append(ends)
             y.append(np.broadcast_to([front, front + pitch - gap], ends.shape))
         middle = np.array([[-self.platform / 2, self.platform / 2]])

@@ -23,7 +23,7 @@ class Shape(TileShape):
     fade: float = 0.5
     """Width of the ring around the middle in which the waves rise to their full height [m], positive."""
     spacing: float = 0.1
-    """Distance of two points of the mesh [m], at least 0.01, at most an eighth of a wave."""
+    """Distance between points of the mesh [m], at least 0.01, at most an eighth of a wave."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -32,7 +32,7 @@ class Shape(TileShape):
         self.check_room("platform + 2 fade", self.platform + 2 * self.fade)
 
     def step(self, difficulty: float) -> float:
-        """None: no face is vertical."""
+        """No step: no face is vertical."""
         return 0.0
 
     def surface(self, difficulty: float, generator: np.random.Generator) -> Mesh:

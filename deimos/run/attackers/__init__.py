@@ -1,1 +1,1 @@
-"""Who attacks a policy in its evaluation: one file, one attacker; see ``deimos.run.attack``."""
+"""Attackers of a policy in its evaluation: one file, one attacker; see ``deimos.run.attack``."""

@@ -12,10 +12,10 @@ from deimos.run.oracle import Clones, Oracle
 
 @dataclass(frozen=True, kw_only=True)
 class Config(argmax_long.Config):
-    """N T steps of a clone for every goal."""
+    """A goal costs N T steps of a clone."""
 
     few_worlds = True
-    """Clones are dear: ``eval.oracle_worlds`` of the worlds meet it."""
+    """Clones are expensive: it attacks only ``eval.oracle_worlds`` of the worlds."""
 
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``."""

@@ -1,7 +1,7 @@
-"""It asks for what a fear network fears most that was trained on other policies: it needs no crash of this one.
+"""It asks for what a fear network that was trained on other policies fears most: it needs no crash of this one.
 
-The file of the network is made before any of the policies that it attacks (``deimos pool``), so that all of them meet
-the very same attacker (after Uesato et al. 2019, who train an adversary on weaker agents).
+The file of the network is made first (``deimos pool``), so that all policies that it attacks meet the same attacker
+(after Uesato et al. 2019, who train an adversary on weaker agents).
 """
 
 from collections.abc import Sequence
@@ -29,13 +29,13 @@ class Config(AttackerConfig):
         """See ``AttackerConfig.prepare``.
 
         Raises:
-            RunError: If the file is broken, or that of another environment.
+            RunError: If the file is broken, or belongs to another environment.
         """
         assert target.pool is not None
         found = load_tensors(target.pool, "pool", SCHEMA)
         env = target.build(1, target.seed)
         if found["layout"] != str(env.layout):
-            raise RunError(f"{target.pool} is of other observations: {found['layout']}, not {env.layout}.")
+            raise RunError(f"{target.pool} is for other observations: {found['layout']}, not {env.layout}.")
         try:
             fear = Fear(from_dict(FearConfig, found["fear"]), env.state_dim, env.goal_dim, env.device, target.seed)
             fear.network.load_state_dict(found["network"])
@@ -49,14 +49,14 @@ class Config(AttackerConfig):
 def make_pool(targets: Sequence[Target], path: Path, *, may_be_uninformed: bool = False) -> dict[str, Any]:
     """Train a fear network on the interactions of many policies, each with the same number of steps.
 
-    Half of the goals are the network's own, one network's for all policies: so it learns what crashes most of them,
-    and where it fears wrongly.
+    Half of the goals are the network's own, one network for all policies: so it learns what crashes most of them, and
+    where its fear is wrong.
 
     Args:
         targets: The policies, at least 1, of one environment.
         path: The file to write.
-        may_be_uninformed: Whether a file is written too where crashes or survivals are missing. Its network has learnt
-            nothing then, and the attacker's goals are uniform.
+        may_be_uninformed: Whether to write a file even if crashes or survivals are missing. Its network has then learnt
+            nothing, and the attacker's goals are uniform.
 
     Returns:
         The facts that rows of the attacker have: see ``learn_fear``.
@@ -66,10 +66,12 @@ def make_pool(targets: Sequence[Target], path: Path, *, may_be_uninformed: bool 
     """
     envs = [target.build(1, target.seed) for target in targets]
     if len({str(env.layout) for env in envs}) > 1:
-        raise RunError("The policies observe different things, so they have no fear in common.")
+        raise RunError("The policies have different observations, so they cannot share a fear network.")
+    if len(periods := sorted({env.goal_period for env in envs})) > 1:
+        raise RunError(f"The policies must have goals of the same period T, got {', '.join(map(str, periods))}.")
     fear, facts = fear_of(targets, targets[0].steps, own_goals=True)
     if facts["uninformed"] and not may_be_uninformed:
-        raise RunError("These policies never crashed, or always, so there is nothing to learn; pool others.")
+        raise RunError("These policies never or always crashed, so there is nothing to learn; pool others.")
     save_fear(path, fear, envs[0], facts)
     return facts
 
@@ -81,7 +83,7 @@ def save_fear(path: Path, fear: Fear, env: Env, facts: dict[str, Any]) -> None:
         path: The file.
         fear: The network.
         env: Worlds that it is for.
-        facts: What rows of the attacker say of it.
+        facts: Facts about it for rows of the attacker.
 
     Raises:
         RunError: If the file cannot be written.

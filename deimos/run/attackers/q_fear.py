@@ -16,7 +16,7 @@ from deimos.run.loop import GoalLoop, spaces
 
 @dataclass(frozen=True, kw_only=True)
 class Config(argmax_long.Config):
-    """It learns every T steps, from those of ``argmax-long``; every other goal in them is its own."""
+    """It learns every T steps, over as many steps as ``argmax-long``; every other goal in them is its own."""
 
     beta: float = 0.9
     """Weight of what follows, in [0, 1)."""
@@ -30,7 +30,7 @@ class Config(argmax_long.Config):
         env = target.build(target.worlds, target.seed + 1)
         config = q_fear.Config(rule="argmax", probe=0.5, beta=self.beta, fear=target.fear)
         selector = config.build(spaces(env), target.seed)
-        # The last T steps: of interactions before them nobody knows any more what could have followed.
+        # The last T steps: for earlier interactions, what could have followed is no longer known.
         loop = GoalLoop(env, selector, window=env.goal_period, guard=target.guard)
         interactions = crashes = 0
         steps, quality = self.longer * target.steps, torch.nan

@@ -12,7 +12,7 @@ from deimos.sim.env import Env
 
 @dataclass(frozen=True, kw_only=True)
 class Config(AttackerConfig):
-    """The environment's own worst goals; uniform ones where it has no idea of them."""
+    """The environment's own worst goals; uniform ones where it defines none."""
 
     def prepare(self, target: Target) -> Attack:
         """See ``AttackerConfig.prepare``."""

@@ -30,7 +30,7 @@ class Config(argmax_long.Config):
     ascents: int = 10
     """Steps along the gradient of fear, from the most feared goal, at least 0."""
     stride: float = 0.05
-    """Length of such a step, as a share of the half side of the box of goals, positive."""
+    """Length of such a step, as a share of half a side of the box of goals, in (0, 1]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -48,7 +48,7 @@ class Config(argmax_long.Config):
 
 
 class Search(GoalSelector):
-    """See ``Config``. Where valid goals are no box it takes the most feared of all its candidates.
+    """See ``Config``. Where valid goals do not form a box, it takes the most feared of all its candidates.
 
     Args:
         config: How it searches.
@@ -61,7 +61,7 @@ class Search(GoalSelector):
         self.num_candidates = config.rounds * config.samples
 
     def propose(self, rows: Tensor, state: Tensor, goal: Tensor, candidates: Tensor, draws: Tensor) -> Proposal:
-        """See ``GoalSelector.propose``; the candidates are the chance that the search needs."""
+        """See ``GoalSelector.propose``; the candidates supply the randomness that the search needs."""
         if not self._fear.fitted:
             return uniform_proposal(candidates, draws[:, 0])
         bounds = self._env.goal_bounds(rows)
@@ -91,7 +91,7 @@ class Search(GoalSelector):
         return picks.take(torch.cat(tried, dim=1), torch.cat(scores, dim=1).argmax(1))
 
     def _ascend(self, state: Tensor, goal: Tensor, start: Tensor, low: Tensor, high: Tensor) -> Proposal:
-        """The most feared goal on the way up from some goals, shape (B, goal_dim)."""
+        """The most feared goals on the ascents from given ones, shape (B, goal_dim)."""
         half = (high - low) / 2
         way = [start]
         for _ in range(self._config.ascents):

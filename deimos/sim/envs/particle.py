@@ -16,7 +16,7 @@ from deimos.nn.host import own_settings
 from deimos.sim.env import EnvConfig, ObsField, Sketch
 from deimos.sim.warp_env import WarpEnv
 
-LARGEST = 1e6  # [u] or [u/step]; beyond, float32 positions no longer tell one step from the next
+LARGEST = 1e6  # [u] or [u/step]; beyond, float32 positions no longer resolve a step
 HALF_SIDE = 1000.0  # [u]; thesis, 4.1.1: the cube is 2000 length units a side
 
 
@@ -32,9 +32,9 @@ class Config(EnvConfig):
     """Bound of every component of the force [u/step^2], positive; inf for none."""
     goal_range: float | None = None
     """Half side of the box that goals are drawn from, positive. By default max_speed [u/step] for
-    directional goals and 1250 u for positions, so that about half of them lie outside the cube."""
+    directional goals and 1250 u for positions, so that about half of them are outside the cube."""
     reward: RewardName = "linear"
-    """Reward of the distance d to the goal: 1 - d / (1.01 d_max), 1 / (1 + d / reward_length) or
+    """Reward for the distance d to the goal: 1 - d / (1.01 d_max), 1 / (1 + d / reward_length) or
     exp(-d / reward_length)."""
     reward_length: float | None = None
     """Distance at which the reciprocal reward is 1/2 and the exponential 1/e, positive. By default
@@ -96,7 +96,7 @@ class Config(EnvConfig):
         return replace(self, stagger_goals=False)
 
     def params(self) -> ParticleParams:
-        """What the kernels need to know."""
+        """Parameters for the kernels."""
         params = ParticleParams()
         params.velocity_goals = self.has_velocity_goals
         params.half_side = HALF_SIDE
@@ -155,7 +155,7 @@ class Particle(WarpEnv):
         return Sketch(HALF_SIDE, position, goal)
 
     def achieved(self, obs: Tensor) -> Tensor | None:
-        """See ``Env.achieved``: velocity or position. The way to a position from elsewhere is no goal from here."""
+        """See ``Env.achieved``: velocity or position. The way to a position from elsewhere is not a goal from here."""
         if self.config.variant == "relative":
             return None
         return obs[:, 0:3] if self.config.has_velocity_goals else obs[:, 3:6]
@@ -205,12 +205,12 @@ class Particle(WarpEnv):
         """A controller that follows goals and brakes in time for the wall.
 
         Per axis, a particle with speed v that brakes by a = max_force / 2 per step needs
-        v^2 / (2 a) + v / 2 to stand still, this step included; so with a distance d left it may
+        v^2 / (2 a) + v / 2 to stop, this step included; so with a distance d left it may
         have v = -a / 2 + sqrt(a^2 / 4 + 2 a d). Distances to the wall bound every velocity;
         distances to a goal position give the velocity that arrives there soonest.
 
         Args:
-            brake: Whether it minds the wall; without, it is the blind follower.
+            brake: Whether it brakes for the wall; without, it follows goals blindly.
         """
         params, directional = self.config.params(), self.config.has_velocity_goals
         relative = self.config.variant == "relative"

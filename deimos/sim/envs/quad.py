@@ -19,8 +19,8 @@ class Config(LocomotionConfig):
         return Locomotion(self, self.make_robot(), (velocity_goal(self.rewards),), num_envs, device, seed, env_offset)
 
 
-# From nothing to walking on flat ground in a few minutes of one core: small networks and rollouts, a short horizon,
-# goals of two seconds, and penalties so light that a robot which has yet to learn to step is not told to stand.
+# From scratch to walking on flat ground in a few minutes on one core: small networks and rollouts, a short horizon,
+# goals of two seconds, and penalties so light that a robot that cannot step yet does not learn to stand still.
 _WALK: dict[str, Any] = {
     "env": {
         "goal_period": 100,
@@ -41,20 +41,19 @@ _WALK: dict[str, Any] = {
 }  # fmt: skip
 
 PRESETS = {
-    # Sizes that two CPU cores can train within the hour.
+    # Sizes that two CPU cores can train within an hour.
     "quad": {
         "num_envs": 1024,
         "env_steps": 6400,
-        # Rewards hold the time step already. A larger deviation at the start clips nearly all of them to 0.
+        # Rewards already include the time step. With a larger initial deviation, nearly all of them are clipped to 0.
         "ppo": {"hidden": (256, 128, 64), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0},
         "eval": {"worlds": 256, "steps": 1000},
     },
     "quad-walk": _WALK,
-    # The same without what a robot cannot measure: the actor does not see how fast the base moves, the critic does. It
-    # takes longer.
+    # The same without what a robot cannot measure: only the critic sees how fast the base moves. It takes longer.
     "quad-proprioceptive": _WALK | {"env": _WALK["env"] | {"privileged": ("linear_velocity",)}, "env_steps": 12_000},
-    # From that policy over slopes, stairs and rectangles: goals of five seconds and episodes of two of them, so that
-    # what a robot achieves says soon which tile is right for it.
+    # From the policy of quad-walk over slopes, stairs and rectangles: goals of five seconds and episodes of two, so
+    # that what a robot achieves soon shows which tile suits it.
     "quad-rough": _WALK | {
         "env": _WALK["env"] | {"terrain": "rough", "goal_period": 250, "episode_steps": 500},
         "env_steps": 40_000,

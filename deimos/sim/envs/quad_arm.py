@@ -1,4 +1,4 @@
-"""Quad+arm: a Go1 with a ReactorX-150 on its back, which walks and reaches at once (thesis, 4.1.2)."""
+"""Quad+arm: a Go1 with a ReactorX-150 on its back, which walks and reaches at the same time (thesis, 4.1.2)."""
 
 from dataclasses import dataclass, field, replace
 
@@ -24,7 +24,7 @@ class Config(LocomotionConfig):
     arm_rewards: ArmWeights = field(default_factory=ArmWeights)
     """Weights of the reward's terms for the arm."""
     hold_trunk: bool = False
-    """Whether the trunk is held fixed in the air, its legs free: a test of the arm alone, no task."""
+    """Whether the trunk is held fixed in the air, its legs free: a test of the arm alone, not a task."""
 
     @property
     def largest_reward(self) -> float:
@@ -46,7 +46,7 @@ class Config(LocomotionConfig):
         return Locomotion(config, robot, parts, num_envs, device, seed, env_offset)
 
 
-# KL divergences add up over the joints. Under half of this bound, which suits a Quad's twelve, the arm hardly learnt.
+# KL divergences add up over the joints. With half of this bound, which suits a Quad's twelve, the arm hardly learnt.
 _PPO = {"hidden": (256, 128, 64), "activation": "elu", "init_std": 0.6, "reward_scale": 1.0, "desired_kl": 0.02}
 
 PRESETS = {
@@ -59,12 +59,12 @@ PRESETS = {
         "env_steps": 4800,
         "ppo": _PPO | {"discount": 0.95, "gae_lambda": 0.9},
     },
-    # Walking first, from nothing, as a Quad learns it.
+    # Walking first, from scratch, as a Quad learns it.
     "quad-arm-walk": quad.PRESETS["quad-walk"] | {
         "env_steps": 7872,
         "ppo": _PPO | {"discount": 0.97, "entropy_coef": 0.002},
     },
-    # From that policy, whose arm has hardly learnt: reaching weighs more, and the divergence may be larger.
+    # From the policy of quad-arm-walk, whose arm has hardly learnt: a larger weight of reaching, a larger divergence.
     "quad-arm-reach": quad.PRESETS["quad-walk"] | {
         "env": quad.PRESETS["quad-walk"]["env"] | {"arm_rewards": {"reach": 1.0, "precision": 2.0}},
         "env_steps": 12_000,

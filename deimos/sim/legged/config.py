@@ -1,4 +1,4 @@
-"""How the task of a legged robot is set up; ``deimos.sim.legged.task`` is the task."""
+"""The configuration of a legged robot's task; ``deimos.sim.legged.task`` is the task."""
 
 import math
 from dataclasses import asdict, dataclass, field, replace
@@ -28,7 +28,7 @@ class LocomotionConfig(EnvConfig):
     terrain: str = "flat"
     """What the robots walk on: flat, rough (slopes, stairs, rectangles), or the path of a terrain file (.npz)."""
     engine: engines.Name = field(default="auto", metadata={"before": "warp"})
-    """What simulates: mujoco-warp, or native, MuJoCo's own C code on all cores of a CPU; auto takes mujoco-warp on CUDA
+    """The simulator: warp (mujoco-warp), or native, MuJoCo's own C code on all cores of a CPU; auto takes warp on CUDA
     and native on a CPU."""
     goal_period: int = 500
     """T: steps that a goal is active, at least 1 and at most an episode."""
@@ -38,11 +38,11 @@ class LocomotionConfig(EnvConfig):
     """What moves a robot to harder and easier tiles: its linear tracking (thesis, 4.1.2), how far it got compared with
     its commanded path (an arc if its goals ask for yaw; less than 0.3 m does not count), or nothing."""
     start_levels: int = 6
-    """Levels that first episodes are drawn from, the easiest ones, at least 1; all where the terrain has fewer."""
+    """Number of the easiest levels, which first episodes are drawn from, at least 1; all if the terrain has fewer."""
     rewards: RewardWeights = field(default_factory=RewardWeights)
     """Weights of the reward's terms."""
     air_time_target: float = 0.3
-    """Air time above which a step is rewarded [s], at least 0. Legged Gym has 0.5 s, for larger robots."""
+    """Air time above which a step is rewarded [s], at least 0. Legged Gym uses 0.5 s, for larger robots."""
     friction: tuple[float, float] = (0.5, 1.25)
     """Range of the feet's friction, drawn once per world; at least 0.05, below which contacts are ill-conditioned."""
     payload: float = 1.0
@@ -55,8 +55,8 @@ class LocomotionConfig(EnvConfig):
     noise: bool = True
     """Whether observations are noisy."""
     privileged: tuple[str, ...] = ()
-    """Entries of the observation that only the critic sees, such as linear_velocity and heights: what the robot itself
-    cannot measure."""
+    """Entries of the observation that only the critic sees because the robot cannot measure them, such as
+    linear_velocity and heights."""
     stagger: bool = True
     """Whether the clocks of first episodes start at random steps, so that resets and goals spread out."""
     stiffness: float | None = None
@@ -64,7 +64,7 @@ class LocomotionConfig(EnvConfig):
     damping: float | None = None
     """Velocity gain of the legs' joints [N m s/rad], positive; by default the robot's own."""
     action_scale: float | None = None
-    """What an action of one adds to a target angle of the legs [rad], positive; by default the robot's own."""
+    """What an action of 1 adds to a target angle of the legs [rad], positive; by default the robot's own."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     """The simulator's settings."""
 
@@ -77,9 +77,9 @@ class LocomotionConfig(EnvConfig):
                 f"goal_period must be at most an episode of {self.episode_steps} steps, got {self.goal_period}."
             )
         if Path(self.robot).suffix.lower() == ".xml":
-            advice = f"make a robot file of it by: deimos robot new {self.robot}"
+            advice = f"make a robot file of it with: deimos robot new {self.robot}"
             raise ValueError(f"robot must be a name or the path of a robot file, got '{self.robot}'; {advice}")
-        if self.robot and not self._has_robot_file:  # a checkpoint leaves out where files lie
+        if self.robot and not self._has_robot_file:  # a checkpoint omits the paths of files
             check_choice("robot", self.robot, [*plugins.names(robots), "or the path of a robot file (.toml)"])
         check_choice("engine", self.engine, ["auto", *engines.MODULES])
         check_choice("levels", self.levels, [rule.name.lower() for rule in LevelRule])
@@ -113,7 +113,7 @@ class LocomotionConfig(EnvConfig):
         return replace(self, engine=engines.resolve(self.engine, device))
 
     def without_randomness(self) -> "LocomotionConfig":
-        """See ``EnvConfig``. World i stands on level (i // columns) % levels of column i % columns, for good."""
+        """See ``EnvConfig``. World i always stands on level (i // columns) % levels of column i % columns."""
         return replace(
             self, levels="frozen", friction=(1.0, 1.0), payload=0.0, push_interval=0.0, noise=False, stagger=False,
             episode_steps=0,
@@ -123,7 +123,7 @@ class LocomotionConfig(EnvConfig):
         """The robot, in free space.
 
         Raises:
-            ValueError: If its file is not one, or its MJCF is not that of a robot.
+            ValueError: If its file is not a robot file, or its MJCF does not describe a robot.
         """
         if not self._has_robot_file:
             return plugins.load(robots, self.robot).build(**self._gains())
@@ -135,7 +135,7 @@ class LocomotionConfig(EnvConfig):
         return Path(self.robot).suffix.lower() in robot_file.ENDINGS
 
     def _gains(self) -> dict[str, float]:
-        """The gains that are not the robot's own."""
+        """The gains that replace the robot's own."""
         gains = {name: getattr(self, name) for name in ("stiffness", "damping", "action_scale")}
         return {name: gain for name, gain in gains.items() if gain is not None}
 
@@ -143,7 +143,7 @@ class LocomotionConfig(EnvConfig):
         """The terrain; ``None`` for flat ground.
 
         Raises:
-            ValueError: If there is none of this name, or the file is not one.
+            ValueError: If there is no terrain of this name, or the file is not a terrain file.
         """
         if self.terrain == "flat":
             return None
@@ -153,9 +153,7 @@ class LocomotionConfig(EnvConfig):
         makers = dict.fromkeys(importing.OPTIONS.keys() - {".npz"}, "import") | {".toml": "grid --file"}
         if maker := makers.get(path.suffix.lower()):
             advice = f"deimos terrain {maker} {path} --out {path.with_suffix('.npz')}"
-            raise ValueError(
-                f"terrain must be flat, rough or a terrain file, got '{path}'; make one of it by: {advice}"
-            )
+            raise ValueError(f"terrain must be flat, rough or a terrain file, got '{path}'; convert it with: {advice}")
         if not path.is_file():
             raise ValueError(f"terrain must be flat, rough or the path of a terrain file, got '{self.terrain}'.")
         return terrain.load(path)
@@ -163,7 +161,7 @@ class LocomotionConfig(EnvConfig):
 
 @lru_cache(maxsize=1)
 def _rough() -> Terrain:
-    """The terrain ``rough``: the same in every environment, and two seconds of work. Its arrays are read-only."""
+    """The terrain ``rough``: the same in every environment; it takes two seconds. Its arrays are read-only."""
     ground = terrain.rough()
     for array in (ground.heights, ground.origins):
         array.flags.writeable = False

@@ -1,4 +1,4 @@
-"""What a legged robot's goal is made of: parts, each with its components and all that comes with them."""
+"""The parts of a legged robot's goal, each with its components and all that belongs to them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, field
@@ -19,42 +19,42 @@ from deimos.sim.legged.robots import Robot
 
 @dataclass(frozen=True, kw_only=True)
 class Launches:
-    """What a part does in the worlds that it was bound to."""
+    """Work of a part in the worlds that it was bound to."""
 
     evaluate: Callable[[LeggedWorlds, slice], None] = lambda worlds, rows: None
     """Evaluates a step in some of the worlds, with their rows: writes the part's terms, tracking and observation. The
     step as a whole is evaluated afterwards."""
     reset: Callable[[], None] = lambda: None
-    """Finishes the reset of the worlds of the mask: their first goals and observations."""
+    """Finishes the reset of the worlds in the mask: their first goals and observations."""
     validate: Callable[[wp.array, wp.array, wp.array], wp.Launch] | None = None
-    """Records what makes goals of uniform candidates valid: of the rows, half side of the box, and the candidates."""
+    """Records a launch that makes uniform candidates valid; takes the rows, the box's half side and the candidates."""
     errors: Mapping[str, Tensor] = field(default_factory=dict)
     """See ``Env.errors``."""
     points: Callable[[], np.ndarray] | None = None
-    """Gives the places of all goals in the world [m], shape (num_envs, 3)."""
+    """Gives the positions of all goals in the world [m], shape (num_envs, 3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GoalPart:
-    """Components of a goal and what comes with them. The velocity goal, whose kernels are the legs', comes first."""
+    """Components of a goal and what belongs to them. The velocity goal, whose kernels are the legs', comes first."""
 
     range: tuple[float, ...]
     """Half side of the box of goals along every component, in its unit."""
     units: tuple[str, ...]
     """Units of the components."""
     scale: tuple[float, ...]
-    """What the policy sees components multiplied by."""
+    """Factors by which the policy sees the components."""
     groups: tuple[int, ...]
-    """How many components, one after another, are met or missed together."""
+    """Numbers of consecutive components that are met or missed together."""
     group_names: tuple[str, ...]
-    """What each of these groups is called."""
+    """Names of these groups."""
     weights: tuple[float, ...]
-    """How much each of them counts in the score."""
+    """Weights of the groups in the score."""
     at_rest: Callable[[Tensor, Tensor], Tensor]
-    """Tracking of each group by robots that stand still, in [0, 1], shape (num_envs, n, groups): of goals in physical
-    units, shape (num_envs, n, components), and what the observation has in ``fields``, shape (num_envs, size)."""
+    """Tracking of each group by robots that stand still, in [0, 1], shape (num_envs, n, groups); takes goals in
+    physical units, shape (num_envs, n, components), and the observation's ``fields``, shape (num_envs, size)."""
     fields: tuple[ObsField, ...] = ()
-    """What the observation has of them, between the last action and the heights."""
+    """The part's fields of the observation, between the last action and the heights."""
     noise: Mapping[str, float] = field(default_factory=dict)
     """Half width of the noise of those fields, in their units."""
     columns: tuple[str, ...] = ()
@@ -82,7 +82,7 @@ def velocity_goal(weights: RewardWeights, speed: float = 1.0) -> GoalPart:
 
 
 def end_effector_goal(robot: Robot, weights: ArmWeights) -> GoalPart:
-    """A place of the end effector, in [-1, 1]^3; see ``deimos.kernels.legged.arm_goals``.
+    """A position of the end effector, in [-1, 1]^3; see ``deimos.kernels.legged.arm_goals``.
 
     Raises:
         ValueError: If the robot has no arm.
@@ -109,14 +109,14 @@ def end_effector_goal(robot: Robot, weights: ArmWeights) -> GoalPart:
         weights=(weights.reach,),
         at_rest=lambda goal, seen: torch.exp(-0.5 * (seen.unsqueeze(1) - goal).abs().sum(-1, keepdim=True)),
         fields=(ObsField("end_effector", 3, "1", 1.0),),
-        noise={"end_effector": 0.01},  # what that of the joints' angles makes of it
+        noise={"end_effector": 0.01},  # what the noise of the joints' angles amounts to
         columns=ARM_TERMS,
         bind=bind,
     )
 
 
 def _build_arm(robot: Robot, weights: ArmWeights, worlds: LeggedWorlds) -> Arm:
-    """The arm's numbers, in the memory of the kernels."""
+    """The arm's numbers, in the kernels' memory."""
     assert robot.arm is not None
     numbers, n = robot.arm, worlds.worlds.num_envs
     joints = len(numbers.axes)

@@ -20,7 +20,7 @@ def add_height_field(spec: "MjSpec", terrain: Terrain) -> "MjsGeom":
     Between them it is made of two triangles per cell.
 
     Returns:
-        The geom, for its friction, its contact masks and its looks.
+        The geom, whose friction, contact masks and appearance the caller sets.
     """
     import mujoco
 

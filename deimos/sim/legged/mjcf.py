@@ -1,7 +1,7 @@
-"""Reads a robot from an MJCF, whatever its names and its order, and copies it as the simulation needs it.
+"""Reads a robot from an MJCF, with any names and order, and copies it in the form that the simulation needs.
 
-MuJoCo compiles the file, with its classes, includes, meshes and keyframes; what the simulation needs is then built anew
-from the compiled numbers: the base, its legs in the order of ``Robot``, and spheres and capsules for whatever collides.
+MuJoCo compiles the file, with its classes, includes, meshes and keyframes; what the simulation needs is then rebuilt
+from the compiled numbers: the base, its legs in the order of ``Robot``, and spheres and capsules for what collides.
 """
 
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ from deimos.sim.legged.robots._primitives import add_collision
 if TYPE_CHECKING:
     import mujoco
 
-STANDING = ("home", "stand", "standing")  # what keyframes of a standing robot are called
+STANDING = ("home", "stand", "standing")  # names of keyframes of a standing robot
 DARK = (0.25, 0.27, 0.3, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Servo:
-    """What an MJCF says about the actuators of a joint; 0 for what it does not say."""
+    """The actuators of a joint in an MJCF; 0 for what it does not specify."""
 
     stiffness: float = 0.0
     """[N m/rad]."""
@@ -34,14 +34,14 @@ class Servo:
     max_torque: float = 0.0
     """[N m]."""
     armature: float = field(default=0.0, compare=False)
-    """What it adds to the joint's own [kg m^2]."""
+    """What they add to the joint's own [kg m^2]."""
     drag: tuple[float, ...] = field(default=(0.0, 0.0, 0.0), compare=False)
-    """What it adds to the joint's own damping, which no largest torque cuts: MuJoCo's polynomial."""
+    """What they add to the joint's own damping, which no torque limit clips: MuJoCo's polynomial."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """An MJCF as it was read: everything has a name, held joints are gone, bodies that do not move are one."""
+    """An MJCF as it was read: everything has a name, held joints are gone, bodies that do not move are merged."""
 
     model: "mujoco.MjModel"
     base: int
@@ -53,7 +53,7 @@ class Source:
     has_keyframe: bool
     """Whether the pose is that of a keyframe."""
     notes: tuple[str, ...]
-    """What is odd about the file, each with a way out, and what of it is left out."""
+    """Oddities of the file, each with a way out, and what is left out."""
 
     def name(self, joint: int) -> str:
         """Name of a joint."""
@@ -72,7 +72,7 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
         held: Joints to hold at zero, as if the file did not have them.
 
     Raises:
-        ValueError: If MuJoCo does not read it, or it is no robot with a floating base.
+        ValueError: If MuJoCo cannot read it, or it is not a robot with a floating base.
     """
     import mujoco
 
@@ -80,7 +80,7 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
         raise ValueError(f"mjcf must be an MJCF file, but there is no {path}.")
     if path.suffix.lower() == ".urdf":
         raise ValueError(
-            f"mjcf must be an MJCF file, got {path}, which Python converts: import mujoco; "
+            f"mjcf must be an MJCF file, got {path}; convert it in Python: import mujoco; "
             f"s = mujoco.MjSpec.from_file('{path}'); s.compiler.fusestatic = False; "
             "s.worldbody.first_body().add_freejoint(); s.compile(); print(s.to_xml())"
         )
@@ -89,7 +89,7 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
         _name_all(spec)
         whole = spec.compile()
     except ValueError as error:
-        raise ValueError(f"mjcf must be a file that MuJoCo loads, but of {path} it says: {one_line(error)}") from error
+        raise ValueError(f"mjcf must be a file that MuJoCo loads, but {path} fails: {one_line(error)}") from error
     base = _find_base(path, whole)
     _refuse_couplings(path, whole)
     notes = [*_weighing_visuals(spec, whole), *_left_out(whole, held)]
@@ -97,7 +97,7 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
         if spec.joint(name) is None:
             raise ValueError(f"held must name joints of {path}, which has no '{name}'.")
         if spec.joint(name).type == mujoco.mjtJoint.mjJNT_FREE:
-            raise ValueError(f"held must name joints of a head, tail or arm, but '{name}' is what the base floats by.")
+            raise ValueError(f"held must name joints of a head, tail or arm, but '{name}' is the base's free joint.")
         spec.delete(spec.joint(name))
     for things in (spec.keys, spec.sensors, spec.actuators, spec.excludes, spec.pairs):
         for thing in list(things):
@@ -116,10 +116,10 @@ def read(path: Path, held: Sequence[str] = ()) -> Source:
 def find_legs(source: Source) -> list[list[int]]:
     """The joints of four legs from hip to foot, front left, front right, rear left, rear right.
 
-    Which leg is which is seen from where the hips are: x is to the front, y to the left.
+    The positions of the hips tell which leg is which: x points to the front, y to the left.
 
     Raises:
-        ValueError: If these are not four legs of three hinges each, and nothing else that moves.
+        ValueError: If the robot is not four legs of three hinges each, with nothing else that moves.
     """
     model, base = source.model, source.base
     chains = [_chain(source, leaf) for leaf in _leaves(model, base)]
@@ -138,16 +138,16 @@ def find_legs(source: Source) -> list[list[int]]:
     if not (min(x[:2]) > max(x[2:]) and y[0] > y[1] and y[2] > y[3]):
         raise ValueError(
             f"the base's frame must have x to the front and y to the left, but the hips of body "
-            f"'{model.body(base).name}' do not lie so: {np.round(places[:, :2], 3).tolist()} m; turn the bodies in it."
+            f"'{model.body(base).name}' are not so: {np.round(places[:, :2], 3).tolist()} m; turn the bodies in it."
         )
     return [chains[leg] for leg in order]
 
 
 def copy(source: Source, legs: Sequence[Sequence[int]]) -> "tuple[mujoco.MjSpec, dict[str, list[tuple[str, str]]]]":
-    """The robot built anew, its legs in this order.
+    """Rebuild the robot, its legs in this order.
 
     Returns:
-        The model, without actuators; and for every body its geoms that collide, each as its name in the file and the
+        The model, without actuators; and for every body its geoms that collide, as pairs of a name in the file and the
         name of a piece of it.
     """
     import mujoco
@@ -170,7 +170,7 @@ def copy(source: Source, legs: Sequence[Sequence[int]]) -> "tuple[mujoco.MjSpec,
 
 
 def _name_all(spec: "mujoco.MjSpec") -> None:
-    """Name what has no name after the body that it is on, and a body after its first joint."""
+    """Name joints and geoms without a name after their body, and a body after its first joint."""
     names = {body.name for body in spec.bodies}
     for number, body in enumerate(spec.bodies):
         joint = body.joints[0].name if body.joints else ""
@@ -182,17 +182,17 @@ def _name_all(spec: "mujoco.MjSpec") -> None:
 
 
 def _refuse_couplings(path: Path, model: "mujoco.MjModel") -> None:
-    """Raise ``ValueError`` if joints are coupled by what a copy would lose."""
+    """Raise ``ValueError`` if joints are coupled by something that a copy would lose."""
     for count, what in ((model.neq, "an equality constraint"), (model.ntendon, "a tendon"), (model.nflex, "a flex")):
         if count:
             raise ValueError(
-                f"mjcf must be a tree of bodies with joints of their own, but {path} has {what}; take it out, and hold "
+                f"mjcf must be a tree of bodies with independent joints, but {path} has {what}; remove it, and hold "
                 "the joints that it moves."
             )
 
 
 def _weighing_visuals(spec: "mujoco.MjSpec", model: "mujoco.MjModel") -> list[str]:
-    """What to say of bodies whose looks are a part of their weight: a frequent slip."""
+    """Notes on bodies whose visual geoms add to their weight: a frequent slip."""
     explicit = {body.name for body in spec.bodies if body.explicitinertial}
     weighing = [
         geom.name for geom in spec.geoms
@@ -201,13 +201,13 @@ def _weighing_visuals(spec: "mujoco.MjSpec", model: "mujoco.MjModel") -> list[st
         and not geom.mass == 0
     ]  # fmt: skip
     return [
-        f"geom '{name}' touches nothing and adds to the weight of its body, which has no <inertial>; give it mass=\"0\""
+        f"geom '{name}' touches nothing but adds to the weight of its body, which has no <inertial>; give it mass=\"0\""
         for name in weighing
     ]
 
 
 def _left_out(model: "mujoco.MjModel", held: Sequence[str]) -> list[str]:
-    """What to say of what moves the robot in the file and is not simulated; actuators of held joints do not."""
+    """Notes on what drives the robot in the file but is not simulated; actuators of held joints are not reported."""
     import mujoco
 
     on_joints = [int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)]
@@ -220,9 +220,9 @@ def _left_out(model: "mujoco.MjModel", held: Sequence[str]) -> list[str]:
     others = [model.actuator(i).name or f"number {i}" for i in range(model.nu) if i not in joints]
     found = (
         (light, "gravcomp of body {} is left out: gravity acts on all of its mass"),
-        (late, "the delay of the actuator of joint {} is left out: its torque comes at once"),
+        (late, "the delay of the actuator of joint {} is left out: its torque is immediate"),
         (filtered, "the activation (timeconst, dyntype) of the actuator of joint {} is left out: it acts at once"),
-        (others, "actuator {} is left out, for it acts on no joint"),
+        (others, "actuator {} is left out because it acts on no joint"),
     )
     return [text.format(", ".join(f"'{name}'" for name in dict.fromkeys(names))) for names, text in found if names]
 
@@ -234,13 +234,13 @@ def _standing_keyframe(model: "mujoco.MjModel") -> int | None:
 
 
 def _servos(model: "mujoco.MjModel") -> dict[str, Servo]:
-    """What the actuators and the joints of a model say about gains and limits."""
+    """Gains and limits from the actuators and the joints of a model."""
     import mujoco
 
     servos = {}
     for joint in range(model.njnt):
         limits = [model.jnt_actfrcrange[joint].max()] if model.jnt_actfrclimited[joint] else []
-        stiffness = damping = armature = 0.0  # a position and a velocity actuator may share the work
+        stiffness = damping = armature = 0.0  # a position and a velocity actuator may act together
         drag = np.zeros(3)
         for i in range(model.nu):
             if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[i, 0] != joint:
@@ -302,9 +302,9 @@ def _require_hinges(source: Source, chains: list[list[int]]) -> None:
     for joint in (joint for chain in chains for joint in chain):
         what = f"joint '{source.name(joint)}' of body '{source.body_of(joint)}'"
         if joint in seen:
-            raise ValueError(f"legs must be chains, but {what} moves two of them; every leg needs three of its own.")
+            raise ValueError(f"legs must be chains, but {what} moves two of them; every leg needs its own three.")
         if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ValueError(f"{what} must be a hinge; name it in held, or model the leg by hinges.")
+            raise ValueError(f"{what} must be a hinge; name it in held, or model the leg with hinges.")
         if not model.jnt_limited[joint]:
             raise ValueError(f'{what} must have a range of angles; give it range="LOW HIGH" in the MJCF.')
         seen.add(joint)
@@ -340,9 +340,9 @@ def _add_joint(body: "mujoco.MjsBody", model: "mujoco.MjModel", joint: int, serv
 def _add_geoms(
     spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjModel", index: int, taken: set[str]
 ) -> list[tuple[str, str]]:
-    """Add what a body looks like and what of it collides; a body that has no looks looks like what collides.
+    """Add a body's visual geoms and the pieces that collide; without visual geoms, those that collide are shown.
 
-    ``taken`` are names that no piece may get; those of the pieces join them.
+    ``taken`` are names that no piece may get; the names of the pieces are added to it.
     """
     geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == index]
     hard = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
@@ -363,7 +363,7 @@ def _add_geoms(
 
 
 def _moved(piece: Piece, model: "mujoco.MjModel", geom: int) -> tuple[tuple, tuple | None, float]:
-    """A piece of a geom's box in the frame of its body."""
+    """A piece of a geom's box, in the frame of its body."""
     import mujoco
 
     turn = np.empty(9)
@@ -391,7 +391,7 @@ def _add_look(spec: "mujoco.MjSpec", body: "mujoco.MjsBody", model: "mujoco.MjMo
 
 
 def _add_mesh(spec: "mujoco.MjSpec", model: "mujoco.MjModel", index: int) -> str:
-    """Add a copy of a mesh, once; gives its name."""
+    """Add a copy of a mesh, once; return its name."""
     import mujoco
 
     name = f"mesh{index}"
@@ -401,6 +401,6 @@ def _add_mesh(spec: "mujoco.MjSpec", model: "mujoco.MjModel", index: int) -> str
         spec.add_mesh(
             name=name, uservert=model.mesh_vert[first : first + count].ravel(),
             userface=model.mesh_face[face : face + faces].ravel(),
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # looks need not be closed
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # visual meshes need not be closed
         )  # fmt: skip
     return name

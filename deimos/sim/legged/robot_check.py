@@ -1,4 +1,4 @@
-"""Checks a robot: what is missing or odd, with a way out for each, from its model and from standing for two seconds."""
+"""Checks a robot's model and how it stands for two seconds: what is missing or odd, with a way out for each."""
 
 import math
 from dataclasses import dataclass
@@ -16,31 +16,31 @@ if TYPE_CHECKING:
 
 LEGS = ("front left", "front right", "rear left", "rear right")
 PARTS = ("hip", "thigh", "calf")
-SECONDS = 2.0  # that the robot has to stand
+SECONDS = 2.0  # that the robot must stand
 DROP = 0.005  # [m] above the ground that it starts at
-SETTLED = 0.5  # [s] at the end over which means are taken
+SETTLED = 0.5  # [s] at the end, over which means are taken
 LOWEST, STEEPEST = 0.7, 0.35  # share of its height, and tilt [rad], beyond which the robot has fallen
-SLIDE, SWAY = 0.04, 0.5  # [m] and [rad/s] beyond which it slides and trembles; a Go1 creeps by 0.02 m
+SLIDE, SWAY = 0.04, 0.5  # [m] and [rad/s], beyond which it slides or trembles; a Go1 creeps by 0.02 m
 SAG, USE = 0.3, 0.7  # [rad], and share of the largest torque, beyond which standing takes too much
-SOFT_LIMIT = 0.9  # share of a joint's range, from which on the task's reward takes something off
-SMALLEST, LARGEST = 2.0, 100.0  # [kg]; of other robots the task's numbers have not been tried
+SOFT_LIMIT = 0.9  # share of a joint's range, beyond which the task's reward has a penalty
+SMALLEST, LARGEST = 2.0, 100.0  # [kg]; the task's numbers have not been tried on other robots
 PAYLOAD = 0.25  # share of the base's mass that the task's payload of 1 kg should not exceed
 
 
 @dataclass(frozen=True)
 class Standing:
-    """What became of a robot that was to stand."""
+    """How a robot stood."""
 
     height: float
-    """Of the base, beside its standing height."""
+    """Of the base, relative to its standing height."""
     tilt: float
     """Of the base [rad]."""
     slide: float
-    """Way of the base over the ground since it settled [m]."""
+    """Distance of the base over the ground since it settled [m]."""
     speed: float
     """Largest root mean square of a joint's speed since it settled [rad/s]."""
     sag: np.ndarray
-    """Angle of every joint beside its target, at the end [rad], shape (num_joints,)."""
+    """Angle of every joint minus its target, at the end [rad], shape (num_joints,)."""
     torque: np.ndarray
     """Mean size of every joint's torque since it settled [N m], shape (num_joints,)."""
     force: np.ndarray
@@ -49,13 +49,13 @@ class Standing:
 
 @dataclass(frozen=True)
 class Report:
-    """What was found about a robot."""
+    """Findings about a robot."""
 
     standing: Standing
     faults: tuple[str, ...]
     """What keeps the robot from being trained."""
     oddities: tuple[str, ...]
-    """What may be meant."""
+    """What may be intended."""
     physics: Physics
     """The world in which it stood, as it is at the end."""
 
@@ -81,7 +81,7 @@ def check_robot(robot: Robot, engine: engines.Name = "native") -> Report:
 
 
 def stand(robot: Robot, physics: Physics) -> Standing:
-    """Let a robot stand in its pose, in the one world of ``physics``, a plane, for ``SECONDS``."""
+    """Let a robot stand in its pose on a plane, in the one world of ``physics``, for ``SECONDS``."""
     joints = len(robot.joints)
     pose = np.array(robot.pose, np.float32)
     physics.arrays.qpos.assign([[0.0, 0.0, robot.standing_height + DROP, 1.0, 0.0, 0.0, 0.0, *pose]])
@@ -107,16 +107,16 @@ def stand(robot: Robot, physics: Physics) -> Standing:
 
 
 def _check_geoms(robot: Robot, model: "mujoco.MjModel") -> list[str]:
-    """What has to collide and does not."""
+    """What must collide but does not."""
     base = model.body(model.jnt_bodyid[0]).name
     on_base = [name for name in robot.parts[0] if model.body(model.geom(name).bodyid[0]).name == base]
     return [] if on_base else [
-        f"base '{base}' does not collide, so a fall is no crash; give it a geom with a contype of 1"
+        f"base '{base}' does not collide, so a fall is not a crash; give it a geom with a contype of 1"
     ]  # fmt: skip
 
 
 def _check_standing(robot: Robot, standing: Standing) -> list[str]:
-    """Whether the robot stands at all."""
+    """A fault if the robot does not stand at all."""
     if not math.isfinite(standing.height):
         return ["the simulation of standing is not finite; lower stiffness or damping, or raise the joints' armature"]
     fallen = standing.height < LOWEST or standing.tilt > STEEPEST or standing.force[0] > 1.0
@@ -139,14 +139,14 @@ def _check_masses(model: "mujoco.MjModel") -> list[str]:
         found.append(f"it weighs {total:.3g} kg; the task is made for {SMALLEST:g} to {LARGEST:g} kg")
     if own < 1.0 / PAYLOAD:
         found.append(
-            f"base '{model.body(base).name}' weighs {own:.3g} kg, beside a payload of up to 1 kg in training; take "
+            f"base '{model.body(base).name}' weighs {own:.3g} kg, but the payload in training is up to 1 kg; use "
             f"--env.payload {PAYLOAD * own:.2g}"
         )
     return found
 
 
 def _check_parts(robot: Robot, model: "mujoco.MjModel") -> list[str]:
-    """Hips that do not collide, limbs that do not, feet that are not."""
+    """Hips and limbs that do not collide."""
     found, bodies = [], [model.geom(name).bodyid[0] for name in robot.parts[0]]
     for i, leg in enumerate(LEGS):
         hip, thigh = (model.jnt_bodyid[model.joint(robot.joints[3 * i + part].name).id] for part in (0, 1))
@@ -161,7 +161,7 @@ def _check_parts(robot: Robot, model: "mujoco.MjModel") -> list[str]:
 
 
 def _check_joints(robot: Robot, standing: Standing) -> list[str]:
-    """Angles near limits, torques near limits, joints that give way or tremble."""
+    """Angles and torques near their limits, joints that give way or tremble."""
     found = []
     for i, joint in enumerate(robot.joints):
         middle, half = sum(joint.range) / 2, (joint.range[1] - joint.range[0]) / 2
@@ -173,11 +173,11 @@ def _check_joints(robot: Robot, standing: Standing) -> list[str]:
         if standing.torque[i] > USE * joint.max_torque:
             found.append(
                 f"standing takes {standing.torque[i]:.1f} of the {joint.max_torque:g} N m of '{joint.name}'; raise "
-                "max_torque if the motor gives more, or choose a pose that takes less"
+                "max_torque if the motor can give more, or choose a pose that takes less"
             )
         elif abs(standing.sag[i]) > SAG:
             found.append(
-                f"'{joint.name}' gives way by {standing.sag[i]:+.2f} rad where the robot stands; raise stiffness"
+                f"'{joint.name}' gives way by {standing.sag[i]:+.2f} rad when the robot stands; raise stiffness"
             )
     if standing.speed > SWAY:
         found.append(f"joints tremble at {standing.speed:.1f} rad/s; lower stiffness, or raise damping or armature")
@@ -185,14 +185,14 @@ def _check_joints(robot: Robot, standing: Standing) -> list[str]:
 
 
 def judge_feet(standing: Standing) -> list[str]:
-    """What a robot that stands does with its feet."""
+    """Oddities of the feet of a robot that stands."""
     found = [
-        f"the {leg} foot is off the ground where the robot stands; make its leg's pose as long as the others'"
+        f"the {leg} foot is off the ground when the robot stands; make its leg's pose as long as the others'"
         for leg, force in zip(LEGS, standing.force[1:5], strict=True) if force < 1.0
     ]  # fmt: skip
     names = [f"{leg} {part}" for leg in LEGS for part in PARTS[1:]]
     found += [
-        f"the {name} touches the ground where the robot stands; name its geom as a foot, or change the pose"
+        f"the {name} touches the ground when the robot stands; name its geom as a foot, or change the pose"
         for name, force in zip(names, standing.force[5:], strict=True) if force > 1.0
     ]  # fmt: skip
     if standing.slide > SLIDE:

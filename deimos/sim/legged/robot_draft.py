@@ -1,4 +1,4 @@
-"""Drafts a robot file from an MJCF: what the MJCF says, and guesses for the rest."""
+"""Drafts a robot file from an MJCF: what the MJCF specifies, and guesses for the rest."""
 
 import itertools
 from pathlib import Path
@@ -14,26 +14,26 @@ if TYPE_CHECKING:
     import mujoco
 
 CROUCH = 0.75  # of the largest height of the hips above the feet; a Go1 stands at 0.73
-SAG = 0.1  # [rad] that a joint gives way by where the robot stands, as a Go1's
+SAG = 0.1  # [rad] by which a joint gives way when the robot stands, as a Go1's
 TIME_CONSTANT = 0.025  # [s], damping over stiffness; Legged Gym's A1
-SOFT_LIMIT = 0.9  # share of a joint's range that poses keep to
-RESERVE = 4.0  # largest torque over that of standing
-LEVEL = 0.01  # [m] above the lowest point of a leg that is still its foot
+SOFT_LIMIT = 0.9  # share of a joint's range that poses stay within
+RESERVE = 4.0  # ratio of the largest torque to that of standing
+LEVEL = 0.01  # [m] above the lowest point of a leg that still counts as its foot
 GRAVITY = 9.81  # [m/s^2]
 
 
 def draft(path: Path, held: tuple[str, ...] = ()) -> tuple[RobotFile, list[str]]:
-    """Draft a robot file, to lie beside the MJCF.
+    """Draft a robot file, to be put next to the MJCF.
 
     Args:
         path: The MJCF.
         held: Joints to hold at zero.
 
     Returns:
-        The robot, and what of it was guessed or is odd, each with a way out.
+        The robot, and notes on what was guessed or is odd, each with a way out.
 
     Raises:
-        ValueError: If the MJCF is not that of a quadruped.
+        ValueError: If the MJCF does not describe a quadruped.
     """
     source = mjcf.read(path, held)
     chains = mjcf.find_legs(source)
@@ -42,13 +42,13 @@ def draft(path: Path, held: tuple[str, ...] = ()) -> tuple[RobotFile, list[str]]
         poses = [[source.pose[source.name(joint)] for joint in chain] for chain in chains]
     else:
         poses = [_guess_pose(source, chain) for chain in chains]
-        notes.append("pose is a guess, for the MJCF has no keyframe 'home': legs bent, feet below the hips")
+        notes.append("pose is a guess because the MJCF has no keyframe 'home': legs bent, feet below the hips")
     data = _posed(source, chains, poses)
     torques = np.max([_standing_torque(source, data, chain) for chain in chains], axis=0)
     servos, *others = [[source.servos[source.name(joint)] for joint in chain] for chain in chains]
     if any(leg != servos for leg in others):
         notes.append(
-            "stiffness, damping and max_torque are the front left leg's, and the MJCF has others for other legs; write "
+            "stiffness, damping and max_torque are the front left leg's, but the MJCF has others for other legs; write "
             "what suits all four"
         )
     stiffness, damping, max_torque = (
@@ -56,7 +56,7 @@ def draft(path: Path, held: tuple[str, ...] = ()) -> tuple[RobotFile, list[str]]
     )
     if not all(stiffness):
         stiffness = [_rounded(max(torques) / SAG)] * 3
-        notes.append(f"stiffness is a guess: joints give way by {SAG} rad where the robot stands")
+        notes.append(f"stiffness is a guess: joints give way by {SAG} rad when the robot stands")
     if not all(damping):
         damping = [_rounded(TIME_CONSTANT * value) for value in stiffness]
         notes.append(f"damping is a guess: {TIME_CONSTANT:g} s times the stiffness")
@@ -74,12 +74,12 @@ def draft(path: Path, held: tuple[str, ...] = ()) -> tuple[RobotFile, list[str]]
 
 
 def _rounded(value: float) -> float:
-    """A number of two digits."""
+    """A number rounded to two digits."""
     return float(f"{value:.2g}")
 
 
 def _posed(source: Source, chains: list[list[int]], poses: list[list[float]]) -> "mujoco.MjData":
-    """The robot in a pose, its base where the file has it but upright."""
+    """The robot in a pose, its base at the file's position but upright."""
     import mujoco
 
     model = source.model
@@ -92,7 +92,7 @@ def _posed(source: Source, chains: list[list[int]], poses: list[list[float]]) ->
 
 
 def _guess_pose(source: Source, chain: list[int]) -> list[float]:
-    """The hip near zero, the end of the leg below the thigh's joint at ``CROUCH``, the knee behind where it can."""
+    """The hip near zero, the end of the leg below the thigh's joint at ``CROUCH``, the knee backwards if possible."""
     import mujoco
 
     model, (_, thigh, knee), end = source.model, chain, _end_geom(source, chain)
@@ -103,7 +103,7 @@ def _guess_pose(source: Source, chain: list[int]) -> list[float]:
     low, high = middle - soft, middle + soft
     hip, height = float(np.clip(0.0, low[0], high[0])), 0.0
     best = middle[1:]
-    for share in (1.0, 0.05):  # of the ranges, first all over, then around the best
+    for share in (1.0, 0.05):  # of the ranges: first everywhere, then around the best
         grid = best[:, None] + share * soft[1:, None] * np.linspace(-1.0, 1.0, 41)
         found = []
         for angles in itertools.product(*np.clip(grid, low[1:, None], high[1:, None])):
@@ -122,7 +122,7 @@ def _colliding(source: Source, chain: list[int]) -> np.ndarray:
     """The geoms that collide on the body that the leg's last joint moves.
 
     Raises:
-        ValueError: If there are none.
+        ValueError: If none collides.
     """
     model, body = source.model, source.model.jnt_bodyid[chain[-1]]
     hard = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
@@ -151,7 +151,7 @@ def _feet(source: Source, data: "mujoco.MjData", chain: list[int]) -> tuple[str,
 
 
 def _half_height(model: "mujoco.MjModel", geom: int, row: np.ndarray) -> float:
-    """How far a geom reaches below its middle [m]; that of its box but for spheres and capsules."""
+    """How far a geom reaches below its middle [m]; that of its box except for spheres and capsules."""
     import mujoco
 
     kinds = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
@@ -162,7 +162,7 @@ def _half_height(model: "mujoco.MjModel", geom: int, row: np.ndarray) -> float:
 
 
 def _standing_torque(source: Source, data: "mujoco.MjData", chain: list[int]) -> np.ndarray:
-    """Torques of a leg's joints that carry a quarter of the robot [N m], shape (3,)."""
+    """Torques of a leg's joints that carry a quarter of the robot's weight [N m], shape (3,)."""
     import mujoco
 
     model = source.model

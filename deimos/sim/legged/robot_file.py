@@ -1,6 +1,6 @@
-"""A robot from one data file: a TOML file that says what an MJCF does not.
+"""A robot from one data file: a TOML file with what an MJCF lacks.
 
-``--env.robot FILE.toml`` takes it. It names the MJCF, the gains, and of every leg its joints, its foot and its pose;
+``--env.robot FILE.toml`` takes it. It names the MJCF, the gains, and the joints, foot and pose of every leg;
 ``deimos robot new`` writes one to start from.
 """
 
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deimos.checks import check_positive, one_line
+from deimos.files import UNREADABLE
 from deimos.sim.legged import mjcf
 from deimos.sim.legged.robots import Joint, Robot
 from deimos.sim.legged.robots._primitives import add_actuators
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     import mujoco
 
 ENDINGS = (".toml", ".zip")
-"""What a robot file ends in; the second is what a run keeps: the first with the MJCF and all that it names."""
+"""Endings of a robot file; the second is a run's copy: a file of the first kind with the MJCF and all its files."""
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 FACTORS = np.linspace(0.5, 1.5, 7)  # of the pose's angles, between which a reset draws
 CLEARANCE = 0.02  # [m] between the lowest foot and the ground at a reset
@@ -41,14 +42,14 @@ class Leg:
     joints: tuple[str, ...]
     """Names of its three hinges, hip first."""
     feet: tuple[str, ...]
-    """Names of the geoms that it stands on, at least one; the others of the leg should not touch the ground."""
+    """Names of the geoms that it stands on, at least one; other geoms of the leg should not touch the ground."""
     pose: tuple[float, ...]
-    """Angle of every joint at an action of zero [rad]; the robot has to stand in it."""
+    """Angle of every joint at an action of zero [rad]; the robot must stand in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotFile:
-    """A robot as its file describes it. What is a single number is that of every joint of a leg."""
+    """A robot as its file describes it. In the file, a single number stands for every joint of a leg."""
 
     mjcf: str
     """Path of the MJCF, relative to the folder of this file."""
@@ -59,7 +60,7 @@ class RobotFile:
     max_torque: tuple[float, ...]
     """Largest torque of the three joints of a leg [N m], positive."""
     action_scale: tuple[float, ...] = (0.25, 0.25, 0.25)
-    """What an action of one adds to the target angles of a leg [rad], positive."""
+    """What an action of 1 adds to the target angles of a leg [rad], positive."""
     held: tuple[str, ...] = ()
     """Joints that are held at zero: of a head, a tail, an arm."""
     front_left: Leg
@@ -84,13 +85,13 @@ class RobotFile:
         """The robot, in free space.
 
         Args:
-            folder: Where the paths begin.
-            stiffness: Instead of the file's own, of every joint [N m/rad].
-            damping: Instead of the file's own, of every joint [N m s/rad].
-            action_scale: Instead of the file's own, of every joint [rad].
+            folder: The folder that paths are relative to.
+            stiffness: Replaces the file's own, for every joint [N m/rad].
+            damping: Replaces the file's own, for every joint [N m s/rad].
+            action_scale: Replaces the file's own, for every joint [rad].
 
         Raises:
-            ValueError: If the MJCF cannot be used, or has not what the file names.
+            ValueError: If the MJCF cannot be used, or lacks what the file names.
         """
         source = mjcf.read(folder / self.mjcf, self.held)
         legs = mjcf.find_legs(source)
@@ -151,10 +152,10 @@ class RobotFile:
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[RobotFile, Path]]:
-    """Read a robot file; gives it and the folder where its paths begin, which may be gone afterwards.
+    """Read a robot file; yield it and the folder that its paths are relative to, which may be gone afterwards.
 
     Raises:
-        ValueError: If there is none, or it is none.
+        ValueError: If there is no such file, or it is not a robot file.
     """
     if not path.is_file():
         raise ValueError(f"robot must be a name or a robot file, but there is no {path}.")
@@ -166,16 +167,16 @@ def opened(path: Path) -> Iterator[tuple[RobotFile, Path]]:
             with zipfile.ZipFile(path) as archive:
                 archive.extractall(folder)
             text = (Path(folder) / "robot.toml").read_bytes()
-        except (OSError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is not a robot that a run has kept: {one_line(error)}.") from error
+        except UNREADABLE as error:
+            raise ValueError(f"{path} is not a run's copy of a robot: {one_line(error)}.") from error
         yield _parse(path, text), Path(folder)
 
 
 def pack(path: Path) -> bytes:
-    """A robot file in one, with the MJCF and all that it includes: what a run keeps.
+    """A robot file with its MJCF and everything that it includes, in one archive: what a run keeps.
 
     Raises:
-        ValueError: If the MJCF names a file by an absolute path, which would not be found where the run is moved to.
+        ValueError: If the MJCF names a file by an absolute path, which would be missing after the run is moved.
     """
     import mujoco
 
@@ -188,18 +189,18 @@ def pack(path: Path) -> bytes:
     top = Path(os.path.commonpath([file.parent for file in files]))
     kept = dataclasses.replace(robot, mjcf=model.relative_to(top).as_posix())
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in [
             ("robot.toml", to_toml(kept).encode()),
             *((file.relative_to(top).as_posix(), file.read_bytes()) for file in files),
         ]:
-            archive.writestr(zipfile.ZipInfo(name), data)  # without the time: the same robot gives the same bytes
+            archive.writestr(zipfile.ZipInfo(name), data)  # without a time or compression: the same bytes everywhere
     _require_whole(buffer, kept)
     return buffer.getvalue()
 
 
 def _require_whole(packed: io.BytesIO, robot: RobotFile) -> None:
-    """Raise ``ValueError`` if what is packed, once unpacked elsewhere, still reads files from where it was."""
+    """Raise ``ValueError`` if the archive, unpacked elsewhere, still reads files from outside."""
     import mujoco
 
     with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed) as archive:
@@ -213,7 +214,7 @@ def _require_whole(packed: io.BytesIO, robot: RobotFile) -> None:
 
 
 def to_toml(robot: RobotFile) -> str:
-    """A robot file's text, with what its values mean."""
+    """A robot file's text, with comments on its values."""
     lines = [f"mjcf = {_spell(robot.mjcf)}"]
     for name, unit in (
         ("stiffness", "N m/rad"), ("damping", "N m s/rad"), ("max_torque", "N m"), ("action_scale", "rad"),
@@ -247,7 +248,7 @@ def _parse(path: Path, data: bytes) -> RobotFile:
             if name in table:
                 values[name] = _numbers(name, table[name])
         return RobotFile(**values)
-    except ValueError as error:  # of TOML and of its encoding too
+    except ValueError as error:  # also those of TOML and of its encoding
         raise ValueError(f"{path}: {one_line(error).rstrip('.')}.") from error
 
 
@@ -279,7 +280,7 @@ def _names(name: str, value: Any, count: int | None) -> tuple[str, ...]:
 
 
 def _numbers(name: str, value: Any, *, spread: bool = True) -> tuple[float, ...]:
-    """Three numbers; a single one stands for three where that is allowed."""
+    """Three numbers; with ``spread``, a single one stands for three."""
     numbers = value if isinstance(value, list) else [value] * (3 if spread else 1)
     is_number = [isinstance(each, int | float) and not isinstance(each, bool) for each in numbers]
     if len(numbers) != 3 or not all(is_number):
@@ -290,7 +291,7 @@ def _numbers(name: str, value: Any, *, spread: bool = True) -> tuple[float, ...]
 def _measure(
     spec: "mujoco.MjSpec", joints: tuple[Joint, ...], parts: tuple[tuple[str, ...], ...]
 ) -> tuple[float, float, float]:
-    """Standing height, spawn height and reach of a ``Robot``, by its legs in the pose and in what a reset draws [m]."""
+    """Standing height, spawn height and reach of a ``Robot``, from its legs in the pose and at a reset [m]."""
     import mujoco
 
     model = spec.compile()
@@ -307,7 +308,7 @@ def _measure(
         return lowest, farthest
 
     standing = -place(pose, feet)[0]
-    # Legs do not feel each other: all four take the same step at once.
+    # Legs are independent of each other: all four take the same angles at once.
     found = [
         place(np.clip(pose * np.tile(factors, 4), low, high), legs) for factors in itertools.product(FACTORS, repeat=3)
     ]

@@ -53,14 +53,14 @@ if TYPE_CHECKING:
     import mujoco
 
 SOFT_LIMIT = 0.9  # share of a joint's range; Legged Gym's A1
-MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is as fast, so a faster one is a simulation gone wrong
+MAX_SPEED, MAX_RATE = 20.0, 500.0  # [m/s] and [rad/s]; no Go1 is that fast, so a faster one is a simulation gone wrong
 SPAWN_RANGE, SPAWN_SPEED = 1.0, 0.5  # [m], [m/s] and [rad/s]; Legged Gym's
 STEP_IN_SIGHT = 0.02  # [m]; the lowest step of the stairs is 5 cm high
-EDGE = 0.3  # [m] of the terrain's edge that count as beyond it
+EDGE = 0.3  # [m] along the terrain's edge that count as outside it
 NOWHERE = 1e9  # [m]; a plane has no edge
-FARTHEST = 4096.0  # [m] from the origin; beyond, float32 tells 0.5 mm at best, and who moves by less in a step stands
-SETTLED = 2.0  # [s] after which a robot that stands is at rest
-GOALS_AT_REST = 2**18  # mean tracking by a robot at rest is then known to 0.001
+FARTHEST = 4096.0  # [m] from the origin; beyond, float32 resolves 0.5 mm at best, and smaller movements per step vanish
+SETTLED = 2.0  # [s] after which a standing robot is at rest
+GOALS_AT_REST = 2**18  # goals with which the mean tracking by a robot at rest is known to 0.001
 NOISE = {
     "linear_velocity": 0.1, "angular_velocity": 0.2, "gravity": 0.05, "joint_position": 0.01, "joint_velocity": 1.5,
     "heights": 0.1,
@@ -75,8 +75,8 @@ class Locomotion(WarpEnv):
 
     Args:
         config: The task.
-        robot: Who does it.
-        parts: What its goals are made of; the velocity goal comes first.
+        robot: The robot.
+        parts: The parts of its goals; the velocity goal comes first.
         num_envs, device, seed, env_offset: See ``EnvConfig.build``.
     """
 
@@ -95,7 +95,7 @@ class Locomotion(WarpEnv):
         self.goal_group_names = tuple(name for part in parts for name in part.group_names)
         self.goal_group_weights = tuple(max(weight, 0.0) for part in parts for weight in part.weights)
         self.columns = (*COLUMNS, *(name for part in parts for name in part.columns))
-        """What the reward is the sum of: the legs' terms, what clipping adds, and the terms of the goal's parts."""
+        """The terms that the reward is the sum of: the legs', what clipping adds, and those of the goal's parts."""
         super().__init__(
             config, num_envs, device, seed, env_offset,
             layout=_layout(robot, parts, len(self.points), config.privileged),
@@ -112,9 +112,9 @@ class Locomotion(WarpEnv):
         self.recordable = self.physics.recordable
         self.tensors = self.physics.tensors | self.tensors
         self.legged = self._join(ground)
-        """All that the kernels work on."""
+        """Everything that the kernels work on."""
         self.term = wp.to_torch(self.legged.out.term)
-        """What the last reward is the sum of, shape (num_envs, len(columns))."""
+        """The terms of the last reward, shape (num_envs, len(columns))."""
         self._launches = [part.bind(self.legged) for part in parts]
         self.errors = {name: error for part in self._launches for name, error in part.errors.items()}
         self._sums = torch.zeros(len(self.columns), dtype=torch.float64, device=device)
@@ -125,7 +125,7 @@ class Locomotion(WarpEnv):
         """The simulator, with a friction and a payload for every world unless they are fixed.
 
         Raises:
-            ValueError: If a payload could take away all of the base.
+            ValueError: If a payload could cancel the base's whole mass.
         """
         config, n = self.config, self.num_envs
         self._set_rows(torch.arange(n))
@@ -149,8 +149,8 @@ class Locomotion(WarpEnv):
         base, payload = model.body(model.jnt_bodyid[0]), self.config.payload
         if payload >= base.mass[0]:
             raise ValueError(
-                f"payload must be less than the {base.mass[0]:.3g} kg of '{base.name}', from which it is taken too, "
-                f"got {payload:g}; take --env.payload {PAYLOAD * base.mass[0]:.2g}."
+                f"payload must be less than the {base.mass[0]:.3g} kg of '{base.name}', since it is also subtracted, "
+                f"got {payload:g}; use --env.payload {PAYLOAD * base.mass[0]:.2g}."
             )
 
     def _join(self, ground: Terrain | None) -> LeggedWorlds:
@@ -182,7 +182,7 @@ class Locomotion(WarpEnv):
         )  # fmt: skip
 
     def _make_params(self, ground: Terrain | None) -> LocomotionParams:
-        """What the kernels need to know."""
+        """Parameters for the kernels."""
         config, robot, land = self.config, self.robot, self.terrain
         limits = np.array([joint.range for joint in robot.joints[:LEG_JOINTS]])
         middle, half = limits.mean(axis=1), SOFT_LIMIT * np.ptp(limits, axis=1) / 2
@@ -206,8 +206,8 @@ class Locomotion(WarpEnv):
     def _begin(self) -> None:
         """Record step and reset, each as one graph, and begin every world's first episode.
 
-        What is recorded knows the memory that it works on and not the environment, which keeps it: so the environment
-        is freed with the last reference to it, and does not wait for Python's search for cycles.
+        The recordings refer to the memory that they work on, not to the environment, which holds them: so the
+        environment is freed with its last reference, without waiting for Python's garbage collector.
         """
         legged, launches, rows = self.legged, self._launches, self.physics.parts
         faults = wp.zeros((len(rows), 3), dtype=wp.int32, device=self.worlds.fault.device)
@@ -227,10 +227,10 @@ class Locomotion(WarpEnv):
         valid_goals = partial(validations[0], self._row.array, self._candidate_scale.array) if validations else None
         run_reset = partial(_run_reset, legged, launches, self.physics)
         self.begin(step, Captured(run_reset, self.device), valid_goals=valid_goals)
-        self.physics.report()  # what the recording needed says nothing about these worlds
+        self.physics.report()  # buffer use while recording says nothing about these worlds
 
     def _gather(self, faults: Tensor) -> Callable[[], None]:
-        """What joins the faults of parts, shape (parts, 3), to those of all worlds."""
+        """Makes a function that adds the faults of parts, shape (parts, 3), to those of all worlds."""
         known, nothing = self._views["fault"], self._no_fault
         first = torch.tensor([[0, rows.start, rows.start] for rows in self.physics.parts]).to(faults)
         faults.copy_(nothing)
@@ -245,7 +245,7 @@ class Locomotion(WarpEnv):
 
     @property
     def action_range(self) -> tuple[Tensor, Tensor]:
-        """See ``Env.action_range``: what takes the joints' targets to the ends of their ranges."""
+        """See ``Env.action_range``: the actions that take the joints' targets to the ends of their ranges."""
         low, high = torch.tensor([joint.action_range for joint in self.robot.joints], dtype=torch.float32).T
         return low, high
 
@@ -259,7 +259,7 @@ class Locomotion(WarpEnv):
         return f"its {cause} was {value:g}{unit}"
 
     def report(self) -> dict[str, float]:
-        """What a log wants to know since the last call: means of the reward's terms per step, levels, buffers, errors.
+        """Numbers for the log since the last call: means of the reward's terms per step, levels, buffers, errors.
 
         The terms add up to the mean reward; the errors are means over the worlds at this moment.
         """
@@ -290,15 +290,15 @@ class Locomotion(WarpEnv):
         return torch.cat([reverse, goal[:, count:]], dim=1)
 
     def rest_goal(self) -> tuple[float | None, ...]:
-        """See ``Env.rest_goal``: no velocity, an arm where it is asked to be."""
+        """See ``Env.rest_goal``: no velocity, and the arm's goal stays."""
         walk, *others = (len(part.range) for part in self.parts)
         return (0.0,) * walk + (None,) * sum(others)
 
     def risk_contrast(self) -> tuple[Tensor, Tensor] | None:
-        """See ``Env.risk_contrast``: as they are, on stairs and on flat ground (thesis, 4.1).
+        """See ``Env.risk_contrast``: robots where they are, on stairs and on flat ground (thesis, 4.1).
 
-        Smooth slopes are flat on level 0. Whoever stands on stairs and sees no step, or on flat ground and sees one, is
-        in neither place.
+        Smooth slopes are flat on level 0. A robot on stairs that sees no step, or on flat ground that sees one, is in
+        neither group.
         """
         shapes = ["flat" if shape.startswith("slope") and not level else shape for shape, level in self.tiles()]
         stairs, flat = (
@@ -312,9 +312,9 @@ class Locomotion(WarpEnv):
         return stairs[uneven[stairs]], flat[~uneven[flat]]
 
     def tracking_at_rest(self) -> float | None:
-        """See ``Env.tracking_at_rest``: of ``GOALS_AT_REST`` goals and more, by the robots once they stand.
+        """See ``Env.tracking_at_rest``: of at least ``GOALS_AT_REST`` goals, by the robots once they stand.
 
-        ``None`` where no part of the goal has a weight.
+        ``None`` if no part of the goal has a weight.
         """
         if not sum(self.goal_group_weights) > 0.0:
             return None
@@ -327,7 +327,7 @@ class Locomotion(WarpEnv):
         return float(np.average(tracking, weights=self.goal_group_weights))
 
     def at_rest(self, goals: Tensor) -> list[Tensor]:
-        """Tracking of goals by robots that stand as these do, part by part, shape (num_envs, n, groups).
+        """Tracking of goals by robots that stand as these do, for each part, shape (num_envs, n, groups).
 
         Args:
             goals: In physical units, shape (num_envs, n, goal_dim).
@@ -354,7 +354,7 @@ class Locomotion(WarpEnv):
 
 
 def _finish_step(legged: LeggedWorlds, launches: Sequence[Launches], rows: slice) -> None:
-    """Launch what follows a step of the simulator, in some of the worlds: ``legged`` is theirs alone."""
+    """Launch what follows a step of the simulator, in some of the worlds: ``legged`` is restricted to them."""
     for part in launches:
         part.evaluate(legged, rows)
     evaluate_step(legged)
@@ -362,7 +362,7 @@ def _finish_step(legged: LeggedWorlds, launches: Sequence[Launches], rows: slice
 
 
 def _run_reset(legged: LeggedWorlds, launches: Sequence[Launches], physics: Physics) -> None:
-    """Launch the reset of the worlds of the mask."""
+    """Launch the reset of the worlds in the mask."""
     mask = legged.worlds.mask
     update_levels(legged)
     physics.reset(mask)
@@ -373,7 +373,7 @@ def _run_reset(legged: LeggedWorlds, launches: Sequence[Launches], physics: Phys
 
 
 def _require_room(ground: Terrain) -> None:
-    """Raise ``ValueError`` unless robots start on the terrain, wherever around a tile's middle they do."""
+    """Raise ``ValueError`` unless robots start on the terrain wherever they start around a tile's middle."""
     beyond_corner = ground.origins[..., :2] - ground.corner
     room, need = np.minimum(beyond_corner, ground.size - beyond_corner).min(), SPAWN_RANGE + EDGE
     if room < need - 1e-4:
@@ -389,7 +389,7 @@ def _require_nearness(ground: Terrain) -> None:
     if farthest > FARTHEST:
         raise ValueError(
             f"terrain must have the middles of its tiles within {FARTHEST:g} m of the origin under a robot, whose "
-            f"position is in single precision, got {farthest:g} m; move it there before it is imported."
+            f"position is in single precision, got {farthest:g} m; move it closer to the origin before importing it."
         )
 
 
@@ -399,7 +399,7 @@ def _layout(
     """Legged Gym's observation, with the fields of the goal's parts before the heights.
 
     Raises:
-        ValueError: If something is to be privileged that is not there, or the goal, which the actor has to see.
+        ValueError: If ``privileged`` names an unknown field, or the goal, which the actor must see.
     """
     joints = len(robot.joints)
     units = [unit for part in parts for unit in part.units]
@@ -432,5 +432,5 @@ def _noise(layout: Sequence[ObsField], parts: Sequence[GoalPart]) -> list[float]
 
 
 def _error_name(name: str) -> str:
-    """``end effector [m]`` as a column of a log."""
+    """The name of a log's column for an error such as ``end effector [m]``."""
     return name.partition(" [")[0].replace(" ", "_") + "_error"

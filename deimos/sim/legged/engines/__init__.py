@@ -1,8 +1,8 @@
-"""What steps the worlds of robots: two engines behind one face, one file each.
+"""What steps the worlds of robots: two engines behind one interface, one file each.
 
-``mujoco_warp`` simulates on CUDA, and on Warp's CPU backend after a compilation of a minute or two. ``native`` is
-MuJoCo's own C code on all cores of a CPU. What they show are Warp arrays with MuJoCo's names and layout; whatever
-uses them need not know which of the two is at work.
+``mujoco_warp`` simulates on CUDA, and on Warp's CPU backend after a minute or two of compilation. ``native`` is
+MuJoCo's own C code on all cores of a CPU. Both expose Warp arrays with MuJoCo's names and layout; code that uses them
+need not know which engine it is.
 """
 
 import abc
@@ -42,15 +42,15 @@ class PhysicsConfig:
     line_search: int = 10
     """Bound of its line-search iterations, at least 1."""
     contacts: int = 0
-    """Contact buffer size per world, shared by all worlds; 0 takes half of what touching with every geom would need, a
-    quarter on a height field, but one for every pair of geoms that can touch at least, and all of it for 16 worlds
-    more. That is 69 % and 28 % for 512 Go1s. Of mujoco-warp; the native engine has an arena for each thread."""
+    """Contact buffer size per world, shared by all worlds; 0 takes half of what contact with every geom would need, a
+    quarter on a height field, but at least one for every pair of geoms that can touch, and the whole for 16 more
+    worlds. That is 69 % and 28 % for 512 Go1s. Only for mujoco-warp; the native engine has an arena per thread."""
     rows: int = 0
-    """Buffer size for constraint rows in each world; 0 takes what touching with every geom needs, with all joints
-    at limits and their dry friction, four fifths of it on a height field. Of mujoco-warp, as above."""
+    """Buffer size for constraint rows in each world; 0 takes what contact with every geom needs, with all joints at
+    their limits and with dry friction, four fifths of it on a height field. Only for mujoco-warp, as above."""
     deterministic: bool = False
-    """Whether contacts and sums come in the same order every time on a GPU too, as exact resumes and clones there need;
-    it takes time. Of mujoco-warp; on a CPU everything always does."""
+    """Whether contacts and sums have the same order every time on a GPU too, which exact resumes and clones need there;
+    it costs time. Only for mujoco-warp; on a CPU the order is always the same."""
 
     def __post_init__(self) -> None:
         check_positive("timestep", self.timestep, finite=True)
@@ -66,7 +66,7 @@ class PhysicsConfig:
 
 
 class Physics(abc.ABC):
-    """``num_envs`` worlds, each with a robot of its own on the same terrain, at the model's defaults."""
+    """``num_envs`` worlds, each with its own robot on the same terrain, at the model's defaults."""
 
     robot: Robot
     terrain: Terrain | None
@@ -74,19 +74,19 @@ class Physics(abc.ABC):
     num_envs: int
     device: torch.device
     arrays: Simulation
-    """What the simulator has for the kernels; torques are those of the last substep."""
+    """The simulator's arrays for the kernels; torques are those of the last substep."""
     parts: tuple[slice, ...]
-    """Worlds that are evaluated on a thread of their own, from the first to the last."""
+    """Consecutive worlds that are each evaluated on a separate thread."""
     lost_contacts: int
     """The bits of ``arrays.overflow`` that mean that a contact or a constraint was left out."""
     recordable: bool = False
-    """Whether a CUDA graph of more than these may take in steps and resets; see ``Env.recordable``."""
+    """Whether a larger CUDA graph may include steps and resets; see ``Env.recordable``."""
     tensors: dict[str, torch.Tensor]
     """Everything that a bit-exact resume needs, by name; views, worlds along the first axis."""
 
     @cached_property
     def model(self) -> "mujoco.MjModel":
-        """The model with its visual geoms, for rendering and viewers; made when it is asked for."""
+        """The model with its visual geoms, for rendering and viewers; made on first use."""
         from deimos.sim.legged.engines.model import build_spec
 
         return build_spec(self.robot, self.terrain, self.config, visual=True).compile()
@@ -103,11 +103,11 @@ class Physics(abc.ABC):
         """Record one control step between launches that belong to it.
 
         Args:
-            before: Launches what the step begins with, such as new target angles.
-            after: Launches what follows from it, in the worlds of each of ``parts``.
+            before: Makes the launches that the step begins with, such as new target angles.
+            after: Make the launches that follow it, in the worlds of each of ``parts``.
 
         Returns:
-            Replays all of it. Recording has run all of it once, or more often: what that changes is to be set anew.
+            Replays all of it. Recording has run it once or more often, so whatever that changes must be set again.
         """
 
     @abc.abstractmethod
@@ -126,7 +126,7 @@ class Physics(abc.ABC):
 
     @abc.abstractmethod
     def report(self) -> dict[str, float]:
-        """What a log wants to know of the steps since the last call, the same keys every time; reads the device."""
+        """Numbers for the log on the steps since the last call, the same keys every time; reads the device."""
 
     @abc.abstractmethod
     def explain_loss(self, bits: int) -> str:
@@ -145,7 +145,7 @@ class Physics(abc.ABC):
 
 
 def resolve(engine: Name, device: torch.device) -> Name:
-    """The engine that ``auto`` stands for on a device; others stand for themselves."""
+    """The engine that a name stands for on a device: ``auto`` depends on it, others stand for themselves."""
     if engine != "auto":
         return engine
     return "warp" if device.type == "cuda" else "native"
@@ -159,13 +159,13 @@ def build(
 
     Args:
         engine: A name of ``MODULES``, or ``auto``.
-        robot: What is simulated.
+        robot: The robot.
         terrain: What it stands on; ``None`` for a plane at height 0, which is faster.
         num_envs: Number of worlds.
         device: Where they are simulated.
         config: The simulator's settings.
-        friction: Sliding friction of every world's feet, shape (num_envs,); ``None`` for that of the robot.
-        payload: What is added to every world's base [kg], shape (num_envs,); ``None`` for nothing.
+        friction: Sliding friction of every world's feet, shape (num_envs,); ``None`` for the robot's own.
+        payload: Mass that is added to every world's base [kg], shape (num_envs,); ``None`` for none.
 
     Raises:
         ValueError: If the terrain's cells are finer than ``model.FINEST_CELL``, or the engine does not know the device.

@@ -13,7 +13,7 @@ import warp as wp
 from deimos.sim.graphs import no_garbage_collected
 from deimos.sim.shared import warp_device
 
-PATIENCE = 3.0  # [s] of silence before the first step says what it waits for
+PATIENCE = 3.0  # [s] of silence before the wait for the compiler is explained
 
 
 class Captured:
@@ -21,7 +21,7 @@ class Captured:
 
     Args:
         launch: Makes the launches. Run once before it is recorded, which compiles what has to be compiled,
-            and once or not at all while it is: whatever it changes has to be set anew afterwards.
+            and once or not at all during recording: whatever it changes must be set again afterwards.
         device: Where they run.
     """
 
@@ -35,9 +35,9 @@ class Captured:
         self._graph = capture.graph
 
     def __call__(self) -> None:
-        """Replay the launches; within a larger graph that is being recorded, make them.
+        """Replay the launches; while a larger graph is being recorded, make them.
 
-        CUDA takes no graph into another one that has loops whose end the device decides.
+        CUDA cannot put a graph into another one if it has loops whose end the device decides.
         """
         if self._device.is_cuda and self._device.is_capturing:
             self._launch()
@@ -47,7 +47,7 @@ class Captured:
 
 @contextmanager
 def _say_what_it_waits_for() -> Iterator[None]:
-    """Say that the simulator is being compiled where that takes some seconds; Warp does it in folders of its cache."""
+    """Report a compilation of the simulator that takes some seconds; Warp compiles in folders of its cache."""
     done = threading.Event()
 
     def watch() -> None:

@@ -10,13 +10,13 @@ from deimos.terrain import Terrain
 if TYPE_CHECKING:
     import mujoco
 
-FINEST_CELL = 0.05  # [m] of a height field on which no geom of a robot covers more than the 50 prisms that are tested
+FINEST_CELL = 0.05  # [m] of a height field, on which no geom of a robot covers more than the 50 prisms that are tested
 
 
 def build_spec(
     robot: Robot, terrain: Terrain | None, config: PhysicsConfig, *, visual: bool
 ) -> "mujoco.MjSpec":  # fmt: skip
-    """The specification of the model, with its visual geoms, to look at, or without, to simulate.
+    """The specification of the model, with its visual geoms for rendering or without them for simulation.
 
     Raises:
         ValueError: If the terrain's cells are finer than ``FINEST_CELL``.
@@ -36,7 +36,7 @@ def build_spec(
 
 
 def _add_ground(spec: "mujoco.MjSpec", terrain: Terrain | None) -> None:
-    """Add a ground without friction of its own: the feet's counts."""
+    """Add a ground without its own friction: that of the feet counts."""
     import mujoco
 
     if terrain is None:
@@ -49,7 +49,7 @@ def _add_ground(spec: "mujoco.MjSpec", terrain: Terrain | None) -> None:
 
 
 def _dress(spec: "mujoco.MjSpec", ground: "mujoco.MjsGeom") -> None:
-    """Daylight, a sky and a chequered ground, so that one sees how the robot moves over it."""
+    """Add daylight, a sky and a chequered ground, which shows how the robot moves over it."""
     import mujoco
 
     headlight = spec.visual.headlight
@@ -71,7 +71,7 @@ def _dress(spec: "mujoco.MjSpec", ground: "mujoco.MjsGeom") -> None:
 
 
 def _set_options(spec: "mujoco.MjSpec", config: PhysicsConfig) -> None:
-    """Newton's solver on pyramidal friction cones, implicit in the joints' damping."""
+    """Set Newton's solver with pyramidal friction cones, implicit in the joints' damping."""
     import mujoco
 
     option = spec.option

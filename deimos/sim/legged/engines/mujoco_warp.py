@@ -1,4 +1,4 @@
-"""The engine of GPUs: mujoco-warp, which runs on Warp's CPU backend too. This is the only file that knows it."""
+"""The engine for GPUs: mujoco-warp, which also runs on Warp's CPU backend. No other file uses it."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -76,7 +76,7 @@ class Engine(Physics):
         self._model.geom_friction.assign(value)
 
     def _set_payload(self, model: "mujoco.MjModel", payload: np.ndarray) -> None:
-        """Change the base's mass, its inertia in proportion, and what follows from them."""
+        """Change the base's mass, its inertia in proportion, and what depends on them."""
         import mujoco_warp as mjw
 
         base = model.jnt_bodyid[0]
@@ -143,7 +143,7 @@ class Engine(Physics):
             self._mjw.reset_data(self._model, self._data, mask)
 
     def buffer_use(self) -> dict[str, int]:
-        """Largest use of contact and constraint buffers since the last call, beside their sizes; reads the device."""
+        """Largest use of contact and constraint buffers since the last call, and their sizes; reads the device."""
         contacts, rows = self._peak.tensor.tolist()
         self._peak.tensor.zero_()
         return {
@@ -163,7 +163,7 @@ class Engine(Physics):
         reasons = {
             bit.NEFC | bit.NJMAX_NNZ: f"{rows}; raise physics.rows",
             bit.BROADPHASE | bit.NARROWPHASE | bit.CCD: f"{contacts}; raise physics.contacts",
-            bit.HFIELD: "a geom covered more of the height field than is tested; take a terrain of larger cells",
+            bit.HFIELD: "a geom covered more of the height field than is tested; use a terrain with larger cells",
             bit.EPA_HORIZON: "a contact was deeper than the collision test can resolve",
         }
         return "; ".join(f"{bit(bits & cause).name}: {text}" for cause, text in reasons.items() if bits & cause)
@@ -172,19 +172,19 @@ class Engine(Physics):
 def _buffer_sizes(model: "mujoco.MjModel", num_envs: int, config: PhysicsConfig, *, plane: bool) -> tuple[int, int]:
     """Buffer sizes: contacts in all worlds, and constraint rows in each.
 
-    Buffers cost time, used or not. On a height field nobody touches with four contacts of every geom: of a Go1's 136
-    rows a policy's robots needed 64 at most, but for worlds that diverged (108), and robots under large random
-    leg targets 93.
+    Buffers cost time, used or not. On a height field no robot touches with four contacts of every geom: of a Go1's 136
+    rows a policy's robots needed at most 64, except for worlds that diverged (108), and robots with large random leg
+    targets 93.
     """
     contacts, pairs, rows = _largest_demand(model, plane=plane)
     contact_share, row_share = (1 / 2, 1.0) if plane else (1 / 4, 4 / 5)
-    # A few worlds alone may need all of the contacts at once.
+    # A few worlds may need all of their contacts at once.
     shared = num_envs * max(pairs, math.ceil(contact_share * contacts)) + min(num_envs, 16) * contacts
     return config.contacts * num_envs or shared, config.rows or math.ceil(row_share * rows)
 
 
 def _largest_demand(model: "mujoco.MjModel", *, plane: bool) -> tuple[int, int, int]:
-    """Contacts, pairs of geoms and constraint rows of one world in which all geoms touch that can touch each other.
+    """Contacts, pairs of geoms and constraint rows of one world in which all geoms that can touch each other do.
 
     A sphere touches anything in one point, a capsule a plane or another capsule in two; on a height field the
     simulator keeps four of each. A contact without friction takes one row, one on a pyramid of four edges four, a joint
@@ -204,7 +204,7 @@ def _largest_demand(model: "mujoco.MjModel", *, plane: bool) -> tuple[int, int, 
 
 
 def _pairs(model: "mujoco.MjModel") -> np.ndarray:
-    """Geoms that can touch each other by their bits and on bodies that move against each other, shape (pairs, 2)."""
+    """Geoms whose bits let them touch each other, on bodies that move against each other, shape (pairs, 2)."""
     first, second = np.triu_indices(model.ngeom, 1)
     wanted = (model.geom_contype[first] & model.geom_conaffinity[second]) != 0
     wanted |= (model.geom_contype[second] & model.geom_conaffinity[first]) != 0

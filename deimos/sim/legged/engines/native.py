@@ -1,6 +1,6 @@
-"""The engine of CPUs: ``mujoco.batch``, MuJoCo's own C code on a pool of threads. Nothing has to be compiled.
+"""The engine for CPUs: ``mujoco.batch``, MuJoCo's own C code on a pool of threads. Nothing has to be compiled.
 
-The bits are the same for any number of threads. Between control steps the state is in single precision, like
+Results are bit-identical for any number of threads. Between control steps the state is in single precision, like
 mujoco-warp's; MuJoCo computes in double precision from there.
 """
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     import mujoco
     from mujoco.batch import Batch
 
-GRAIN = 64  # worlds that are worth waking a thread for; no two threads write to the same cache line then
+GRAIN = 64  # worlds that are worth waking a thread for; a multiple keeps threads from writing to the same cache line
 SLOTS = 4  # contacts of a geom with the ground that are kept, those with the largest forces; mujoco-warp keeps as many
-LARGEST_FORCES = 2  # how a contact sensor chooses; MuJoCo has a number for it and no name
+LARGEST_FORCES = 2  # how a contact sensor chooses; MuJoCo has no name for this number
 WARNINGS = (
     ("INERTIA", "the inertia of the robot is close to singular"),
     ("CONTACTFULL", "there were more contacts than the arena holds; raise memory of the robot's spec"),
@@ -38,11 +38,11 @@ WARNINGS = (
     ("BADQACC", "an acceleration was not finite, or beyond 1e10"),
     ("BADCTRL", "a target angle was not finite, or beyond 1e10"),
 )
-"""MuJoCo's warnings, by their number; a world that gets one is not simulated to the end of the control step."""
+"""MuJoCo's warnings, in order; a world that gets one is not simulated to the end of the control step."""
 
 
 class Engine(Physics):
-    """See ``Physics`` and ``build``. It has as many threads as torch has when it is made."""
+    """See ``Physics`` and ``build``. It gets as many threads as torch has when it is built."""
 
     def __init__(
         self, robot: Robot, terrain: Terrain | None, num_envs: int, device: torch.device, config: PhysicsConfig, *,
@@ -51,9 +51,9 @@ class Engine(Physics):
         import mujoco
 
         if device.type != "cpu":
-            raise ValueError(f"engine must be warp on {device}, got native; take --env.engine warp, or --device cpu.")
+            raise ValueError(f"engine must be warp on {device}, got native; use --env.engine warp, or --device cpu.")
         # Warnings are counted per world and explained by this engine; MuJoCo itself would also write them to a file in
-        # the working directory. Whoever has a handler keeps it.
+        # the working directory. An existing handler is kept.
         if mujoco.get_mju_user_warning() is None:
             mujoco.set_mju_user_warning(lambda message: None)
         self.robot, self.terrain, self.config = robot, terrain, config
@@ -80,7 +80,7 @@ class Engine(Physics):
         self._batch.expand("geom_friction")[:, feet, 0] = friction[:, None]
 
     def _set_payload(self, model: "mujoco.MjModel", payload: np.ndarray) -> None:
-        """Change the base's mass, its inertia in proportion, and what follows from them."""
+        """Change the base's mass, its inertia in proportion, and what depends on them."""
         base = model.jnt_bodyid[0]
         share = 1.0 + payload / model.body_mass[base]
         self._batch.expand("body_mass")[:, base] *= share
@@ -88,7 +88,7 @@ class Engine(Physics):
         self._batch.set_const()
 
     def _join(self, model: "mujoco.MjModel", part: list[int]) -> None:
-        """Make the arrays of the kernels, and show the kernels MuJoCo's memory."""
+        """Make the arrays for the kernels, and give the kernels MuJoCo's memory."""
         batch, shape = self._batch, (self.num_envs, self.config.substeps, model.nsensordata)
         self._contact = np.zeros(shape)
         memory = {
@@ -140,7 +140,7 @@ class Engine(Physics):
         return step
 
     def bare_step(self) -> None:
-        """See ``Physics.bare_step``; the contact forces of every substep are a part of it."""
+        """See ``Physics.bare_step``; it includes the contact forces of every substep."""
         self._simulate()
 
     def _simulate(self) -> None:
@@ -149,7 +149,7 @@ class Engine(Physics):
 
         try:
             self._batch.rollout(self.config.substeps, record=("sensordata",), out={"sensordata": self._contact})
-        except batch.SimulationError as error:  # those worlds are where they were
+        except batch.SimulationError as error:  # those worlds have not moved
             world = int(error.ids[0])
             reason = " ".join(self._batch.error(world).split())
             raise SimulationError(f"World {world}: MuJoCo stops with '{reason}'.") from error
@@ -159,7 +159,7 @@ class Engine(Physics):
         reset_rows(mask, self._rows, self.arrays)
 
     def report(self) -> dict[str, float]:
-        """See ``Physics.report``: there are no buffers to speak of."""
+        """See ``Physics.report``: there are no buffers to report."""
         return {}
 
     def explain_loss(self, bits: int) -> str:
@@ -168,16 +168,16 @@ class Engine(Physics):
 
 
 def _divide(num_envs: int, threads: int) -> tuple[slice, ...]:
-    """Worlds in as many parts as there are threads, of ``GRAIN`` or a multiple each, the last one apart."""
+    """Divide worlds into at most as many parts as threads, each a multiple of ``GRAIN`` except for the last."""
     size = -(-num_envs // (threads * GRAIN)) * GRAIN
     return tuple(slice(start, min(start + size, num_envs)) for start in range(0, num_envs, size))
 
 
 def _watch_contacts(spec: "mujoco.MjSpec", robot: Robot, *, plane: bool) -> list[int]:
-    """Give every geom that is watched a sensor of its contacts with the ground, and the model no other sensors.
+    """Give every watched geom a sensor of its contacts with the ground, and the model no other sensors.
 
     Returns:
-        The part of every contact that they report, in their order.
+        The part of every contact that they report, in order.
     """
     import mujoco
 
@@ -198,15 +198,15 @@ def _watch_contacts(spec: "mujoco.MjSpec", robot: Robot, *, plane: bool) -> list
 
 
 def _set_options(model: "mujoco.MjModel") -> None:
-    """The options that only this engine has."""
+    """Set the options that only this engine has."""
     import mujoco
 
     off = mujoco.mjtDisableBit
-    # One robot is one island of few geoms: to look for islands and to sort geoms costs more than it saves. A world that
-    # is not finite stays so, to be found and reset like all others.
+    # A robot is one island of few geoms: finding islands and sorting geoms costs more than it saves. A world that is
+    # not finite stays so, to be found and reset like all others.
     model.opt.disableflags |= int(off.mjDSBL_ISLAND | off.mjDSBL_MIDPHASE | off.mjDSBL_AUTORESET)
-    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # Newton's solver errs on sparse ones in MuJoCo 4.0.0
-    model.opt.tolerance = 1e-6  # mujoco-warp's; what lies below is lost when the state becomes single precision
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # Newton's solver is wrong with sparse ones in MuJoCo 4.0.0
+    model.opt.tolerance = 1e-6  # mujoco-warp's; anything smaller is lost when the state is rounded to single precision
 
 
 def _make_batch(model: "mujoco.MjModel", num_envs: int) -> "Batch":
@@ -222,18 +222,18 @@ def _make_batch(model: "mujoco.MjModel", num_envs: int) -> "Batch":
         return Batch(model, num_envs, available())
     except ValueError as error:  # std::bad_alloc
         size = 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
-        raise MemoryError(f"a world takes {size / 1024:.1f} KiB and more") from error
+        raise MemoryError(f"a world takes at least {size / 1024:.1f} KiB") from error
 
 
 def _own_fields(batch: "Batch") -> list[str]:
-    """Names of the model's fields of which every world has its own."""
+    """Names of the model's fields that every world has its own copy of."""
     from mujoco.batch import MODEL_FIELDS
 
     return sorted(name for name in MODEL_FIELDS if batch.expanded(name) is not None)
 
 
 def _view(array: np.ndarray, dtype: Any) -> wp.array:
-    """A Warp array of a NumPy array's memory, which has to outlive it."""
+    """A Warp array in a NumPy array's memory, which must outlive it."""
     axes = array.ndim - len(getattr(dtype, "_shape_", ()))
     return wp.array(
         ptr=array.ctypes.data, dtype=dtype, shape=array.shape[:axes], strides=array.strides[:axes], device="cpu"

@@ -1,7 +1,7 @@
 """Legged robots, built in code from published numbers: one file, one robot, which ``--env.robot`` finds by its name.
 
-A robot's file holds ``build(*, stiffness, damping, action_scale) -> Robot``, three numbers that all have defaults. What
-has an MJCF needs no code: see ``deimos.sim.legged.robot_file``.
+A robot's file holds ``build(*, stiffness, damping, action_scale) -> Robot``, three numbers that all have defaults. A
+robot with an MJCF needs no code: see ``deimos.sim.legged.robot_file``.
 """
 
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     import mujoco
 
 # Time constant [s] and damping ratio of contacts (solref); mjlab's. With MuJoCo's 0.02 s the centre of a landing foot
-# gets below the surface of a height field, where float32 sometimes finds a depth of metres.
+# goes below the surface of a height field, where float32 sometimes yields a depth of metres.
 CONTACT_STIFFNESS = (0.01, 1.0)
 VISUAL_GROUP = 2  # geoms of this group are visual: the simulation leaves them out
 COLLISION_GROUP = 3  # MuJoCo's viewers hide this group by default
-TERRAIN_BIT, ROBOT_BIT = 1, 2  # contype and conaffinity: robots touch the terrain, and of themselves what asks for it
+TERRAIN_BIT, ROBOT_BIT = 1, 2  # contype and conaffinity: robots touch the terrain, and themselves only where asked
 
 Vector = tuple[float, float, float]
 
@@ -28,7 +28,7 @@ class Joint:
     pose: float
     """Angle at an action of zero [rad]."""
     action_scale: float
-    """What an action of one adds to the target angle [rad]."""
+    """What an action of 1 adds to the target angle [rad]."""
     range: tuple[float, float]
     """Lowest and highest angle [rad]."""
     stiffness: float
@@ -50,20 +50,20 @@ class Arm:
     """An arm on the base, for goals of its end effector."""
 
     offsets: tuple[Vector, ...]
-    """Place of every joint, then of the end effector, in the frame before it [m]; the first is in the base."""
+    """Position of every joint, then of the end effector, in the frame before it [m]; the first is in the base's."""
     axes: tuple[Vector, ...]
     """Axis of every joint, in its frame."""
     shoulder: Vector
-    """What goals are relative to, in the base [m]."""
+    """Origin of the goals, in the base's frame [m]."""
     body: tuple[Vector, Vector]
-    """Corners of the box in the base that goals keep out of [m]."""
+    """Corners of the box that goals stay out of, in the base's frame [m]."""
     radius: float
-    """How far goals stay away from that box and from the ground [m]."""
+    """Distance that goals keep from that box and from the ground [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """A robot with a floating base, and what a task and a deployment have to know about it.
+    """A robot with a floating base, and what a task and a deployment need to know about it.
 
     The first twelve joints are those of the four legs, leg by leg in the order front left, front
     right, rear left, rear right, each hip, thigh, calf; an arm adds its joints after them.
@@ -79,8 +79,8 @@ class Robot:
     standing_height: float
     """Height of the base above flat ground in ``pose`` [m]."""
     spawn_height: float
-    """Height of the base above the highest ground below it where an episode starts [m]: whatever the joints' angles at
-    a reset, no foot is in the ground."""
+    """Height of the base above the highest ground below it at the start of an episode [m]: no foot is in the ground,
+    whatever the joints' angles at a reset."""
     reach: float
     """Largest horizontal distance of a foot from the base's origin at a reset [m]."""
     arm: Arm | None = None

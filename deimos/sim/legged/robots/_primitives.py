@@ -1,4 +1,4 @@
-"""What robots are built of: bodies from numbers, actuators, shapes that collide and shapes that are visual."""
+"""Building blocks of robots: bodies from numbers, actuators, shapes that collide and visual shapes."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -8,7 +8,7 @@ from deimos.sim.legged.robots import COLLISION_GROUP, CONTACT_STIFFNESS, VISUAL_
 if TYPE_CHECKING:
     import mujoco
 
-HOLD = 1e7  # [N s/m] and [N m s/rad]; under its robot's whole weight a base moves 0.3 mm in 20 s
+HOLD = 1e7  # [N s/m] and [N m s/rad]; under the robot's whole weight a base moves 0.3 mm in 20 s
 
 
 def add_inertia(body: "mujoco.MjsBody", mass: float, centre: tuple, inertia: tuple) -> None:
@@ -49,7 +49,7 @@ def add_visual(
     body: "mujoco.MjsBody", shape: str, size: tuple, pos: tuple, rgba: tuple,
     *, quat: tuple = (1.0, 0.0, 0.0, 0.0), end: tuple | None = None,
 ) -> None:  # fmt: skip
-    """Add a shape that is seen and touches nothing."""
+    """Add a shape that is visible and touches nothing."""
     import mujoco
 
     geom = body.add_geom(
@@ -60,10 +60,10 @@ def add_visual(
 
 
 def hold_base(robot: Robot) -> Robot:
-    """The robot with its base held wherever it is put, with legs that touch nothing; its ``spec`` is changed in place.
+    """The robot with its base held where it is put, and legs that touch nothing; its ``spec`` is changed in place.
 
-    The free joint is damped until it stands still, which unlike a weld holds every world where that world was put. For
-    tests of an arm alone.
+    The free joint is damped to a standstill, which unlike a weld holds each world's base where it was put. For tests of
+    an arm alone.
     """
     robot.spec.worldbody.first_body().first_joint().damping = (HOLD, 0.0, 0.0)
     for part in robot.parts[1:]:

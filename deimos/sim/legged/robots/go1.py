@@ -5,15 +5,15 @@ Where the numbers come from:
 * Lengths, masses, centres of mass, inertias, joint ranges, torque limits and rotor inertias:
   ``unitree_go1/go1.xml`` of MuJoCo Menagerie, as mjlab 1.6 ships it; 12.743 kg in all. (Unitree's
   ``go1_description`` says 12.013 kg and has other inertias.)
-* Collision: the feet's radius is Menagerie's and the limbs' capsules are thickened from its own. The
+* Collision: the feet's radius is Menagerie's and the limbs' capsules are its own, thickened. The
   trunk is two capsules that fill mjlab's box of (0.26, 0.18, 0.1) m: mujoco-warp keeps at most 50 contacts of a
   geom with the prisms of a height field, and on cells of 0.05 m a box, or longer capsules, have more.
-* The hips are balls of mjlab's radius, where they stick out of the trunk: a Go1 that lies on its side touches the
+* The hips are spheres of mjlab's radius, where they stick out of the trunk: a Go1 that lies on its side touches the
   ground with them. They are watched as parts of the base, since the thesis counts "any part of the robot's base"
   as a crash and a hip holds the trunk's motors; without them a robot on its side rested on thighs and calves and
   did not crash.
 * Gains: those of the Unitree A1 in Legged Gym (20 N m/rad, 0.5 N m s/rad) raised by half, since a Go1
-  is heavier; the default pose is the A1's, with the rear thighs as the front ones so that it stands level.
+  is heavier; the default pose is the A1's, with the rear thighs like the front ones so that it stands level.
 """
 
 from typing import TYPE_CHECKING
@@ -63,7 +63,7 @@ def build(*, stiffness: float = STIFFNESS, damping: float = DAMPING, action_scal
     Args:
         stiffness: Position gain of every joint [N m/rad].
         damping: Velocity gain of every joint [N m s/rad].
-        action_scale: What an action of one adds to a target angle [rad].
+        action_scale: What an action of 1 adds to a target angle [rad].
     """
     import mujoco
 
@@ -134,7 +134,7 @@ def _add_leg(trunk: "mujoco.MjsBody", leg: str) -> None:
 
 
 def _add_trunk_geoms(trunk: "mujoco.MjsBody") -> None:
-    """Add the trunk's two capsules and the head's sphere, and what they look like."""
+    """Add the trunk's two capsules and the head's sphere, and their visual shapes."""
     for name, y in (("trunk_left", 0.04), ("trunk_right", -0.04)):
         _collide(trunk, name, 0.05, (-0.08, y, 0.0), (0.08, y, 0.0))
     _collide(trunk, "head", 0.06, (0.24, 0.0, 0.0))
@@ -148,7 +148,7 @@ def _add_trunk_geoms(trunk: "mujoco.MjsBody") -> None:
 
 
 def _add_leg_visuals(hip: "mujoco.MjsBody", thigh: "mujoco.MjsBody", calf: "mujoco.MjsBody", left: int) -> None:
-    """Add what a leg looks like: two motor discs, a tapering thigh, a thin calf and a rubber foot."""
+    """Add the visual shapes of a leg: two motor discs, a tapering thigh, a thin calf and a rubber foot."""
     add_visual(hip, "cylinder", (0.046, 0.03, 0.0), (0.0, 0.0, 0.0), DARK, quat=(0.70711, 0.0, 0.70711, 0.0))
     add_visual(hip, "cylinder", (0.046, 0.02, 0.0), (0.0, left * 0.035, 0.0), LIGHT, quat=ALONG_Y)
     add_visual(

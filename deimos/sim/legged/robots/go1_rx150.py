@@ -1,18 +1,18 @@
-"""A Unitree Go1 with a ReactorX-150 of Interbotix, an arm of five joints, on its trunk.
+"""A Unitree Go1 with Interbotix's ReactorX-150, an arm with five joints, on its trunk.
 
 Where the numbers come from:
 
 * Offsets, ranges, masses, centres of mass and inertias: ``rx150.urdf.xacro`` of Interbotix's
-  ``interbotix_ros_manipulators``, each link's inertia turned into the link's own axes; 1.772 kg in all.
+  ``interbotix_ros_manipulators``, each link's inertia rotated into the link's own axes; 1.772 kg in all.
   Its three frame-only links have a dummy inertia of 0.001 kg m^2 each, dozens of times the gripper's:
   they are left out. The gripper is one body, its fingers fixed half-way.
 * Torque limits: what the servos can give (an XM430-W350 4.1 N m, an XL430-W250 1.4 N m), where the URDF
-  claims up to 18 N m; 1 N m for the last joint, as the URDF says.
-* Gains, armature and drag: between what others give servos of this kind (MuJoCo Menagerie's Robotis OP3 has
+  claims up to 18 N m; 1 N m for the last joint, as in the URDF.
+* Gains, armature and drag: between what others use for servos of this kind (MuJoCo Menagerie's Robotis OP3 has
   21 N m/rad, 1.1 N m s/rad and 0.045 kg m^2) and the 5 N m/rad of *Deep Whole-Body Control*. Most of the damping is
-  drag that the torque limit does not cut, since a motor's back-EMF limits its speed. The URDF's dry friction of
+  drag that the torque limit does not clip, since a motor's back-EMF limits its speed. The URDF's dry friction of
   0.1 N m is left out: five more constraint rows in every world cost a tenth of the speed.
-* The place on the trunk: Fu, Cheng and Pathak, *Deep Whole-Body Control* (CoRL 2022), put the base of a WidowX
+* The position on the trunk: Fu, Cheng and Pathak, *Deep Whole-Body Control* (CoRL 2022), put the base of a WidowX
   on the top of a Go1's trunk there.
 """
 
@@ -38,13 +38,13 @@ OFFSETS = (
     (0.093575, 0.0, 0.0),
 )  # [m]: of every joint from the frame before it, then of the end effector
 SHOULDER = (0.03, 0.0, 0.16157)  # [m], of the shoulder's axis in the trunk
-GRIPPER_RADIUS = 0.035  # [m], of what must not touch anything, about the end effector too
-# Corners of a Go1's trunk with head and hips [m], in the trunk: goals keep out of it, and of what is below it.
+GRIPPER_RADIUS = 0.035  # [m], of the part that must not touch anything, also around the end effector
+# Corners of a Go1's trunk with head and hips [m], in the trunk: goals stay out of it, and of the space below it.
 BODY = ((-0.24, -0.15, -math.inf), (0.30, 0.15, 0.06))
 MASS = 1.772  # [kg]
 
-# Each is mass [kg], centre of mass [m], inertia about it (xx, yy, zz, xy, xz, yz) [kg m^2]: of the base, and of what
-# every joint moves.
+# Each is mass [kg], centre of mass [m], inertia about it (xx, yy, zz, xy, xz, yz) [kg m^2]: of the base, and of the
+# link that each joint moves.
 BASE = (0.766135, (-0.03545, -0.00336, 0.02534), (1.357e-3, 3.354e-3, 4.111e-3, 1.247e-4, -2.102e-4, 1.105e-5))
 LINKS = (
     (0.257774, (-0.00013, -0.00018, 0.00795), (2.226e-4, 2.195e-4, 2.898e-4, 0.0, 0.0, 0.0)),
@@ -60,27 +60,27 @@ MAX_TORQUE = (4.1, 4.1, 4.1, 1.4, 1.0)  # [N m]
 STIFFNESS = (15.0, 15.0, 15.0, 5.0, 5.0)  # [N m/rad]
 DAMPING = (0.25, 0.25, 0.25, 0.18, 0.24)  # [N m s/rad], within the torque limit
 ARMATURE = (0.02, 0.02, 0.02, 0.005, 0.005)  # [kg m^2]
-# [N m s/rad], of every joint, whatever the torque: at full torque a servo turns as fast as it can without a load,
-# about 4.8 rad/s (XM430) and 6.4 rad/s (XL430). Below the limit the two dampings add up.
+# [N m s/rad], of every joint, whatever the torque: at full torque a servo turns at its no-load speed, about 4.8 rad/s
+# (XM430) and 6.4 rad/s (XL430). Below the limit the two dampings add up.
 DRAG = (0.85, 0.85, 0.85, 0.22, 0.16)
 POSE = (0.0, -0.9, 0.9, 0.3, 0.0)  # [rad], half folded
 ACTION_SCALE = 0.5  # [rad]
 
-# What of the arm collides, capsules along x in their frames: body, radius, from, to [m].
+# The arm's collision shapes, capsules along x in their frames: body, radius, from, to [m].
 CAPSULES = {"forearm": ("arm_forearm", 0.025, 0.0, 0.15), "gripper": ("arm_gripper", GRIPPER_RADIUS, -0.045, 0.09)}
-# What these alone touch: two capsules that fill trunk, head and hip motors, and a ball within the arm's base: radius,
+# What only these touch: two capsules that fill trunk, head and hip motors, and a sphere within the arm's base: radius,
 # from, to [m], in the trunk.
 GUARDS = {
     "guard_left": (0.05, (-0.18, 0.04, 0.0), (0.24, 0.04, 0.0)),
     "guard_right": (0.05, (-0.18, -0.04, 0.0), (0.24, -0.04, 0.0)),
     "guard_base": (0.05, (0.02, 0.0, 0.107), None),
 }
-GUARD_BIT = 4  # of the contype of guards and of the conaffinity of the arm
+GUARD_BIT = 4  # in the contype of guards and in the conaffinity of the arm
 
 BLACK, GREY, STEEL = (0.08, 0.08, 0.09, 1.0), (0.22, 0.23, 0.25, 1.0), (0.62, 0.64, 0.67, 1.0)
 ALONG_Z, ALONG_Y, ALONG_X = (1.0, 0.0, 0.0, 0.0), (0.70711, 0.70711, 0.0, 0.0), (0.70711, 0.0, 0.70711, 0.0)
-# What every body looks like, servos in black between brackets in grey: shape, half sizes (of a cylinder radius and half
-# length) [m], place [m], orientation, colour.
+# Visual shapes of every body, servos in black between brackets in grey: shape, half sizes (for a cylinder radius and
+# half length) [m], position [m], orientation, colour.
 LOOK = {
     "arm_base": (
         ("box", (0.085, 0.05, 0.004), (-0.035, 0.0, 0.0), ALONG_Z, GREY),
@@ -138,8 +138,8 @@ def build(
 def mount(robot: Robot) -> Robot:
     """The robot with the arm on its trunk; joints and actuators of the arm come after its own.
 
-    Forearm and gripper touch the trunk, and the terrain, where touching counts as it does for the base: it is a crash.
-    Shoulder and upper arm touch nothing: who falls on them falls on the forearm or the trunk, too.
+    Forearm and gripper touch the trunk and the terrain; touching the terrain is a crash, as for the base. Shoulder and
+    upper arm touch nothing: a robot that falls on them also falls on the forearm or the trunk.
 
     Args:
         robot: The Go1 to mount the arm on. Its ``spec`` is changed in place.
@@ -174,7 +174,7 @@ def _axis(i: int) -> Vector:
 
 
 def _add_links(trunk: "mujoco.MjsBody") -> None:
-    """Add the base, the chain of bodies and joints, what they look like, and the end effector's site."""
+    """Add the base, the chain of bodies and joints, their visual shapes, and the end effector's site."""
     body = trunk.add_body(name="arm_base", pos=MOUNT)
     add_inertia(body, *BASE)
     _dress(body)
@@ -200,6 +200,6 @@ def _add_collisions(spec: "mujoco.MjSpec", trunk: "mujoco.MjsBody") -> None:
 
 
 def _dress(body: "mujoco.MjsBody") -> None:
-    """Add what a body looks like."""
+    """Add the visual shapes of a body."""
     for shape, size, pos, quat, rgba in LOOK[body.name]:
         add_visual(body, shape, size, pos, rgba, quat=quat)
