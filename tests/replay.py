@@ -5,13 +5,17 @@ it was recorded, and its results go where they went then. Random numbers are dra
 knows. So whatever changes from one time to the next, and is no tensor that is written in place, stays what it was.
 """
 
+from collections import Counter
+from contextlib import contextmanager
+
 import torch
 import warp as wp
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from deimos.goals import core
 from deimos.nn import mlps, random
-from deimos.run import loop
 from deimos.sim import graphs
 
 WAITING = {
@@ -19,6 +23,8 @@ WAITING = {
     "bincount", "equal", "is_nonzero", "multinomial", "_linalg_check_errors", "histc",
 }  # fmt: skip
 """Operations that wait for CUDA: they give the host a number, or a size that depends on numbers."""
+READING = {"tolist", "numpy", "cpu", "item", "__array__", "__bool__", "__int__", "__float__", "__index__"}
+"""Methods of tensors that hand numbers to the host; on a CPU not all of them come by an operation."""
 
 
 def waits(func, args):
@@ -30,6 +36,44 @@ def waits(func, args):
         return True
     masks = args[1] if name in ("index", "index_put", "index_put_", "_index_put_impl_") else ()
     return any(mask is not None and mask.dtype == torch.bool for mask in masks)
+
+
+class Calls(TorchDispatchMode):
+    """Counts operations by name, those that start work apart from views, and finds those that wait for a GPU."""
+
+    def __init__(self):
+        super().__init__()
+        self.work, self.views, self.waits = Counter(), Counter(), Counter()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        """Take note of an operation, and run it."""
+        name = func.overloadpacket.__name__
+        (self.views if func.is_view or name == "_unsafe_view" else self.work)[name] += 1
+        if waits(func, args):
+            self.waits[name] += 1
+        return func(*args, **(kwargs or {}))
+
+
+class Reads(TorchFunctionMode):
+    """Finds methods of tensors that hand numbers to the host."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = Counter()
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        """Take note of a call, and make it."""
+        if getattr(func, "__name__", "") in READING:
+            self.found[func.__name__] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def counted():
+    """Counts calls within; what waits is in ``waits``."""
+    with Reads() as reads, Calls() as calls:
+        yield calls
+    calls.waits += reads.found
 
 
 class Replay(TorchDispatchMode):
@@ -99,7 +143,7 @@ def as_on_gpu(monkeypatch):
     """Let torch compute on a CPU what it does on CUDA: products, random numbers, goals of all worlds at once."""
     monkeypatch.setattr(mlps, "_kernel", lambda nets: None)
     monkeypatch.setattr(random, "philox", random._rounds)
-    monkeypatch.setattr(loop, "AS_ON_GPU", True)
+    monkeypatch.setattr(core, "AS_ON_GPU", True)
 
 
 def replay_on_cpu(monkeypatch):

@@ -1,16 +1,13 @@
 """What an iteration asks of a GPU, counted on a CPU: calls of torch, launches of Warp, and waits for the device."""
 
 from collections import Counter
-from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
 import replay
 import torch
 import warp as wp
-from replay import waits
-from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode
+from replay import counted
 
 from deimos.goals import methods
 from deimos.learn.ppo import PPOConfig
@@ -18,8 +15,6 @@ from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs import particle
 
 CPU = torch.device("cpu")
-READING = {"tolist", "numpy", "cpu", "item", "__array__", "__bool__", "__int__", "__float__", "__index__"}
-"""Methods of tensors that hand numbers to the host; on a CPU not all of them come by an operation."""
 BUDGET = {"uniform": (52, 5), "p75": (67, 5)}
 """Calls of torch that start work on the device, and launches of Warp, in a step of a rollout with goals of a method."""
 VIEWS = {"uniform": 37, "p75": 61}
@@ -28,44 +23,6 @@ NOISE = 137
 """Calls for the exploration of a whole rollout."""
 MINIBATCH, MINIBATCH_VIEWS = 127, 53
 """Calls in a minibatch of the update, under torch's products."""
-
-
-class Calls(TorchDispatchMode):
-    """Counts operations by name, those that start work apart from views, and finds those that wait for a GPU."""
-
-    def __init__(self):
-        super().__init__()
-        self.work, self.views, self.waits = Counter(), Counter(), Counter()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        """Take note of an operation, and run it."""
-        name = func.overloadpacket.__name__
-        (self.views if func.is_view or name == "_unsafe_view" else self.work)[name] += 1
-        if waits(func, args):
-            self.waits[name] += 1
-        return func(*args, **(kwargs or {}))
-
-
-class Reads(TorchFunctionMode):
-    """Finds methods of tensors that hand numbers to the host."""
-
-    def __init__(self):
-        super().__init__()
-        self.found = Counter()
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        """Take note of a call, and make it."""
-        if getattr(func, "__name__", "") in READING:
-            self.found[func.__name__] += 1
-        return func(*args, **(kwargs or {}))
-
-
-@contextmanager
-def counted():
-    """Counts calls within; what waits is in ``waits``."""
-    with Reads() as reads, Calls() as calls:
-        yield calls
-    calls.waits += reads.found
 
 
 @pytest.fixture

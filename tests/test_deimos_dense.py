@@ -8,7 +8,7 @@ import pytest
 import torch
 from states import leaves
 
-from deimos.goals import methods
+from deimos.goals import core, methods
 from deimos.goals.interactions import assign
 from deimos.goals.selector import GoalSelector, uniform_proposal
 from deimos.goals.selectors import mix, rnd
@@ -61,7 +61,7 @@ def differences(found, expected):
 def hold_to_each_other(config, monkeypatch, iterations):
     """Train twice, once as a GPU does, and compare all that there is; gives what ``run`` gave in that case."""
     listed, rows, goals, cut_off = run(config, iterations)
-    monkeypatch.setattr(loop, "AS_ON_GPU", True)
+    monkeypatch.setattr(core, "AS_ON_GPU", True)
     dense, dense_rows, dense_goals, dense_cut_off = run(config, iterations)
     assert torch.equal(dense_goals, goals)
     assert torch.equal(dense_cut_off, cut_off)
@@ -128,7 +128,7 @@ class Counting(GoalSelector):
 @pytest.mark.parametrize("dense", [False, True])
 def test_a_selector_is_asked_about_due_worlds_alone_unless_it_allows_more(dense, monkeypatch):
     """Whoever does not say that it may be asked about all worlds, or has a guard, is asked about those that are due."""
-    monkeypatch.setattr(loop, "AS_ON_GPU", True)
+    monkeypatch.setattr(core, "AS_ON_GPU", True)
     monkeypatch.setattr(Counting, "dense", dense)
     for guard in (None, lambda env, rows, goal: goal):
         env = particle.Config(goal_period=5).build(8, CPU, 0)

@@ -206,3 +206,13 @@ def test_options_that_do_not_fit_are_refused(capfd):
     }.items():
         assert cli.main(["doctor", *arguments.split()]) == 2
         assert re.search(message, capfd.readouterr().err)
+
+
+def test_the_stage_of_waits_steps_a_director_that_does_not_wait(monkeypatch):
+    """What the stage asks CUDA about runs, on both clocks, and reads nothing from the device."""
+    replay.as_on_gpu(monkeypatch)
+    step = gpu_stages.directed(16, CPU)
+    for _ in range(12):
+        with replay.counted() as calls:
+            step()
+        assert not calls.waits

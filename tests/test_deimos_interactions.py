@@ -351,8 +351,8 @@ def test_what_was_executed_is_what_comes_back(torch_device):
     """Where a world pursued another goal than was issued, that one is learnt from; the others keep theirs."""
     interactions = make_interactions(3, torch_device)
     issue(interactions, [0, 1, 2], [0.0, 1.0, 2.0], torch_device)
-    executed = torch.tensor([[7.0, 8.0]], device=torch_device)
-    interactions.execute(torch.tensor([1], device=torch_device), executed)
+    executed = torch.tensor([7.0, 8.0], device=torch_device).expand(3, 2)
+    interactions.execute(torch.tensor([False, True, False], device=torch_device), executed)
     advance(interactions, make_step(3, torch_device, goal_due=[0, 1, 2]))
     resolved = interactions.resolved()
     assert resolved.next_goal.tolist() == [[0.5, 0.5], [7.0, 8.0], [2.5, 2.5]]
@@ -375,7 +375,7 @@ def test_what_is_stored_carries_no_gradient(torch_device):
     sizes = (STATE_DIM, GOAL_DIM, GOAL_DIM)
     parts = [torch.zeros(2, size, device=torch_device, requires_grad=True) for size in sizes]
     interactions.open(rows, *parts, 2 * score, horizon=3)
-    interactions.execute(rows, 2 * parts[2])
+    interactions.execute(rows >= 0, 2 * parts[2])
     step = make_step(2, torch_device, goal_due=[0, 1])
     step.reward.requires_grad_()
     advance(interactions, step)

@@ -17,9 +17,12 @@ from pathlib import Path
 import pytest
 import torch
 from states import assert_same
+from taught_selectors import SPACES
 
 import deimos
 from deimos.checks import RunError, SimulationError
+from deimos.goals import interactions, methods
+from deimos.goals.core import GoalCore
 from deimos.goals.fear import FearConfig
 from deimos.goals.selectors import director
 from deimos.learn.ppo import PPOConfig
@@ -213,6 +216,20 @@ def test_something_was_learnt(one):
     assert rows["rnd"][0]["rnd/loss"] > 0
     assert rows["plr"][0]["plr/filled"] > 0
     assert rows["grid"][1]["grid/weight_0"] != rows["grid"][0]["grid/weight_0"]
+
+
+@pytest.mark.parametrize(("name", "times"), [("uniform", 0), ("cl", 2), ("p25", 3), ("rnd", 5)])
+def test_only_what_a_selector_reads_is_sent(name, times, monkeypatch):
+    """Ranks exchange those parts of the interactions that a selector reads, once in an update, and Uniform none."""
+    sent = []
+    monkeypatch.setattr(interactions, "gather_rows", lambda rows: sent.append(rows) or rows)
+    core = GoalCore(methods.method(name).build(SPACES, 0), SPACES)
+    core.learn(None)
+    assert len(sent) == times
+    every = core.interactions.of_all_ranks()
+    every.resolved()
+    every.without_scores().resolved()
+    assert len(sent) == times + 2
 
 
 def test_a_resumed_run_is_the_undisturbed_one(both):

@@ -26,6 +26,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from deimos.goals.director import GoalDirector
 from deimos.run import training
 from deimos.run.config import to_dict
 from deimos.run.folder import RunFolder
@@ -125,16 +126,36 @@ def tests(device: torch.device, sizes: Sizes) -> dict[str, Any]:
 
 
 def waits(device: torch.device, sizes: Sizes) -> dict[str, Any]:
-    """Where rollouts under the Director wait for the GPU, which they must not, and where whole iterations do."""
+    """Where rollouts and a ``GoalDirector`` wait for the GPU, which they must not, and where whole iterations do."""
     if device.type != "cuda":
         raise Skipped("only CUDA says where it waits")
     trainer = Trainer(replace(_config(sizes.worlds), graph="off"), device)  # a graph that waits cannot be recorded
     for _ in range(5):
         trainer.iterate()
-    in_rollouts, in_iterations = (_waits_in(part) for part in (trainer.collect, trainer.iterate))
+    parts = (trainer.collect, trainer.iterate, directed(sizes.worlds, device))
+    in_rollouts, in_iterations, directed_ = (_waits_in(part) for part in parts)
     return {
-        "waits in a rollout": in_rollouts, "waits in an iteration": in_iterations, "passed": not in_rollouts
+        "waits in a rollout": in_rollouts, "waits in an iteration": in_iterations,
+        "waits in a GoalDirector's step": directed_, "passed": not (in_rollouts or directed_),
     }  # fmt: skip
+
+
+def directed(num_envs: int, device: torch.device) -> Callable[[], None]:
+    """A step of other people's loops: under a ``GoalDirector``'s clock, and under that of a command manager."""
+    options: dict[str, Any] = {"num_envs": num_envs, "state_dim": 9, "goal_dim": 3, "device": device}
+    options |= {"goal_box": ([-1.0] * 3, [1.0] * 3), "learn_every": 100}
+    own, theirs = GoalDirector("p75", 10, **options), GoalDirector("p75", max_horizon=10, **options)
+    state, never = torch.zeros(num_envs, 9, device=device), torch.zeros(num_envs, dtype=torch.bool, device=device)
+    rows = torch.arange(0, num_envs, 7, device=device)
+    goals = [director.propose(None, state, torch.zeros(num_envs, 3, device=device)) for director in (own, theirs)]
+
+    def step() -> None:
+        goals[0] = own.step(state, goals[0], never, never).goal
+        theirs.observe(never, never, executed=goals[1])
+        theirs.reset(rows[:1])
+        goals[1][rows] = theirs.propose(rows, state[rows], goals[1][rows])
+
+    return step
 
 
 def _waits_in(work: Callable[[], object]) -> dict[str, float]:

@@ -13,6 +13,13 @@ from deimos.nn.stateful import Stateful
 
 RING = 32 * 2**20  # bytes for resolved interactions where a world may have any number of them,
 SPARE = 8  # but at least this many of each world
+AS_ON_GPU = False
+"""Whether a CPU is treated as a device that the host has to wait for, as it has for a GPU: for tests."""
+
+
+def on_gpu(device: torch.device) -> bool:
+    """Whether the host has to wait for ``device`` to read a number: whether it is not the CPU."""
+    return AS_ON_GPU or device.type != "cpu"
 
 
 def window_between(goal_period: int, steps: int) -> int:
@@ -80,8 +87,9 @@ class GoalCore(Stateful):
         """Percentile of the active goal's fear among the candidates that it was chosen from, in [0, 100], shape
         (num_envs,): 50 for first goals and all other uniform ones, NaN where the selector has no fear to rank by."""
         self._delivered, self._steps = torch.zeros_like(self.weight), 0  # its sum since the last call of learn
-        self._everybody = torch.arange(spaces.num_envs, dtype=torch.int64, device=spaces.device)
-        self._nobody = self._everybody[:0]
+        self.everybody = torch.arange(spaces.num_envs, dtype=torch.int64, device=spaces.device)
+        """All worlds, int64, shape (num_envs,)."""
+        self._nobody = self.everybody[:0]
 
     def changes(self, terminated: Tensor, truncated: Tensor, due: Tensor) -> Changes:
         """What ``advance`` will return for a step; nothing is counted yet."""
@@ -118,7 +126,7 @@ class GoalCore(Stateful):
         self._steps += 1
         if dense:
             done = terminated | truncated
-            everybody, changing = self._everybody, due | done
+            everybody, changing = self.everybody, due | done
             self.interactions.resolve(everybody, terminated, due, changing)
             assign(self.percentile, everybody, 50.0, done)
             return Changes(everybody, everybody, everybody, done, changing ^ done)
@@ -143,8 +151,8 @@ class GoalCore(Stateful):
         """Choose the next goals of the listed worlds, and begin their interactions.
 
         For the arguments see ``GoalSelector.propose``; each world is listed once, and nothing is pending in it.
-        ``horizon`` holds the steps that each goal is to last, int64, shape (B,); ``None`` for T. In dense form ``rows``
-        are all worlds, and ``where`` says in which of them the goals are issued, bool, shape (num_envs,).
+        ``horizon`` holds the steps that each goal is to last, int64, shape (B,); ``None`` for T. ``where`` says in
+        which of ``rows`` the goals are issued, bool, shape (B,); see ``assign``.
 
         Returns:
             Goals, shape (B, goal_dim).

@@ -3,8 +3,8 @@
 import copy
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Generic, Literal
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,29 +15,17 @@ from deimos.goals import given
 from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore, window_between
 from deimos.goals.director_checks import check_candidates, check_options, placed, settings, unpacked
+from deimos.goals.faults import refuse_not_finite, refuse_unsound
 from deimos.goals.fear_selector import FearEstimate, fear_selector
-from deimos.goals.given import A, Array, Bound, Candidates, GoalBox, Inputs, Rows
+from deimos.goals.given import A, Array, Assignment, Bound, Candidates, GoalBox, Inputs, Rows
 from deimos.goals.horizons import Horizons
-from deimos.goals.interactions import Interactions
+from deimos.goals.interactions import Interactions, taken
 from deimos.goals.methods import method
 from deimos.goals.risk_map import RiskMap, grid
 from deimos.goals.selector import GoalSelector, SelectorConfig, Spaces, Transitions
 from deimos.nn.host import own_settings
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Assignment(Generic[A]):
-    """What every world pursues next; arrays or tensors, as the goals given to the step."""
-
-    goal: A
-    """Goals, shape (num_envs, goal_dim): the given ones except where ``changed``."""
-    changed: A
-    """True where the goal is a new one, bool, shape (num_envs,)."""
-    weight: A
-    """Weight of the transitions under the goal in everything that the learner learns, at least 0, shape (num_envs,);
-    1 under most selectors."""
 
 
 class GoalDirector:
@@ -51,6 +39,10 @@ class GoalDirector:
 
     All arguments may be NumPy arrays or torch tensors; results are of the kind and the dtype of ``goal``. It computes
     in float32, and keeps copies without gradients.
+
+    On a GPU, calls with tensors there do not wait for it, except for updates and ``state_dict`` and where worlds must
+    be counted: for a function of ``candidates`` in ``step``, for selectors that are not ``dense``. So numbers that do
+    not fit are refused only there, before anything is learnt from them or saved; shapes are refused at once.
 
     Args:
         selector: A selector's ``Config``, or the name of a method such as ``p25``.
@@ -179,7 +171,7 @@ class GoalDirector:
 
         Raises:
             ValueError: If a shape, a device or a number does not fit, or a goal is not the one that was given. Nothing
-                is counted then.
+                is counted then; for numbers on a GPU see the class.
             SimulationError: If a weight of a network is not finite after an update.
         """
         if self.goal_period is None:
@@ -193,20 +185,20 @@ class GoalDirector:
         check_candidates(candidates, inputs.num_envs, inputs, self._goal_box is not None)
         clocks = self._clocks or self._begin(inputs)
         unseen = None if self._choose_first and not self._next_step else crashed | cut_off
-        given.refuse_unsound("state", states, but=unseen)
-        given.refuse_unsound("goal", goals)
+        refuse_unsound("state", states, but=unseen, faults=inputs.faults)
+        refuse_unsound("goal", goals, faults=inputs.faults)
         if executed is None:
             clocks.refuse_other_goals(goals)
-        step = clocks.outcome(crashed, cut_off, own=True)
-        rows, new = step.rows, goals[:0]
-        offered = self._candidates(given.taken(candidates, rows), rows, goal) if len(rows) else None
+        step = clocks.outcome(crashed, cut_off, own=True, dense=clocks.dense and not callable(candidates))
+        rows, where, new = step.rows, step.where, goals[:0]
+        offered = self._candidates(given.taken(candidates, rows, where), rows, goal, where) if len(rows) else None
         clocks.advance(step, met, pursued)
         if offered is not None:
-            new = clocks.propose(rows, self._horizons.behind(states[rows]), goals[rows], offered, own=True)
+            seen, before = (taken(values, rows, where) for values in (self._horizons.behind(states), goals))
+            new = clocks.propose(rows, seen, before, offered, own=True, where=where)
         self._learn_if_due()
-        changed = torch.zeros(inputs.num_envs, dtype=torch.bool, device=inputs.device).index_fill_(0, rows, True)
         weight = given.like(clocks.core.weight.clone(), goal)
-        return Assignment(given.replaced(goal, rows, new), given.like(changed, goal), weight)
+        return Assignment(given.replaced(goal, rows, new, where), given.like(step.changed, goal), weight)
 
     @own_settings()
     @torch.no_grad()
@@ -222,7 +214,7 @@ class GoalDirector:
         crashed, cut_off, met, pursued = inputs.ends(terminated, truncated, tracking, executed)
         clocks = self._clocks or self._begin(inputs)
         self._learn_if_due()  # all proposals of the step before have been made by now
-        clocks.advance(clocks.outcome(crashed, cut_off, own=False), met, pursued)
+        clocks.advance(clocks.outcome(crashed, cut_off, own=False, dense=clocks.faults is not None), met, pursued)
 
     @own_settings()
     @torch.no_grad()
@@ -239,7 +231,7 @@ class GoalDirector:
             ValueError: If a world does not exist or is listed twice.
         """
         if self._clocks is not None:
-            self._clocks.reset(given.worlds(rows, len(self.weight), self.weight.device))
+            self._clocks.reset(given.marked(rows, len(self.weight), self.weight.device, self._clocks.faults))
 
     @own_settings()
     @torch.no_grad()
@@ -269,15 +261,15 @@ class GoalDirector:
         count, state_dim = given.matrix("state", state, "state_dim")
         num_envs = count if rows is None else None
         inputs = self._expected(state, num_envs, state_dim, given.matrix("goal", goal, "goal_dim")[1])
-        listed = given.worlds(rows, inputs.num_envs, inputs.device)
+        listed = given.worlds(rows, inputs.num_envs, inputs.device, count, inputs.faults)
         states, goals = inputs.states(state, len(listed)), inputs.goals(goal, len(listed))
-        lasts = self._horizons.steps(horizon, len(listed), inputs)
+        lasts = self._horizons.steps(horizon, listed, inputs)
         check_candidates(candidates, len(listed), inputs, self._goal_box is not None)
         clocks = self._clocks or self._begin(inputs)
         if not len(listed):
             return given.like(goals, goal)
-        given.refuse_unsound("state", states, listed, but=clocks.uniform(listed))
-        given.refuse_unsound("goal", goals, listed)
+        refuse_unsound("state", states, listed, clocks.uniform(listed), inputs.faults)
+        refuse_unsound("goal", goals, listed, faults=inputs.faults)
         clocks.refuse_other_goals(goals, listed)
         offered = self._candidates(candidates, listed, goal)
         clocks.end(listed)
@@ -303,6 +295,7 @@ class GoalDirector:
             SimulationError: If a weight of a network is no longer finite.
         """
         core = self._known.core
+        self._known.refuse_faults()
         given.check_transitions(rollout, core, self._learnt_at)
         self.metrics, self._learnt_at = core.learn(rollout), core.interactions.now
         core.selector.check()
@@ -329,12 +322,13 @@ class GoalDirector:
         afraid = fear_selector(self.selector)
         if afraid is None:
             raise ValueError(f"The selector must have a fear network, as a Director has; got {self._config}.")
-        inputs, count = self._expected(state, None, None, None), len(state)
+        inputs, count = replace(self._expected(state, None, None, None), faults=None), len(state)
         states, goals = inputs.states(state, count), inputs.goals(goal, count)
         new_goals = inputs.goals(new_goal, count, "new_goal")
         for name, numbers in (("state", states), ("goal", goals), ("new_goal", new_goals)):
-            given.refuse_not_finite(name, numbers, what="row")
-        lasts = self._horizons.steps(self.max_horizon if horizon is None else horizon, count, inputs)
+            refuse_not_finite(name, numbers, what="row")
+        rows = torch.arange(count, device=inputs.device)
+        lasts = self._horizons.steps(self.max_horizon if horizon is None else horizon, rows, inputs)
         return afraid.estimate(self._horizons.behind(states, lasts), goals, new_goals)
 
     def risk_map(
@@ -406,7 +400,7 @@ class GoalDirector:
             check_at_least(name, value, 1)
         device = self._device or (sample.device if isinstance(sample, Tensor) else torch.device("cpu"))
         columns = () if self._groups == (slice(None),) else (len(self._groups),)
-        return Inputs(worlds, states, goals, device, columns)
+        return Inputs(worlds, states, goals, device, columns, None if self._clocks is None else self._clocks.faults)
 
     @own_settings()
     @torch.inference_mode(False)  # what is made in a loop without gradients must also work outside it
@@ -423,7 +417,7 @@ class GoalDirector:
         self._device, self._sizes = inputs.device, [inputs.num_envs, inputs.state_dim, inputs.goal_dim]
         return self._clocks
 
-    def _candidates(self, candidates: Candidates, rows: Tensor, model: A) -> Tensor:
+    def _candidates(self, candidates: Candidates, rows: Tensor, model: A, where: Tensor | None = None) -> Tensor:
         """Candidates of the listed worlds, shape (m, N, goal_dim): given, made by a function, or drawn."""
         clocks, share = self._known, self.goal_range
         if candidates is None:
@@ -432,9 +426,10 @@ class GoalDirector:
         if callable(candidates):
             candidates = candidates(given.like(rows, model))
         offered = self._expected(rows, None, None, None).candidates(candidates, len(rows))
-        given.refuse_unsound("candidates", offered, rows)
+        but = None if where is None else ~where
+        refuse_unsound("candidates", offered, rows, but, clocks.faults)
         if self._box is not None:
-            self._box.check(offered, rows, share)
+            self._box.check(offered, rows, share, but, clocks.faults)
         return offered
 
     def _learn_if_due(self) -> None:
@@ -445,5 +440,7 @@ class GoalDirector:
             return
         for lack in given.lacking(core.selector, self._learnt_at > 0, tracked) if now == self.learn_every else ():
             _log.warning(lack)
-        if not core.selector.needs_rollout:
+        if core.selector.needs_rollout:
+            self._known.refuse_faults()
+        else:
             self.learn()

@@ -1,23 +1,37 @@
-"""What other people's loops hand over, as tensors: checked, without gradients, floats as float32."""
+"""What other people's loops hand over, as tensors: checked, without gradients, floats as float32; and what they get."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from deimos.goals.core import GoalCore
+from deimos.goals.faults import Faults, refuse_outside_0_and_1, refuse_unsound
+from deimos.goals.interactions import assign
 from deimos.goals.selector import Delegate, GoalSelector, Transitions, with_parts
 from deimos.nn.random import Purpose, uniforms
-from deimos.nn.stateful import LARGEST, is_sound
 
 Array = Tensor | np.ndarray
 A = TypeVar("A", Tensor, np.ndarray)  # what comes back is of the kind of what came in
 Bound = Array | Sequence[float]
 Rows = Array | slice | Sequence[int] | None
 Candidates = Array | Callable[[Array], Array] | None
+
+
+@dataclass(frozen=True)
+class Assignment(Generic[A]):
+    """What every world pursues next; arrays or tensors, as the goals given to the step."""
+
+    goal: A
+    """Goals, shape (num_envs, goal_dim): the given ones except where ``changed``."""
+    changed: A
+    """True where the goal is a new one, bool, shape (num_envs,)."""
+    weight: A
+    """Weight of the transitions under the goal in everything that the learner learns, at least 0, shape (num_envs,);
+    1 under most selectors."""
 
 
 def matrix(name: str, value: Array, components: str) -> tuple[int, int]:
@@ -63,7 +77,7 @@ def floats(name: str, value: Bound, shape: tuple[int, ...], device: torch.device
     return numbers.float()
 
 
-def flags(name: str, value: Array, num_envs: int, device: torch.device) -> Tensor:
+def flags(name: str, value: Array, num_envs: int, device: torch.device, faults: Faults | None = None) -> Tensor:
     """Flags of all worlds, bool, shape (num_envs,), from bool or from whole or real numbers 0 and 1.
 
     Raises:
@@ -75,14 +89,25 @@ def flags(name: str, value: Array, num_envs: int, device: torch.device) -> Tenso
     if marks.dtype == torch.bool:
         return marks
     other = (marks != 0) & (marks != 1)
-    if bool(other.any()):
+    if faults is not None:
+        faults.note(f"{name} of world {{world}} must be bool, or 0 and 1", other)
+    elif bool(other.any()):
         world = int(other.nonzero()[0])
         raise ValueError(f"{name} must be bool, or 0 and 1, got {marks[world].item()} in world {world}.")
     return marks == 1
 
 
-def worlds(rows: Rows, num_envs: int, device: torch.device) -> Tensor:
+def worlds(
+    rows: Rows, num_envs: int, device: torch.device, count: int | None = None, faults: Faults | None = None
+) -> Tensor:
     """The listed worlds, int64, shape (m,), from indices, a mask, a slice, or ``None`` for all.
+
+    Args:
+        rows: Which.
+        num_envs: Worlds.
+        device: Where.
+        count: How many a mask must have, where they are not to be counted at once.
+        faults: Where to note what does not fit; ``None`` to refuse it at once.
 
     Raises:
         ValueError: If a world does not exist or is listed twice, or a mask has another length.
@@ -92,71 +117,38 @@ def worlds(rows: Rows, num_envs: int, device: torch.device) -> Tensor:
         return every if rows is None else every[rows]
     listed = tensor("rows", rows, device)
     if listed.dtype == torch.bool:
-        if listed.shape != (num_envs,):
-            raise ValueError(f"rows must be a mask of the shape {(num_envs,)}, got {tuple(listed.shape)}.")
-        return every[listed]
+        _check_mask(listed, num_envs)
+        if faults is None or count is None:
+            return every[listed]
+        faults.note("rows must be as many worlds as state has rows", (listed.sum() != count).expand(num_envs))
+        return torch.nonzero_static(listed, size=count).squeeze(1).clamp(min=0)
     if listed.dim() != 1 or (len(listed) and (listed.is_floating_point() or listed.is_complex())):
         raise ValueError(f"rows must be indices of worlds, a mask or a slice, got {rows!r}.")
     listed = listed.long()
+    if faults is not None:
+        there = listed.clamp(0, num_envs - 1)
+        times = torch.zeros_like(every).index_add_(0, there, 1 + (there != listed).long())
+        faults.note(f"rows must be worlds in [0, {num_envs}), each once", times > 1)
+        return there
     if not bool(((listed >= 0) & (listed < num_envs)).all()) or len(listed.unique()) < len(listed):
         raise ValueError(f"rows must be worlds in [0, {num_envs}), each once, got {listed.tolist()}.")
     return listed
 
 
-def refuse_not_finite(
-    name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None, what: str = "world"
-) -> None:
-    """Raise a ``ValueError`` that names the first row of ``numbers`` with one that is not finite.
-
-    Args:
-        name: What they are.
-        numbers: Shape (m, ...).
-        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
-        but: Rows that do not matter, bool, shape (m,).
-        what: What a row is.
-    """
-    if bool(numbers.sum().isfinite()):  # a sum costs a tenth of looking at every number
-        return
-    bad = ~numbers.flatten(1).isfinite().all(1) if numbers.dim() > 1 else ~numbers.isfinite()
-    if but is not None:
-        bad &= ~but
-    if bool(bad.any()):
-        row = int(bad.nonzero()[0])
-        world = row if rows is None else int(rows[row])
-        raise ValueError(f"{name} of {what} {world} must be finite, got {numbers[row].tolist()}.")
+def marked(rows: Rows, num_envs: int, device: torch.device, faults: Faults | None = None) -> Tensor:
+    """True in the listed worlds, bool, shape (num_envs,); for the arguments and errors see ``worlds``."""
+    if not (rows is None or isinstance(rows, slice)):
+        rows = tensor("rows", rows, device)
+        if rows.dtype == torch.bool:
+            _check_mask(rows, num_envs)
+            return rows
+    listed = worlds(rows, num_envs, device, faults=faults)
+    return torch.zeros(num_envs, dtype=torch.bool, device=device).index_fill_(0, listed, True)
 
 
-def refuse_unsound(name: str, numbers: Tensor, rows: Tensor | None = None, but: Tensor | None = None) -> None:
-    """Raise ``ValueError`` where a number is not finite, or so large that what is learnt from it would not be.
-
-    Args:
-        name: What they are.
-        numbers: Shape (m, n, ...), not empty.
-        rows: Worlds of the rows, int64, shape (m,); ``None`` for all worlds in order.
-        but: Rows that do not matter, bool, shape (m,).
-    """
-    if bool(is_sound(torch.stack(numbers.aminmax())).all()):
-        return
-    refuse_not_finite(name, numbers, rows, but)
-    large = ~is_sound(numbers).flatten(1).all(1)
-    large = large if but is None else large & ~but
-    if bool(large.any()):
-        row = int(large.nonzero()[0])
-        world = row if rows is None else int(rows[row])
-        raise ValueError(f"{name} of world {world} must be at most {LARGEST:g} in size, got {numbers[row].tolist()}.")
-
-
-def refuse_outside_0_and_1(name: str, numbers: Tensor) -> None:
-    """Raise a ``ValueError`` that names the first world with a number outside [0, 1] by more than rounding.
-
-    Args:
-        name: What they are.
-        numbers: Finite, shape (num_envs, ...).
-    """
-    outside = (numbers - 0.5).abs() > 0.5 + 1e-5
-    if bool(outside.any()):
-        world = int(outside.nonzero()[0, 0])
-        raise ValueError(f"{name} of world {world} must be in [0, 1], got {numbers[world].tolist()}.")
+def _check_mask(rows: Tensor, num_envs: int) -> None:
+    if rows.shape != (num_envs,):
+        raise ValueError(f"rows must be a mask of the shape {(num_envs,)}, got {tuple(rows.shape)}.")
 
 
 def like(values: Tensor, model: A) -> A:
@@ -167,22 +159,26 @@ def like(values: Tensor, model: A) -> A:
     return array.astype(dtype) if values.is_floating_point() and np.issubdtype(dtype, np.floating) else array
 
 
-def taken(values: Candidates, rows: Tensor) -> Candidates:
-    """The candidates of some worlds, int64, shape (m,), if they exist already."""
-    if values is None or callable(values):
+def taken(values: Candidates, rows: Tensor, where: Tensor | None) -> Candidates:
+    """The candidates of some worlds, int64, shape (m,), if they exist already; with ``where``, these are all worlds."""
+    if values is None or callable(values) or where is not None:
         return values
     return values[rows] if isinstance(values, Tensor) else np.asarray(values)[rows.cpu().numpy()]
 
 
-def replaced(values: A, rows: Tensor, new: Tensor) -> A:
-    """A copy of ``values``, shape (num_envs, ...), with new rows, int64, shape (m,); whole numbers become float32."""
+def replaced(values: A, rows: Tensor, new: Tensor, where: Tensor | None = None) -> A:
+    """A copy of ``values``, shape (num_envs, ...), with new rows, int64, shape (m,); whole numbers become float32.
+
+    For ``where`` see ``deimos.goals.interactions.assign``.
+    """
     if isinstance(values, Tensor):
         copy = values.detach().clone() if values.is_floating_point() else values.float()
-        copy[rows] = new.to(copy.dtype)
+        assign(copy, rows, new.to(copy.dtype), where)
         return copy
     array = np.array(values)
     array = array if np.issubdtype(array.dtype, np.floating) else array.astype(np.float32)
-    array[rows.cpu().numpy()] = new.cpu().numpy()
+    places = (rows if where is None else where).cpu().numpy()
+    array[places] = (new if where is None else new[where]).cpu().numpy()
     return array
 
 
@@ -200,6 +196,8 @@ class Inputs:
     """Device of tensors."""
     columns: tuple[int, ...]
     """Shape of the tracking of a world: () for the whole goal, (groups,) for each group of its components."""
+    faults: Faults | None = None
+    """Where to note what does not fit; ``None`` to refuse it at once."""
 
     def states(self, value: Array, count: int) -> Tensor:
         """States of ``count`` worlds."""
@@ -214,17 +212,16 @@ class Inputs:
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
         """What a step of all worlds ended in; see ``GoalDirector.step``."""
         crashed, cut_off = (
-            flags(name, value, self.num_envs, self.device)
+            flags(name, value, self.num_envs, self.device, self.faults)
             for name, value in (("terminated", terminated), ("truncated", truncated))
         )
         met = pursued = None
         if tracking is not None:
             met = floats("tracking", tracking, (self.num_envs, *self.columns), self.device)
-            refuse_not_finite("tracking", met)
-            refuse_outside_0_and_1("tracking", met)
+            refuse_outside_0_and_1("tracking", met, self.faults)
         if executed is not None:
             pursued = self.goals(executed, self.num_envs, "executed")
-            refuse_unsound("executed", pursued)
+            refuse_unsound("executed", pursued, faults=self.faults)
         return crashed, cut_off, met, pursued
 
     def check_candidates(self, value: Candidates, count: int) -> None:
@@ -241,12 +238,18 @@ class Inputs:
         self.check_candidates(value, count)
         return tensor("candidates", value, self.device).float()
 
-    def horizons(self, value: Array | int, count: int, most: int) -> Tensor:
-        """Steps that the goals of ``count`` worlds are to last, in [1, most], int64, shape (count,)."""
+    def horizons(self, value: Array | int, most: int, rows: Tensor) -> Tensor:
+        """Steps that the goals of some worlds, int64, shape (m,), are to last, in [1, most], int64, shape (m,)."""
+        count = len(rows)
+        if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most:  # nothing to copy
+            return torch.full((count,), value, dtype=torch.int64, device=self.device)
         steps = tensor("horizon", value, self.device)
         if steps.dtype == torch.bool or steps.is_floating_point() or steps.shape not in ((), (count,)):
             raise ValueError(f"horizon must be a whole number or {count} of them, got {value!r}.")
-        if not bool(((steps >= 1) & (steps <= most)).all()):
+        fits = (steps >= 1) & (steps <= most)
+        if self.faults is not None:
+            self.faults.note(f"horizon of world {{world}} must be in [1, {most}]", ~fits, rows)
+        elif not bool(fits.all()):
             raise ValueError(f"horizon must be in [1, {most}], got {steps.tolist()}.")
         return steps.long().expand(count)
 
@@ -353,11 +356,20 @@ class GoalBox:
         unit = drawn.flatten(1)[:, :numbers].unflatten(1, (count, len(self))) * 2.0 - 1.0
         return self._middle + self._half * (unit if share is None else unit * share)
 
-    def check(self, candidates: Tensor, rows: Tensor, share: Tensor | None) -> None:
-        """Raise ``ValueError`` if a candidate, shape (m, N, goal_dim), is outside by more than rounding."""
+    def check(
+        self, candidates: Tensor, rows: Tensor, share: Tensor | None, but: Tensor | None, faults: Faults | None
+    ) -> None:
+        """Raise ``ValueError`` if a candidate, shape (m, N, goal_dim), is outside by more than rounding.
+
+        For ``but`` and ``faults`` see ``refuse_not_finite``.
+        """
         reach = self._half if share is None else self._half * share
         outside = ((candidates - self._middle).abs() > reach * 1.001).any(2)
-        if bool(outside.any()):
+        if faults is not None:
+            bad = outside.any(1)
+            text = "candidates of world {world} must be in the goal_box, within GoalDirector.goal_range"
+            faults.note(text, bad if but is None else bad & ~but, rows)
+        elif bool(outside.any()):
             row, candidate = outside.nonzero()[0].tolist()
             low, high = (self._middle - reach).tolist(), (self._middle + reach).tolist()
             raise ValueError(

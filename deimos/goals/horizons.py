@@ -19,8 +19,8 @@ class Horizons:
     seen: bool
     """Whether the fear network sees how long a goal is to last."""
 
-    def steps(self, horizon: Array | int | None, count: int, inputs: Inputs) -> Tensor | None:
-        """Announced steps, int64, shape (count,); the most if not announced, ``None`` where it is always T.
+    def steps(self, horizon: Array | int | None, rows: Tensor, inputs: Inputs) -> Tensor | None:
+        """Announced steps of some worlds, int64, shape (m,); the most if not announced, ``None`` where it is always T.
 
         Raises:
             ValueError: If they do not fit, are not T where it is always the same, or are missing where the fear network
@@ -32,8 +32,13 @@ class Horizons:
             if self.seen:
                 raise ValueError("horizon must be given where it is an input of the fear network, got None.")
             horizon = self.most
-        steps = inputs.horizons(horizon, count, self.most)
-        if self.period is not None and bool((steps < self.period).any()):  # outcomes are kept for goals of T steps
+        steps = inputs.horizons(horizon, self.most, rows)
+        if self.period is None:
+            return steps
+        short = steps < self.period  # outcomes are kept for goals of T steps
+        if inputs.faults is not None:
+            inputs.faults.note(f"horizon of world {{world}} must be goal_period, {self.period}", short, rows)
+        elif bool(short.any()):
             raise ValueError(
                 f"horizon must be goal_period, {self.period}, got {steps.tolist()}; "
                 f"GoalDirector(max_horizon={self.period}) has goals of fewer steps."

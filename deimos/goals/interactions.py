@@ -70,7 +70,8 @@ def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | 
         tensor: Written, shape (n, ...).
         rows: Which rows, int64, shape (m,), each once.
         value: A number for all, or a tensor with a row for each, of the dtype of ``tensor``.
-        where: Which of ``rows`` are meant, bool, shape (n,), where these are all rows in order; ``None`` for all.
+        where: Which of ``rows`` are meant, bool, shape (m,); ``None`` for all. If ``rows`` are all rows of ``tensor``,
+            they must be in order.
     """
     if where is None:
         if isinstance(value, Tensor):
@@ -79,7 +80,10 @@ def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | 
             tensor.index_fill_(0, rows, value)
         return
     where = where.view(-1, *[1] * (tensor.dim() - 1))
-    if isinstance(value, Tensor):
+    if len(where) < len(tensor):
+        kept = tensor[rows]
+        tensor[rows] = torch.where(where, value, kept) if isinstance(value, Tensor) else kept.masked_fill(where, value)
+    elif isinstance(value, Tensor):
         torch.where(where, value, tensor, out=tensor)
     else:
         tensor.masked_fill_(where, value)
@@ -87,7 +91,7 @@ def assign(tensor: Tensor, rows: Tensor, value: Tensor | float, where: Tensor | 
 
 def taken(tensor: Tensor, rows: Tensor, where: Tensor | None) -> Tensor:
     """The rows of a tensor that ``assign`` would write: a copy, or the tensor itself where ``rows`` are all rows."""
-    return tensor[rows] if where is None else tensor
+    return tensor[rows] if where is None or len(where) < len(tensor) else tensor
 
 
 class Interactions(Stateful):
@@ -208,14 +212,15 @@ class Interactions(Stateful):
         assign(self.active, rows, True, where)
 
     @torch.no_grad()
-    def execute(self, rows: Tensor, goal: Tensor) -> None:
-        """Report what the listed worlds pursue where that is not what was issued: it is what is learnt from.
+    def execute(self, where: Tensor, goal: Tensor) -> None:
+        """Report what worlds pursue where that is not what was issued: it is what is learnt from.
 
         Args:
-            rows: Worlds, int64, shape (m,), each once.
-            goal: Goals, shape (m, goal_dim).
+            where: Which worlds, bool, shape (num_envs,).
+            goal: Goals of all worlds, shape (num_envs, goal_dim).
         """
-        self._pending[rows, self._next_goal] = goal.float()
+        issued = self._pending[:, self._next_goal]
+        torch.where(where.unsqueeze(1), goal.float(), issued, out=issued)
 
     def resolved(self, since: int = 0) -> Resolved:
         """The interactions resolved within the window, and after step ``since``, ordered by world."""
@@ -265,16 +270,34 @@ class Interactions(Stateful):
         return ~done.crashed & (self.issued_at[done.env] == done.resolved)
 
     def of_all_ranks(self) -> "Interactions":
-        """The interactions in the worlds of all ranks, by their global numbers: what to learn from."""
-        view = copy.copy(self)
-        vars(view).update({name: gather_rows(getattr(self, name)) for name in self.by_world})
-        return view
+        """The interactions in the worlds of all ranks, by their global numbers: what to learn from.
+
+        What has one row per world is gathered when it is first read, so all ranks must read the same in the same order,
+        and what a selector does not read is not sent.
+        """
+        return _OfAllRanks(self)
 
     def without_scores(self) -> "Interactions":
         """The same interactions for a selector that did not choose these goals: it sees no scores."""
         view = copy.copy(self)
         view._scored = False
         return view
+
+
+class _OfAllRanks(Interactions):
+    """See ``Interactions.of_all_ranks``."""
+
+    def __init__(self, own: Interactions) -> None:
+        vars(self).update({name: value for name, value in vars(own).items() if name not in self.by_world})
+        self._own = own
+        self._gathered: dict[str, Tensor] = {}  # also of a view without scores, which is a shallow copy
+
+    def __getattr__(self, name: str) -> Tensor:  # asked only for what is not an attribute
+        if name not in Interactions.by_world:
+            raise AttributeError(name)
+        if name not in self._gathered:
+            self._gathered[name] = gather_rows(getattr(self._own, name))
+        return self._gathered[name]
 
 
 def _resized(ring: Tensor, cursor: Tensor, capacity: int) -> Tensor:

@@ -177,8 +177,8 @@ class GoalSelector(Stateful, abc.ABC):
     ) -> None:  # fmt: skip
         """Take note of goals that were issued.
 
-        The first arguments are those of ``propose``, and ``chosen`` is what it returned. In dense form the rows are all
-        worlds, and ``where`` says in which of them goals were issued, bool, shape (num_envs,); ``None`` for all rows.
+        The first arguments are those of ``propose``, and ``chosen`` is what it returned. ``where`` says in which of the
+        rows goals were issued, bool, shape (B,); ``None`` for all. See ``deimos.goals.interactions.assign``.
         """
 
     def critic(self) -> Callable[[Tensor], Tensor] | None:
@@ -192,7 +192,8 @@ class GoalSelector(Stateful, abc.ABC):
         """Learn from what happened, once per rollout.
 
         Where several ranks share a run, each learns the same from the same interactions, those in the worlds of all.
-        What a selector keeps of its own worlds, or counts in them, it gathers with ``deimos.nn.ranks``.
+        What a selector keeps of its own worlds, or counts in them, it gathers with ``deimos.nn.ranks``. What it reads
+        of the interactions is gathered then, so whether it reads it must not depend on the rank.
 
         Args:
             interactions: The pending and the recently resolved ones; worlds by their global numbers.

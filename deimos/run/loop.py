@@ -6,15 +6,12 @@ import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least
-from deimos.goals.core import Changes, GoalCore, window_between
+from deimos.goals.core import Changes, GoalCore, on_gpu, window_between
 from deimos.goals.given import lacking
 from deimos.goals.interactions import Resolved
 from deimos.goals.selector import GoalSelector, Spaces, Transitions
 from deimos.nn.host import own_settings
 from deimos.sim.env import Env, Step
-
-AS_ON_GPU = False
-"""Whether the CPU, too, asks for the next goals of all worlds at every step, as a GPU does: for tests."""
 
 GoalGuard = Callable[[Env, Tensor, Tensor], Tensor]
 """Has the last word on goals: from the environment, the worlds, int64, shape (B,), and the goals that they are to get,
@@ -107,8 +104,7 @@ class GoalLoop:
 
     @property
     def _dense(self) -> bool:
-        on_gpu = AS_ON_GPU or self.env.device.type == "cuda"
-        return on_gpu and self.selector.dense and self._guard is None
+        return on_gpu(self.env.device) and self.selector.dense and self._guard is None
 
     def graph_key(self) -> Hashable:
         """What Python branches on in ``advance``; ``None`` if a CUDA graph cannot replay it, see ``why_eager``."""

@@ -92,7 +92,7 @@ class Weighted(FearSelector):
         super().issued(rows, state, goal, candidates, chosen, where)
         assert chosen.weight is not None
         powers = torch.stack([torch.ones_like(chosen.weight), chosen.weight, chosen.weight.square()]).double()
-        self._sums += (powers if where is None else powers * where).sum(1)
+        self._sums += (powers if where is None else powers.masked_fill(~where, 0.0)).sum(1)
 
     def learn(self, interactions: Interactions, rollout: Transitions | None) -> dict[str, float]:
         """See ``FearSelector.learn``; adds the effective sample size, as a share, and the shift of the states."""
