@@ -156,7 +156,7 @@ def test_kept_policies_change_no_number(whole, tmp_path):
 def test_a_kept_policy_is_loaded_evaluated_and_played(copied, tmp_path, capsys):
     """It acts, its rows stand beside those of the last one, which keeps its summary, and a command takes it too."""
     policy = deimos.load_policy(copied / "policies" / "000002.pt")
-    assert policy(torch.zeros(2, 12)).shape == (2, 3)
+    assert policy.scaled(torch.zeros(2, 12)).shape == (2, 3)
     before = RunFolder(copied).read_json("evaluation.json")
     assert cli.main(["evaluate", str(copied)]) == 0
     summary = (copied / "summary.png").read_bytes()

@@ -423,7 +423,7 @@ def test_run_that_cannot_begin_leaves_no_folder(tmp_path, monkeypatch):
 )
 def test_checkpoint_of_another_task_is_refused(undisturbed, other):
     """The shapes of its tensors may fit; what it was made for must too."""
-    with pytest.raises(RunError, match="that of another environment or network size: it was made for"):
+    with pytest.raises(RunError, match="belongs to another environment or network size: it was made for"):
         training.load(RunFolder.open(undisturbed), replace(CONFIG, **other))
 
 

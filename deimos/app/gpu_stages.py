@@ -145,9 +145,10 @@ def directed(num_envs: int, device: torch.device) -> Callable[[], None]:
     options: dict[str, Any] = {"num_envs": num_envs, "state_dim": 9, "goal_dim": 3, "device": device}
     options |= {"goal_box": ([-1.0] * 3, [1.0] * 3), "learn_every": 100}
     own, theirs = GoalDirector("p75", 10, **options), GoalDirector("p75", max_horizon=10, **options)
-    state, never = torch.zeros(num_envs, 9, device=device), torch.zeros(num_envs, dtype=torch.bool, device=device)
+    state = torch.zeros(num_envs, 9, dtype=torch.float32, device=device)
+    never = torch.zeros(num_envs, dtype=torch.bool, device=device)
     rows = torch.arange(0, num_envs, 7, device=device)
-    goals = [director.propose(None, state, torch.zeros(num_envs, 3, device=device)) for director in (own, theirs)]
+    goals = [director.propose(None, state, state[:, :3]) for director in (own, theirs)]
 
     def step() -> None:
         goals[0] = own.step(state, goals[0], never, never).goal
