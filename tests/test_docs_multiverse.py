@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reproduction import multiverse
+from deimos.study.data import Data
+from reproduction import multiverse, multiverse_page
 from reproduction.multiverse import UNIFORM, Roles
 from reproduction.multiverse_page import MultiverseOptions, write
 
@@ -70,7 +71,7 @@ def test_one_choice_moves_one_headline(settings):
 
 
 def test_the_page_has_the_methods(settings):
-    """Safe policies, rates, scores and slopes, in the order of the page; and the best new selector."""
+    """Rates, scores and slopes, in the order of the page; and the best new selector."""
     standings = multiverse.standings(settings)
     place = -1
     for each in standings:
@@ -78,12 +79,42 @@ def test_the_page_has_the_methods(settings):
         if each.method != UNIFORM:
             score, slope = written(each.score, 2), f"{written(multiverse.removed(settings, each.method), 2)} "
         name = NAMES.get(each.method, each.method)
-        line = f"| {name} | {written(each.safe, 0, 100)} | {100 * each.worst.estimate:.0f} | {score} | {slope}|"
+        line = f"| {name} | {100 * each.worst.estimate:.0f} | {score} | {slope}|"
         assert PAGE.find(line) > place
         place = PAGE.find(line)
     assert multiverse.best_new(standings) == "weighted"
     able = [each.method for each in standings if each.method in multiverse.NEW and each.score.estimate >= 0.95]
     assert able == ["weighted"]
+
+
+def test_pages_have_the_confirmation():
+    """Rates of all methods, what the new selector does to Uniform's rate and score, and that it misses both aims."""
+    data = Data.read(RESULTS / "multiverse_ours")
+    rows = [row for row in data.rows if row["goals"] == "naive"]
+    rate = {
+        name: f"{100 * np.mean([row['worst'] for row in rows if row['method'] == name]):.1f}"
+        for name in data.methods(multiverse_page.OURS)
+    }
+    found = {each.rival: each for each in multiverse.contrasts(data, multiverse_page.OURS, "weighted")}
+    assert all(each.n == (30, 30) and each.p <= 0.05 and each.lower.low > 0.0 for each in found.values())
+    uniform = found.pop("uniform")
+    assert all(each.score.low > 1.0 for each in found.values())
+    assert not uniform.is_winner
+    assert uniform.ratio.estimate < multiverse.AIM
+    assert uniform.score.estimate < multiverse.AIM_SCORE
+    ratio, score = written(uniform.ratio, 2), written(uniform.score, 3)
+    assert (
+        f"on {rate['weighted']} % of goals, p75's on {rate['p75']}, RND's on {rate['rnd']}, Uniform's on "
+        f"{rate['uniform']}, VDS's on {rate['vds']}: fewer than each (corrected p at most "
+        f"{max(each.p for each in found.values()):.3f})"
+    ) in PAGE
+    assert f"Uniform crashes {ratio} times as often; weighted has {score} of its score" in PAGE
+    for each in (ratio, score):
+        assert each.split(maxsplit=1)[1] in LAB
+    assert (
+        f"crashes on {rate['weighted']} %, Uniform on {rate['uniform']} %, at {uniform.score.estimate:.3f} of its "
+        f"score (30 seeds, p = {uniform.p:.3f})"
+    ) in README
 
 
 def test_pages_count_settings(settings, room):
@@ -129,6 +160,7 @@ def test_the_lab_says_what_a_penalty_does_without_headroom(settings, room):
 
 def test_the_report_is_what_the_analysis_writes(tmp_path):
     """Word for word."""
-    write(MultiverseOptions(out=tmp_path, screening=RESULTS / "multiverse_screening", map=RESULTS / "multiverse"))
+    screening, mapped, ours = (RESULTS / name for name in ("multiverse_screening", "multiverse", "multiverse_ours"))
+    write(MultiverseOptions(out=tmp_path, screening=screening, map=mapped, confirmations=(ours,)))
     wanted = (tmp_path / "multiverse.md").read_text(encoding="utf-8")
     assert (RESULTS / "map" / "multiverse.md").read_text(encoding="utf-8") == wanted
