@@ -75,7 +75,8 @@ def train(
         device = config.device
         begin = partial(training.start, config, _path(out), _path(init_from), _path(branch_from))
     else:
-        _refuse("is not for resume", config=config, out=out, init_from=init_from, branch_from=branch_from)
+        why = "is not for resume, which takes only env_steps, device and graph"
+        _refuse(why, config=config, out=out, init_from=init_from, branch_from=branch_from)
         begin = partial(training.resume, Path(resume), env_steps, device, graph)
         device = device or _config(resume).device
     is_new = resume is None and branch_from is None
