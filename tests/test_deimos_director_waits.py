@@ -162,7 +162,14 @@ def test_what_wants_to_know_the_worlds_waits(monkeypatch):
 
 
 NO = torch.zeros(N, dtype=torch.bool)
-NAN = torch.full((N, 1), 0.0).index_fill(0, torch.tensor([5]), torch.nan)
+
+
+def odd(value):
+    """Zeros, shape (N, 1), except ``value`` in world 5."""
+    return torch.zeros(N, 1).index_fill(0, torch.tensor([5]), value)
+
+
+NAN = odd(torch.nan)
 
 
 def good(**changes):
@@ -173,14 +180,14 @@ def good(**changes):
 
 STEPS = [
     ({"state": NAN.expand(N, 2)}, "state of world 5 must be finite and at most 1e+15 in size"),
-    ({"goal": NAN.nan_to_num(1e16)}, "goal of world 5 must be finite and at most 1e+15 in size"),
+    ({"goal": odd(1e16)}, "goal of world 5 must be finite and at most 1e+15 in size"),
     ({"tracking": NAN[:, 0]}, "tracking of world 5 must be in [0, 1]"),
-    ({"tracking": NAN[:, 0].nan_to_num(7.0)}, "tracking of world 5 must be in [0, 1]"),
+    ({"tracking": odd(7.0)[:, 0]}, "tracking of world 5 must be in [0, 1]"),
     ({"executed": NAN}, "executed of world 5 must be finite and at most 1e+15 in size"),
     ({"candidates": NAN.unsqueeze(1)}, "candidates of world 5 must be finite and at most 1e+15 in size"),
-    ({"candidates": NAN.unsqueeze(1).nan_to_num(2.0)}, "candidates of world 5 must be in the goal_box"),
+    ({"candidates": odd(2.0).unsqueeze(1)}, "candidates of world 5 must be in the goal_box"),
     ({"truncated": NAN[:, 0]}, "truncated of world 5 must be bool, or 0 and 1"),
-    ({"goal": NAN.nan_to_num(0.5)}, "goal of world 5 must be what it was given"),
+    ({"goal": odd(0.5)}, "goal of world 5 must be what it was given"),
 ]  # fmt: skip
 
 

@@ -31,12 +31,6 @@ def room(settings):
     return [each for each in settings if each.has_headroom]
 
 
-def written(interval, digits, by=1.0):
-    """An interval as the pages have it."""
-    low, high = (f"{by * x:.{digits}f}" for x in (interval.low, interval.high))
-    return f"{by * interval.estimate:.{digits}f} [{low}, {high}]"
-
-
 def safer(settings, name):
     """By how many points a method crashes less than Uniform under the worst attacker, setting by setting."""
     return 100 * np.array([each.policies[UNIFORM].worst - each.policies[name].worst for each in settings])
@@ -48,9 +42,10 @@ def test_the_page_has_the_headline_clauses(settings):
     for clause in multiverse.headlines(Roles.of(settings)):
         share, margin = multiverse.share_that_holds(settings, clause), multiverse.margins(settings, clause)
         text = clause.text.replace("rnd ", "RND ").replace("uniform", "Uniform")
-        line = f"| {text} | {written(share, 0, 100)} | {written(multiverse.mean(100 * margin), 1)} |"
+        holds = f"{100 * share.estimate:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]"
+        line = f"| {text} | {holds} | {multiverse.mean(100 * margin):.1f} |"
         assert line in PAGE
-        shares[clause.name] = written(share, 0, 100).replace(" [", " % [")
+        shares[clause.name] = holds.replace(" [", " % [")
         decided += [clause.name] if share.low > 0.5 or share.high < 0.5 else []
     assert decided == ["danger is hidden"]
     assert f"holds clearly, in {shares['danger is hidden']} of those" in README
@@ -77,7 +72,7 @@ def test_the_page_has_the_methods(settings):
     for each in standings:
         score, slope = "1", ""
         if each.method != UNIFORM:
-            score, slope = written(each.score, 2), f"{written(multiverse.removed(settings, each.method), 2)} "
+            score, slope = f"{each.score:.2f}", f"{multiverse.removed(settings, each.method):.2f} "
         name = NAMES.get(each.method, each.method)
         line = f"| {name} | {100 * each.worst.estimate:.0f} | {score} | {slope}|"
         assert PAGE.find(line) > place
@@ -102,7 +97,7 @@ def test_pages_have_the_confirmation():
     assert not uniform.is_winner
     assert uniform.ratio.estimate < multiverse.AIM
     assert uniform.score.estimate < multiverse.AIM_SCORE
-    ratio, score = written(uniform.ratio, 2), written(uniform.score, 3)
+    ratio, score = f"{uniform.ratio:.2f}", f"{uniform.score:.3f}"
     assert (
         f"on {rate['weighted']} % of goals, p75's on {rate['p75']}, RND's on {rate['rnd']}, Uniform's on "
         f"{rate['uniform']}, VDS's on {rate['vds']}: fewer than each (corrected p at most "
@@ -155,7 +150,7 @@ def test_the_lab_says_what_a_penalty_does_without_headroom(settings, room):
     uniform, penalty = (f"{rates.pop(name):.1f} %" for name in (UNIFORM, "penalty-30"))
     assert f"crashes Uniform's policies on {uniform} of its goals, penalty-30's on {penalty}" in LAB
     assert f"{min(rates.values()):.1f} to {max(rates.values()):.1f} %" in LAB
-    assert f"advantage is {written(multiverse.mean(safer(room, 'penalty-30')), 1)}".replace(" [", " points [") in LAB
+    assert f"advantage is {multiverse.mean(safer(room, 'penalty-30')):.1f}".replace(" [", " points [") in LAB
 
 
 def test_the_report_is_what_the_analysis_writes(tmp_path):
