@@ -19,6 +19,7 @@ ours = importlib.metadata.files("deimos-rl") or []
 tops = {file.parts[0] for file in ours if not file.parts[0].endswith(".dist-info")} - {"..", "__pycache__"}
 assert tops == {"deimos"}, tops
 assert any(file.name == "py.typed" for file in ours)
+assert {"LICENSE", "NOTICE"} <= {file.name for file in ours if file.parts[0].endswith(".dist-info")}
 assert sum(file.parts[:3] == ("deimos", "terrain", "grids") for file in ours) >= 2  # data files, which no import misses
 
 names = [info.name for info in pkgutil.walk_packages(deimos.__path__, "deimos.")]

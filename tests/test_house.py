@@ -3,6 +3,7 @@
 import ast
 import re
 import tomllib
+from pathlib import Path
 
 import pytest
 from source_files import HOME, PACKAGES, module_name, sources
@@ -15,6 +16,21 @@ def test_wheel_holds_every_package():
     build = tomllib.loads((HOME / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
     there = {module_name(path) for path in sources("deimos", "kernels", "terrain") if path.endswith("__init__.py")}
     assert sorted(build["packages"]) == sorted(there | set(build["package-data"]))
+
+
+def test_notices_of_others_are_in_the_package():
+    """Licence and notice are installed; every robot, and every project that its numbers come from, is in the notice."""
+    project = tomllib.loads((HOME / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["license-files"] == ["LICENSE", "NOTICE"]
+    notice = (HOME / "NOTICE").read_text(encoding="utf-8")
+    robots = sources("deimos/sim/legged/robots")
+    named = {path for path in robots if not Path(path).name.startswith("_")}
+    assert named == set(re.findall(r"deimos/sim/legged/robots/\w+\.py", notice))
+    said = " ".join(map(ast.get_docstring, robots.values()))
+    for source in ("MuJoCo Menagerie", "mjlab", "Legged Gym", "interbotix_ros_manipulators"):
+        assert source in said, source
+        assert source in notice, source
+    assert "BSD 3-Clause License" in notice
 
 
 def test_readme_holds_two_setup_lines():
