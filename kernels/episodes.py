@@ -177,7 +177,7 @@ def _set_goals(
 ):
     i = wp.tid()
     env = row[i]
-    if env < 0:
+    if env < 0 or env >= worlds.goal.shape[0]:
         return
     for k in range(goal.shape[1]):
         target = goal[i, k] / worlds.goal_scale[k]
@@ -193,7 +193,7 @@ def set_goals(row: wp.array, goal: wp.array, worlds: Worlds) -> wp.Launch:
     """Record a launch that gives the listed worlds new goals, starts their clocks and shows them in the observations.
 
     Args:
-        row: Worlds, int32, shape (n,), each in [0, num_envs) and at most once; below 0 for none.
+        row: Worlds, int32, shape (n,), each at most once; outside [0, num_envs) for none.
         goal: Goals as the policy sees them, scaled, float32, shape (n, goal_dim).
         worlds: The worlds.
 

@@ -16,7 +16,7 @@ from torch.utils._pytree import tree_leaves
 
 from deimos.goals import core
 from deimos.nn import mlps, random
-from deimos.sim import graphs
+from deimos.sim import graphs, warp_env
 
 WAITING = {
     "_local_scalar_dense", "nonzero", "masked_select", "_unique", "_unique2", "unique_dim", "unique_consecutive",
@@ -144,6 +144,7 @@ def as_on_gpu(monkeypatch):
     monkeypatch.setattr(mlps, "_kernel", lambda nets: None)
     monkeypatch.setattr(random, "philox", random._rounds)
     monkeypatch.setattr(core, "AS_ON_GPU", True)
+    monkeypatch.setattr(warp_env, "AS_ON_GPU", True)
 
 
 def replay_on_cpu(monkeypatch):

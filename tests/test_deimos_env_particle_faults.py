@@ -14,7 +14,7 @@ from deimos.sim.envs.particle import Config
 from deimos.sim.warp_env import WarpEnv
 
 CPU = torch.device("cpu")
-ALL, ROWS = torch.ones(8, dtype=torch.bool), torch.tensor([2, 5])
+ALL, ROWS, GOALS = torch.ones(8, dtype=torch.bool), torch.tensor([2, 5]), torch.zeros(2, 3)
 
 
 @pytest.mark.parametrize("shape", [(8,), (8, 2), (7, 3), (1, 3)])
@@ -40,6 +40,22 @@ def test_actions_of_another_shape_are_refused(torch_device, shape):
         (lambda env: env.set_goals(ALL, torch.zeros(8, 3)), "rows must be whole numbers of worlds, got torch.bool"),
         (lambda env: env.set_goals(ROWS, torch.zeros(3)), r"goal must have the shape \(2, 3\), got \(3,\)"),
         (lambda env: env.set_goals(ROWS, torch.zeros(2, 3), ROWS), "where must be bool, got torch.int64"),
+        (lambda env: env.set_goals([2, 5], GOALS), r"rows must be a torch.Tensor, got \[2, 5\]"),
+        (lambda env: env.set_goals(ROWS, GOALS.numpy()), "goal must be a torch.Tensor, got array"),
+        (lambda env: env.set_goals(ROWS[:1, None], GOALS[:1]), r"rows must have the shape \(B,\), .*, got \(1, 1\)"),
+        (lambda env: env.set_goals(torch.arange(9), torch.zeros(9, 3)), r"at most 8 worlds, got \(9,\)"),
+        (lambda env: env.set_goals(ROWS + 3, GOALS), r"rows must be worlds in \[0, 8\), got 8"),
+        (lambda env: env.set_goals(ROWS - 3, GOALS), r"rows must be worlds in \[0, 8\), got -1"),
+        (lambda env: env.set_goals(ROWS + 2**32, GOALS), r"rows must be worlds in \[0, 8\), got 4294967301"),
+        (lambda env: env.set_goals(ROWS - ROWS, GOALS), "rows must be different worlds, got 0 more than once"),
+        (lambda env: env.sample_goals(ROWS + 3, 2), r"rows must be worlds in \[0, 8\), got 8"),
+        (lambda env: env.draw(ROWS - 3), r"rows must be worlds in \[0, 8\), got -1"),
+        (lambda env: env.set_goals(ROWS, GOALS.double()), r"goal must be float32, got torch.float64; .* \.float\(\)"),
+        (lambda env: env.set_goals(ROWS, GOALS.bool()), "goal must be float32, got torch.bool"),
+        (lambda env: env.reset(ALL, torch.ones(3).double()), "goal range must be float32, got torch.float64"),
+        (lambda env: env.set_goals(ROWS.to("meta"), GOALS), "rows must be on cpu, got it on meta; move it there"),
+        (lambda env: env.set_goals(ROWS, GOALS.to("meta")), "goal must be on cpu, got it on meta; move it there"),
+        (lambda env: env.reset(ALL.to("meta")), "mask must be on cpu, got it on meta; move it there"),
     ],
 )
 def test_masks_rows_and_goals_are_never_guessed(wrong, message):

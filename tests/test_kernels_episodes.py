@@ -204,7 +204,7 @@ def test_set_goals_touches_nothing_else(device, relative):
     origin = np.ones((4, 3), np.float32) if relative else None
     worlds = make(4, device, origin=origin, values={"goal_clock": 5, "episode_step": 6})
     before = snapshot(worlds)
-    give(worlds, [2, -1, 0], [[0.5, 0.5, 0.5], [0.1, 0.1, 0.1], [-1.0, 0.0, 1.0]])  # a row below 0 is nobody
+    give(worlds, [2, -1, 0, 4], [[0.5, 0.5, 0.5], [0.1, 0.1, 0.1], [-1.0, 0.0, 1.0], [0.2, 0.2, 0.2]])  # -1, 4: nobody
     after = snapshot(worlds)
     for name in before:
         assert [before[name][i] == after[name][i] for i in (1, 3)] == [True, True]

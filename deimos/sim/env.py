@@ -226,7 +226,7 @@ class Env(abc.ABC):
 
         Args:
             rows: Worlds, int64, shape (B,), each at most once.
-            goal: Goals as the policy sees them, shape (B, goal_dim).
+            goal: Goals as the policy sees them, float32, shape (B, goal_dim).
             where: Which of the rows are meant, bool, shape (B,); ``None`` for all.
         """
 

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from deimos.checks import SimulationError, check_at_least, check_seed
+from deimos.checks import SimulationError, check_at_least, check_is, check_seed
 from deimos.kernels.episodes import RESUMED, WORLDS, Worlds, make_worlds, record, set_goals
 from deimos.kernels.goals import draw_candidates
 from deimos.kernels.random import Purpose, draw_uniforms
@@ -20,6 +20,8 @@ from deimos.sim.shared import Shared, check_stream, warp_device
 MAX_INVALID_SHARE = 1e-3  # of all world-steps; a larger share stops the run
 GUARD = 64  # rows behind the observations, which catch what a kernel writes beyond the last one
 WINDOW = 10_000  # world-steps, at least, that the share is taken of, however often it is checked
+AS_ON_GPU = False
+"""Whether a CPU is treated as a device that the host has to wait for, as it has for a GPU: for tests."""
 
 
 class WarpEnv(Env):
@@ -27,8 +29,9 @@ class WarpEnv(Env):
 
     A subclass calls this constructor, allocates its own state with ``allocate``, and finally calls ``begin`` with a
     kernel for the step (physics, reward, crash, observation) and one for the reset; see ``deimos.kernels.episodes`` for
-    what these share, and docs/add_an_environment.md for a complete example. Masks, worlds, goals and shares whose shape
-    or dtype is not as ``Env`` says raise a ``ValueError``: nothing is broadcast.
+    what these share, and docs/add_an_environment.md for a complete example. Masks, worlds, goals and shares whose
+    shape, dtype or device is not as ``Env`` says raise a ``ValueError``: nothing is broadcast or converted. So do, on a
+    CPU, worlds that do not exist or are given two goals at once; a GPU would have to be waited for.
 
     Args:
         config: The task.
@@ -180,7 +183,7 @@ class WarpEnv(Env):
     def reset(self, mask: Tensor, goal_scale: Tensor | None = None) -> None:
         """See ``Env.reset``."""
         check_stream(self.device)
-        _require_mask("mask", mask, self._views["mask"].shape)
+        _require("mask", mask, self._views["mask"].shape, self._views["mask"])
         self._views["mask"].copy_(mask)
         self._first_range.set(goal_scale)
         self._launch_reset()
@@ -227,11 +230,14 @@ class WarpEnv(Env):
     @final
     def set_goals(self, rows: Tensor, goal: Tensor, where: Tensor | None = None) -> None:
         """See ``Env.set_goals``."""
-        _require_shape("goal", goal, (len(rows), self.goal_dim))
+        self._require_rows(rows)
+        if self._may_read and len(rows) and (times := rows.bincount()).max() > 1:
+            raise ValueError(f"rows must be different worlds, got {int(times.argmax())} more than once.")
+        _require("goal", goal, (len(rows), self.goal_dim), self._new_goal.tensor)
         if where is not None:
-            _require_mask("where", where, rows.shape)
+            _require("where", where, rows.shape, self._views["mask"])
             rows = torch.where(where, rows, self._nobody[: len(rows)])
-        self._set_rows(rows)
+        self._row.tensor[: len(rows)] = rows
         self._new_goal.tensor[: len(rows)] = goal.detach()
         self._launch_goals.set_dim(len(rows))
         self._launch_goals.launch()
@@ -290,10 +296,29 @@ class WarpEnv(Env):
             launches.append(self._valid_goals(candidates.array))
         return candidates, launches
 
+    @property
+    def _may_read(self) -> bool:
+        """Whether the host reads numbers of the device without waiting for it."""
+        return self.device.type == "cpu" and not AS_ON_GPU
+
     def _set_rows(self, rows: Tensor) -> None:
+        self._require_rows(rows)
+        self._row.tensor[: len(rows)] = rows
+
+    def _require_rows(self, rows: Tensor) -> None:
+        """Raise ``ValueError`` unless these are worlds of this environment: a kernel would write beyond its memory."""
+        check_is("rows", rows, Tensor)
         if rows.dtype not in (torch.int32, torch.int64):  # a mask would be read as worlds 0 and 1
             raise ValueError(f"rows must be whole numbers of worlds, got {rows.dtype}.")
-        self._row.tensor[: len(rows)] = rows
+        if rows.dim() != 1 or len(rows) > self.num_envs:
+            most = f"(B,), at most {self.num_envs} worlds"
+            raise ValueError(f"rows must have the shape {most}, got {tuple(rows.shape)}.")
+        _require_device("rows", rows, self._row.tensor.device)
+        if self._may_read and len(rows):
+            lowest, highest = map(int, rows.aminmax())
+            if lowest < 0 or highest >= self.num_envs:
+                wrong = lowest if lowest < 0 else highest
+                raise ValueError(f"rows must be worlds in [0, {self.num_envs}), got {wrong}.")
 
 
 class _Share:
@@ -306,7 +331,7 @@ class _Share:
     def set(self, share: Tensor | None) -> None:
         """Write ``share`` of the range, of the shape of the range, in (0, 1]; ``None`` for the whole."""
         if share is not None:
-            _require_shape("share of the goal range", share, self._whole.shape)
+            _require("share of the goal range", share, self._whole.shape, self._whole)
             torch.mul(self._whole, share.detach(), out=self._out)
         elif not self._is_whole:
             self._out.copy_(self._whole)
@@ -319,8 +344,20 @@ def _require_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} must have the shape {tuple(shape)}, got {tuple(tensor.shape)}.")
 
 
-def _require_mask(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
-    """Raise ``ValueError`` unless a tensor is a mask of this shape: numbers of worlds could pass for one."""
+def _require_device(name: str, tensor: Tensor, device: torch.device) -> None:
+    """Raise ``ValueError`` for another device: a copy would be waited for in every step."""
+    if tensor.device != device:
+        raise ValueError(f"{name} must be on {device}, got it on {tensor.device}; move it there with .to(env.device).")
+
+
+def _require(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
+    """Raise ``ValueError`` unless a tensor has this shape, and the dtype and the device of ``like``.
+
+    So no list of worlds passes for a mask.
+    """
+    check_is(name, tensor, Tensor)
     _require_shape(name, tensor, shape)
-    if tensor.dtype != torch.bool:
-        raise ValueError(f"{name} must be bool, got {tensor.dtype}.")
+    if tensor.dtype != like.dtype:
+        way_out = "; convert it with .float()" if like.is_floating_point() else ""
+        raise ValueError(f"{name} must be {str(like.dtype).removeprefix('torch.')}, got {tensor.dtype}{way_out}.")
+    _require_device(name, tensor, like.device)
