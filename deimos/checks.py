@@ -57,10 +57,11 @@ def check_positive(name: str, value: float, *, finite: bool = False) -> None:
         raise ValueError(f"{name} must be {'finite and ' if finite else ''}positive, got {value}.")
 
 
-def check_range(name: str, value: float, low: float, high: float) -> None:
-    """Raise ``ValueError`` unless ``value`` is in [low, high]."""
-    if not low <= value <= high:
-        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value}.")
+def check_range(name: str, value: float, low: float, high: float, *, finite: bool = False) -> None:
+    """Raise ``ValueError`` unless ``value`` is in [low, high], and finite if asked for."""
+    if not low <= value <= high or (finite and not math.isfinite(value)):
+        end = ")" if finite and math.isinf(high) else "]"
+        raise ValueError(f"{name} must be in [{low:g}, {high:g}{end}, got {value}.")
 
 
 def check_seed(seed: int, spare: int = 0) -> None:

@@ -1,5 +1,6 @@
 """Studies on clusters: one cell by its number, as Slurm's arrays ask for it, and what Ray is asked for."""
 
+import math
 import os
 import re
 import signal
@@ -321,7 +322,8 @@ def test_an_estimate_can_be_stopped(study, monkeypatch, capsys):
     ("options", "message"),
     [
         ({"gpus": 1.0}, "gpus are given to cells by a Ray cluster; add --engine ray"),
-        ({"gpus": -1.0, "engine": "ray"}, "gpus must be at least 0, got -1.0"),
+        ({"gpus": -1.0, "engine": "ray"}, r"gpus must be in \[0, inf\), got -1.0"),
+        ({"gpus": math.inf, "engine": "ray"}, r"gpus must be in \[0, inf\), got inf"),
         ({"workers": 0, "engine": "ray"}, "workers must be at least 1, got 0"),
     ],
 )

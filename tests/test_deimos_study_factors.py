@@ -198,6 +198,7 @@ MISTAKES = {
     "[factors]\ntimes.env_steps = [inf]": "env_steps must stay a whole number, got 2000 x inf = inf",
     "[factors]\ntimes.env.max_force = [0.0]": "Environment 'directional': max_force must be positive",
     "[factors]\nppo.epochs = { low = 3, high = 1 }": r"ppo\.epochs must have low < high",
+    "[factors]\nenv.max_speed = { low = -inf, high = 3.0 }": r"max_speed must have low < high, finite",
     "[factors]\nppo.epochs = { low = 1, high = 3 }": "must be a list of levels; only a sobol design takes a range",
     "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'half'": "kind must be one of full, .*, got 'half'",
     "[factors]\nppo.epochs = [1, 2]\n[design]\npoints = 4": r"A full \[design\] has no points; it has: kind",

@@ -1,26 +1,34 @@
 """A run's configuration: it comes back from its file whole, and what it does not know is refused."""
 
+import contextlib
+import itertools
 import json
+import math
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 import torch
 
 from deimos import plugins
+from deimos.goals import selectors
 from deimos.goals.fear import FearConfig
 from deimos.goals.methods import METHODS, method
 from deimos.goals.selector import SelectorConfig
-from deimos.goals.selectors import director
+from deimos.goals.selectors import director, vds
 from deimos.learn.ppo import PPOConfig
-from deimos.run import presets, training
+from deimos.plugins import load_all
+from deimos.run import attackers, presets, training
 from deimos.run.config import from_dict, kind, to_dict
 from deimos.run.evaluation import EvalConfig
 from deimos.run.folder import RunFolder
+from deimos.run.shield import ShieldConfig
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim import envs
 from deimos.sim.env import EnvConfig
 from deimos.sim.envs import particle
+from deimos.sim.legged.engines import PhysicsConfig
 
 CONFIGS = {
     **{f"method {name}": TrainConfig(method=name) for name in METHODS},
@@ -96,6 +104,19 @@ def test_config_refuses_what_it_does_not_know(cls, data, message):
     """An unknown field, plugin or value in a stored configuration is named, not skipped."""
     with pytest.raises(ValueError, match=message):
         from_dict(cls, data)
+
+
+def test_numbers_are_finite_unless_infinity_means_something():
+    """Every number of a configuration refuses NaN and, but for two in which it stands for no bound, infinity."""
+    plugged = [module.Config() for package in (envs, selectors, attackers) for module in load_all(package).values()]
+    accepted = set()
+    for config in (PPOConfig(), FearConfig(), PhysicsConfig(), ShieldConfig(), *plugged):
+        names = [name for name, hint in get_type_hints(type(config)).items() if hint in (float, float | None)]
+        for name, value in itertools.product(names, (math.inf, -math.inf, math.nan)):
+            with contextlib.suppress(ValueError):
+                replace(config, **{name: value})
+                accepted.add((type(config), name, value))
+    assert accepted == {(particle.Config, "max_force", math.inf), (vds.Config, "clip", math.inf)}
 
 
 def test_a_field_that_is_gone_is_read_with_the_value_that_it_has_today():

@@ -79,7 +79,7 @@ def parse(options: Any, arguments: list[str], program: str, **more: Any) -> Any:
         with contextlib.suppress(ImportError):  # then tyro's own framed messages stay, with exit code 2
             from tyro._errors import on_parse_error  # since 1.0.16, and private
 
-            stack.enter_context(on_parse_error(_refuse))
+            stack.enter_context(on_parse_error(functools.partial(_refuse, arguments)))
         if is_help:
             stack.enter_context(_wrapped_help())
         found = tyro.cli(
@@ -208,7 +208,14 @@ def _plainly(message: str) -> str:
     return tried[0] if len(tried) == 1 else message
 
 
-def _refuse(event: Any) -> None:
+def _option(argument: str) -> str:
+    """Which option, or which choice such as ``env:``, an argument gives; tyro takes several spellings."""
+    if not argument.startswith("--"):
+        return argument[: argument.find(":") + 1]
+    return re.sub(r"(^--|\.)no-", r"\1", argument.partition("=")[0].replace("_", "-"))
+
+
+def _refuse(given: list[str], event: Any) -> None:
     """Raise ``RunError`` in place of tyro's framed messages; what is not known here stays with tyro."""
     argument = getattr(event, "argument", None)
     name = argument and argument.display_name()
@@ -227,6 +234,10 @@ def _refuse(event: Any) -> None:
         case "BadValue":
             raise RunError(f"Missing value for argument '{name}'.")
         case "UnrecognizedArgs":
+            all_options, left = ([*map(_option, tokens)] for tokens in (given, event.tokens))
+            for option in filter(None, left):  # after an option of env: or selector:, tyro takes none a second time
+                if all_options.count(option) > left.count(option):
+                    raise RunError(f"{option} is given twice; give it once.")
             raise RunError(f"Unrecognized options: {' '.join(event.tokens)}.")
         case "MissingArgs":
             arguments = [found.arg for found in event.missing_arguments]

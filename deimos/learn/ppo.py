@@ -79,7 +79,7 @@ class PPOConfig:
         for name in ("learning_rate", "clip", "max_grad_norm", "reward_scale", "init_std"):
             check_positive(name, getattr(self, name), finite=True)
         for name in ("desired_kl", "value_coef", "entropy_coef"):
-            check_range(name, getattr(self, name), 0.0, math.inf)
+            check_range(name, getattr(self, name), 0.0, math.inf, finite=True)
         for name in ("discount", "gae_lambda"):
             check_range(name, getattr(self, name), 0.0, 1.0)
         check_choice("activation", self.activation, ACTIVATIONS)
@@ -239,7 +239,8 @@ class PPO(Stateful):
         """
         explained = self.batch(rollout, critic)[1]
         if order is None:
-            torch.randperm(self._rows, generator=self.generator, out=self._order)
+            own = self._order.device  # named: within ``own_settings`` it may be the CPU, whatever ``out`` is
+            torch.randperm(self._rows, generator=self.generator, out=self._order, device=own)
         else:
             self._order.copy_(order)
         value_loss = surrogate_loss = kl = math.nan

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from deimos.checks import RunError, check_at_least
+from deimos.checks import RunError, check_at_least, check_range
 from deimos.run import training
 from deimos.study import archive, factors, plan
 from deimos.study import cell as worker
@@ -53,8 +53,8 @@ class _WorkOptions(_FolderOptions):
     def __post_init__(self) -> None:
         if self.workers is not None:
             check_at_least("workers", self.workers, 1)
-        if self.gpus is not None and not self.gpus >= 0.0:
-            raise ValueError(f"gpus must be at least 0, got {self.gpus}.")
+        if self.gpus is not None:
+            check_range("gpus", self.gpus, 0.0, math.inf, finite=True)
         if self.gpus is not None and self.engine != "ray":
             raise ValueError("gpus are given to cells by a Ray cluster; add --engine ray.")
 

@@ -136,8 +136,8 @@ def _check_range(name: str, found: Mapping[str, Any]) -> None:
     low, high = found.get("low"), found.get("high")
     numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
     check_kind(f"[factors] {name}: log", found.get("log", False), bool)
-    if not numbers or not low < high < math.inf or (found.get("log") and low <= 0):  # type: ignore[operator]
-        raise RunError(f"[factors] {name} must have low < high, both positive where log = true, got {dict(found)}.")
+    if not numbers or not -math.inf < low < high < math.inf or (found.get("log") and low <= 0):  # type: ignore[operator]
+        raise RunError(f"[factors] {name} must have low < high, finite, and positive if log = true, got {dict(found)}.")
 
 
 def _full(factors: Mapping[str, list]) -> list[dict[str, Any]]:
