@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats as scipy_stats
 
 from deimos.study import effects
 
@@ -90,6 +91,37 @@ def test_an_instrument_that_measures_nothing_has_no_interval():
     outcome, base, _ = simulated(rng, 0.5)
     found = effects.instrumented_slope(outcome, base, rng.permutation(SETTINGS) / SETTINGS)
     assert (found.low, found.high) == (-math.inf, math.inf)
-    still = effects.instrumented_slope(outcome, base, np.zeros(SETTINGS))
-    assert math.isnan(still.estimate)
-    assert (still.low, still.high) == (-math.inf, math.inf)
+    alternating = np.resize([1.0, -1.0], SETTINGS)
+    for nothing in (
+        (base, np.zeros(SETTINGS)),
+        (base, np.full(SETTINGS, 0.7)),
+        (np.full(SETTINGS, 0.7), base),
+        (alternating, np.resize([1.0, 1.0, -1.0, -1.0], SETTINGS)),
+    ):  # constant, or uncorrelated
+        still = effects.instrumented_slope(outcome, *nothing)
+        assert math.isnan(still.estimate)
+        assert (still.low, still.high) == (-math.inf, math.inf)
+
+
+def test_the_interval_of_a_slope_is_what_students_test_does_not_reject():
+    """At its ends the mean of (outcome - b base) times the centred instrument is as far from 0 as 5 % allow."""
+    outcome, base, again = simulated(np.random.default_rng(4), 0.4)
+    found, centred = effects.instrumented_slope(outcome, base, again), again - again.mean()
+    assert found.estimate == pytest.approx(np.cov(outcome, again)[0, 1] / np.cov(base, again)[0, 1])
+    for end in (found.low, found.high):
+        left = centred * ((outcome - outcome.mean()) - end * (base - base.mean()))
+        ratio = left.mean() / scipy_stats.sem(left)
+        assert abs(ratio) == pytest.approx(scipy_stats.t.ppf(0.975, SETTINGS - 2))
+
+
+def test_errors_of_effects_are_hc3(design):
+    """Intervals are as many of White's errors wide, each residual over 1 - its leverage, as the permutations say."""
+    rng = np.random.default_rng(5)
+    levels, outcome = rng.permuted(design, axis=0), rng.lognormal(size=SETTINGS)
+    x = np.column_stack([np.ones(SETTINGS), levels])
+    inverse = np.linalg.inv(x.T @ x)
+    residuals = (outcome - x @ inverse @ x.T @ outcome) / (1 - np.diag(x @ inverse @ x.T))
+    errors = 2 * np.sqrt(np.diag(inverse @ (x.T * residuals**2) @ x @ inverse))[1:]
+    found = effects.factor_effects(levels, outcome, permutations=99)
+    widths = [(each.high - each.estimate) / error for each, error in zip(found, errors, strict=True)]
+    assert widths == pytest.approx([widths[0]] * 5)

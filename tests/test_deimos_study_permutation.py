@@ -145,6 +145,28 @@ def test_labels_are_permuted_within_blocks_alone():
     assert (more, less) == pytest.approx((4 / 36, 1.0))  # the other two in either order, in either block
 
 
+@pytest.mark.parametrize("kind", ["superiority", "mean", "spread"])
+@pytest.mark.parametrize(
+    ("x", "words"),
+    [([1.0], "two values or more, got samples of 1, 7"), ([1.0, math.nan, 2.0], "finite"), ([1, math.inf], "finite")],
+)
+def test_samples_that_cannot_be_compared_are_refused(kind, x, words):
+    """With a value that is not known, or a single one, no statistic is as large as the samples' own: p would be 0."""
+    with pytest.raises(ValueError, match=words):
+        permutation.p_values([np.array(x), Y], ONE, kind)
+
+
+def test_blocks_that_cannot_be_compared_are_refused():
+    """The same in blocks, which all samples must have."""
+    for bad in (math.nan, math.inf):
+        with pytest.raises(ValueError, match="finite"):
+            permutation.p_values_in_blocks([np.array([1.0, bad]), np.zeros(2)], mean_difference)
+    with pytest.raises(ValueError, match="samples must be of the same blocks, got 3, 2 values"):
+        permutation.p_values_in_blocks([np.zeros(3), np.zeros(2)], mean_difference)
+    with pytest.raises(ValueError, match="two values or more, got samples of 1, 1"):
+        permutation.p_values_in_blocks([np.ones(1), np.zeros(1)], mean_difference)
+
+
 @pytest.mark.parametrize("n", [5, 10])
 def test_detectable_spread_has_the_promised_power(n):
     """At the ratio that it names, the test itself tells fresh normal samples apart in 80 %, also of five a side."""

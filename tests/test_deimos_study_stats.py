@@ -105,10 +105,19 @@ def test_bootstrap_t_leans_towards_the_long_tail():
     assert found.high - found.estimate > 1.2 * (found.estimate - found.low)
 
 
-@pytest.mark.parametrize("interval", [stats.bootstrap_t, lambda x: stats.bootstrap([x], stats.iqm)])
-def test_constant_sample_has_no_width(interval):
+@pytest.mark.parametrize("interval", [stats.bootstrap_t, stats.student, lambda x: stats.bootstrap([x], stats.iqm)])
+@pytest.mark.parametrize("value", [2.5, 0.1, 0.7])  # of which the last two have a standard error by rounding
+def test_constant_sample_has_no_width(interval, value):
     """A population of equal values has a point as its interval, without a warning."""
-    assert interval(np.full(6, 2.5)) == stats.Interval(2.5, 2.5, 2.5)
+    found = interval(np.full(6, value))
+    assert found.estimate == found.low == found.high == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize("x", [[0.1, 0.2, 0.7], [12.345, 7.891, 3.21], [1.0, 2.0, 4.0]])
+def test_bootstrap_t_of_three_has_no_ends(x):
+    """One draw in nine is three times the same value, and has no standard error, whatever rounding leaves of it."""
+    found = stats.bootstrap_t(np.array(x))
+    assert (found.low, found.high) == (-math.inf, math.inf)
 
 
 def test_probability_of_improvement_is_mann_whitneys():
@@ -149,6 +158,28 @@ def test_detectable_probability_is_noethers():
     assert stats.detectable_probability(30, 30) == pytest.approx(0.7088, abs=1e-4)
     assert stats.detectable_probability(4, 4) == 1.0
     assert stats.detectable_probability(3, 3) == math.inf  # 3 above 3 is p = 0.1
+    assert stats.detectable_probability(3, 3, alpha=0.1) == 1.0  # and 10 % are enough for 10 %
+
+
+@pytest.mark.parametrize("n", [6, 7, 10, 20])
+def test_detectable_share_has_the_promised_power(n):
+    """At the share that it names, SciPy's two-sided sign test is significant upwards in 80 %."""
+    enough = next(k for k in range(n + 1) if k > n / 2 and scipy_stats.binomtest(k, n).pvalue <= 0.05)
+    power = scipy_stats.binom.sf(enough - 1, n, stats.detectable_share(n))
+    assert power == pytest.approx(stats.POWER)
+    assert stats.detectable_share(5) == math.inf  # five of five is p = 1/16
+
+
+def test_what_has_no_sample_is_refused():
+    """Nothing to count, no task, and pairs of different policies are errors that name the argument."""
+    with pytest.raises(ValueError, match="holds must have a value"):
+        stats.share(np.zeros(0, bool))
+    with pytest.raises(ValueError, match="pairs must hold"):
+        stats.probability_of_improvement([])
+    with pytest.raises(ValueError, match="samples must hold"):
+        stats.performance_profile([], np.zeros(1))
+    with pytest.raises(ValueError, match="x and y must be of the same policies, got 12 and 9 values"):
+        stats.share_of_pairs(X, Y)
 
 
 @pytest.mark.parametrize("x", [np.array([1.0]), np.ones((2, 2)), np.array([1.0, math.nan])])

@@ -75,7 +75,7 @@ def instrumented_slope(outcome: Array, base: Array, instrument: Array) -> Interv
     """
     n, centred = len(outcome), instrument - instrument.mean()
     above, below = centred * (outcome - outcome.mean()), centred * (base - base.mean())
-    if not below.any():
+    if any(len({*x}) < 2 for x in (base, instrument)) or not below.mean():  # rounding leaves constants a covariance
         return Interval(np.nan, -np.inf, np.inf)
     slope = above.mean() / below.mean()
     (aa, ab), (_, bb) = np.cov(above, below) / n

@@ -88,7 +88,11 @@ def p_values(
 
     Returns:
         Small where the first ones have more, and small where they have less, each of shape (...).
+
+    Raises:
+        ValueError: If a sample has fewer than two values, or one that is not finite.
     """
+    _check(samples)
     if kind == "spread":
         samples = [x - np.median(x, axis=-1, keepdims=True) for x in samples]
     sizes = np.array([x.shape[-1] for x in samples])
@@ -119,7 +123,13 @@ def p_values_in_blocks(
         statistic: Of the samples; the larger, the more has what is claimed to have more.
         permutations: How many random ones at most; ``None``: ``PERMUTATIONS``.
         seed: Of the permutations.
+
+    Raises:
+        ValueError: If samples have fewer than two values, different numbers of them, or one that is not finite.
     """
+    _check(samples)
+    if len({len(x) for x in samples}) > 1:
+        raise ValueError(f"samples must be of the same blocks, got {', '.join(str(len(x)) for x in samples)} values.")
     more, less = (
         stats.permutation_test(
             samples, lambda *x, axis: statistic(*x), permutation_type="samples", vectorized=True,
@@ -148,6 +158,15 @@ def detectable_spread(n: int, m: int, alpha: float = 0.05) -> float:
 
     top = math.log(100)
     return math.inf if lacking(top) > 0 else math.exp(optimize.bisect(lacking, 0.0, top, xtol=0.03))
+
+
+def _check(samples: Sequence[Array]) -> None:
+    """Refuse what no order could be compared with, so that each would look more extreme than all others."""
+    if min(x.shape[-1] for x in samples) < 2:
+        sizes = ", ".join(str(x.shape[-1]) for x in samples)
+        raise ValueError(f"A sample must hold two values or more, got samples of {sizes}.")
+    if not all(np.isfinite(x).all() for x in samples):
+        raise ValueError("A sample must hold finite values; leave out policies whose value is not known.")
 
 
 def _blocks(studies: int, permutations: int, number: int) -> Iterator[tuple[slice, slice]]:

@@ -104,13 +104,14 @@ def bootstrap_t(x: Array, *, resamples: int | None = None, seed: int = 0) -> Int
     """
     x = _checked(x)
     mean, error = float(x.mean()), float(stats.sem(x))
-    if error == 0.0:
+    if _constant(x):
         return Interval(mean, mean, mean)
 
     def student(draws: Array) -> Array:
         away = draws.mean(axis=-1) - mean
+        errors = np.where(_constant(draws), 0.0, stats.sem(draws, axis=-1))
         with np.errstate(divide="ignore", invalid="ignore"):  # infinite where all drawn values are the same
-            return np.where(away == 0.0, 0.0, away / stats.sem(draws, axis=-1))
+            return np.where(away == 0.0, 0.0, away / errors)
 
     low, high = _ends(distribution([x], student, resamples=resamples, seed=seed))
     return Interval(mean, mean - high * error, mean - low * error)
@@ -120,7 +121,7 @@ def student(x: Array) -> Interval:
     """Student's interval of the mean: exact for normal samples, and the one for a handful of differences of pairs."""
     x = _checked(x)
     mean, error = float(x.mean()), float(stats.sem(x))
-    if error == 0.0:
+    if _constant(x):
         return Interval(mean, mean, mean)
     return Interval(mean, *map(float, stats.t.interval(LEVEL, len(x) - 1, mean, error)))
 
@@ -136,6 +137,8 @@ def share(holds: NDArray[np.bool_]) -> Interval:
     References:
         .. [1] Clopper and Pearson, *The Use of Confidence or Fiducial Limits*, Biometrika 26, 1934.
     """
+    if not len(holds):
+        raise ValueError("holds must have a value for one policy or more, got none.")
     found = stats.binomtest(int(holds.sum()), len(holds))
     interval = found.proportion_ci(LEVEL)
     return Interval(float(found.statistic), float(interval.low), float(interval.high))
@@ -147,6 +150,8 @@ def share_of_pairs(x: Array, y: Array) -> Interval:
     Ties count as lost at its lower end and as won at its upper one.
     """
     x, y = _checked(x), _checked(y)
+    if len(x) != len(y):
+        raise ValueError(f"x and y must be of the same policies, got {len(x)} and {len(y)} values.")
     lost, won = share(x > y), share(x >= y)
     return Interval((lost.estimate + won.estimate) / 2, lost.low, won.high)
 
@@ -159,6 +164,8 @@ def probability_of_improvement(
     References:
         .. [1] Agarwal et al., arXiv:2108.13264, section 4.3.
     """
+    if not pairs:
+        raise ValueError("pairs must hold the samples of one task or more, got none.")
     rng, resamples = np.random.default_rng(seed), resamples or RESAMPLES
     estimate, values = 0.0, np.zeros(resamples)
     for x, y in pairs:
@@ -180,6 +187,8 @@ def performance_profile(
     References:
         .. [1] Agarwal et al., arXiv:2108.13264, section 4.2.
     """
+    if not samples:
+        raise ValueError("samples must hold that of one task or more, got none.")
     rng, resamples = np.random.default_rng(seed), resamples or RESAMPLES
     above = [_checked(x)[:, None] > thresholds for x in samples]
     values = sum(_drawn(len(x), resamples, rng) @ x / len(samples) for x in above)
@@ -200,7 +209,7 @@ def detectable_probability(n: int, m: int, alpha: float = 0.05) -> float:
     References:
         .. [1] Noether, *Sample Size Determination for Some Common Nonparametric Tests*, JASA 82, 1987.
     """
-    if 2 / math.comb(n + m, n) >= alpha:
+    if 2 / math.comb(n + m, n) > alpha:
         return math.inf
     z = stats.norm.ppf(1 - alpha / 2) + stats.norm.ppf(POWER)
     return min(1.0, 0.5 + float(z) * math.sqrt((n + m) / (12 * n * m)))
@@ -238,6 +247,11 @@ def _ends(values: Array, level: float = LEVEL) -> tuple[float, float]:
     ends = (1 - level) / 2, (1 + level) / 2
     low, high = np.quantile(values, ends, method="linear" if np.isfinite(values).all() else "nearest")
     return float(low), float(high)
+
+
+def _constant(x: Array) -> Array:
+    """Whether all values along the last axis are equal: rounding leaves equal values a standard error above 0."""
+    return x.max(axis=-1) == x.min(axis=-1)
 
 
 def _checked(x: Array) -> Array:
