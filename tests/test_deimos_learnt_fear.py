@@ -17,8 +17,10 @@ from deimos.goals.methods import method
 from deimos.goals.selector import Spaces
 from deimos.goals.selectors import mix, schedule
 from deimos.run import training
+from deimos.run.evaluation import EvalConfig
 from deimos.run.fear import load_fear
 from deimos.run.saved import SavedRun
+from deimos.run.shield import ShieldConfig, shield_run
 
 METHODS = {
     name: method(name)
@@ -108,8 +110,22 @@ def test_what_earlier_versions_saved_is_read(tmp_path):
     assert found.beta == 0.0 != trainer.loop.selector.beta
     mixed = SavedRun(saved.folder, replace(saved.config, selector=mix.Config(base="boltzmann")))
     assert_same(mixed.fear(env).calibration.state_dict(), found.calibration.state_dict())
-    torch.save({"schema": 1, "ppo": {}}, path / "checkpoint.pt")
+    torch.save({"schema": 2, "ppo": {}}, path / "checkpoint.pt")
     assert saved.selector(env) is None
+
+
+def test_a_run_of_0_1_has_no_fear(tmp_path):
+    """Its fear network had other layers: the run can be watched without, and a shield says why it needs another."""
+    path = tmp_path / "run"
+    finished(replace(CONFIG, env_steps=48), path)
+    state = torch.load(path / "checkpoint.pt")
+    state["loop"]["selector"] = {"fear": {"weights": torch.zeros(1, 3)}}
+    torch.save(state | {"schema": 1}, path / "checkpoint.pt")
+    saved = SavedRun.open(path)
+    assert saved.selector(saved.build(1, seed=0, world=0)) is None
+    assert BY_HAND in Session(saved, 1, seed=0).names
+    with pytest.raises(RunError, match=r"has no fear network that has learnt \(those of Deimos 0\.1 are not read\)"):
+        shield_run(saved.folder, saved.config, ShieldConfig(), EvalConfig(worlds=2), torch.device("cpu"))
 
 
 def test_what_does_not_fit_is_one_line(tmp_path):

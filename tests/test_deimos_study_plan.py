@@ -151,9 +151,10 @@ def test_cell_survives_its_file(tmp_path):
     cell = plan.Cell(environment="x", config=TrainConfig(method="vds+p75", seed=3), goal_periods=(20, 100))
     (tmp_path / "cell.json").write_text(json.dumps(cell.to_dict()))
     assert plan.read_cell(tmp_path / "cell.json") == cell
-    (tmp_path / "cell.json").write_text('{"schema": 99}')
-    with pytest.raises(RunError, match="its schema is 99, not 2"):
-        plan.read_cell(tmp_path / "cell.json")
+    for schema, way in ((99, r"\)\."), (1, "; deimos study report and merge still read its tables")):
+        (tmp_path / "cell.json").write_text(json.dumps({"schema": schema}))
+        with pytest.raises(RunError, match=f"its schema is {schema}, not 2{way}"):
+            plan.read_cell(tmp_path / "cell.json")
 
 
 ERRORS = {

@@ -11,9 +11,13 @@ from deimos.run.trainer import TrainConfig
 from deimos.run.training import load_checkpoint
 from deimos.sim.env import Env
 
+OLDEST_SCHEMA = 2  # of checkpoint.pt; the fear networks of earlier ones have other layers, and are not read
+
 
 def load_selector(folder: RunFolder, config: TrainConfig, env: Env) -> GoalSelector | None:
     """The selector of a run with all that it has learnt; ``None`` if it has no fear network that has learnt.
+
+    Nor has a run of Deimos 0.1.
 
     It may be asked to propose, but must not be told what it issued: its state belongs to the worlds of the training.
 
@@ -30,7 +34,10 @@ def load_selector(folder: RunFolder, config: TrainConfig, env: Env) -> GoalSelec
     afraid = fear_selector(selector)
     if afraid is None:
         return None
-    state = load_checkpoint(folder).get("loop", {}).get("selector", {})  # some hold only networks
+    checkpoint = load_checkpoint(folder)
+    if checkpoint["schema"] < OLDEST_SCHEMA:
+        return None
+    state = checkpoint.get("loop", {}).get("selector", {})  # some hold only networks
     try:
         _restore(selector, state)
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:

@@ -377,8 +377,8 @@ def shield_run(
     afraid = load_fear(folder, config, env_config.build(1, device, config.seed))
     if afraid is None:
         raise RunError(
-            f"{folder.path} has no fear network that has learnt, which a shield needs; train with a method that has "
-            "one, such as --method p25."
+            f"{folder.path} has no fear network that has learnt (those of Deimos 0.1 are not read), which a shield "
+            "needs; train with a method that has one, such as --method p25."
         )
     with torch_on_one():
         target = make_target(policy.scaled, env_config, eval_config, device)

@@ -200,7 +200,8 @@ def read_cell(path: Path) -> Cell:
     data = RunFolder(path.parent).read_json(path.name)
     try:
         if (found := data.pop("schema")) != SCHEMA:
-            raise ValueError(f"its schema is {found}, not {SCHEMA}")
+            way = "; deimos study report and merge still read its tables" if found == 1 else ""
+            raise ValueError(f"its schema is {found}, not {SCHEMA}{way}")
         import_plugins(data["plugins"])
         return from_dict(Cell, data, stored=True)
     except (AttributeError, KeyError, RunError, TypeError, ValueError) as error:
