@@ -26,6 +26,7 @@ from benchmarks import (
     viewer,
 )
 from benchmarks.timing import wide_console
+from deimos.app.console import parse
 from deimos.checks import RunError, check_at_least, check_positive
 from deimos.nn.threads import torch_on_one
 from deimos.run.trainer import TrainConfig
@@ -199,7 +200,7 @@ def main(arguments: list[str]) -> int:
     """Run the command line; returns the exit code."""
     wp.config.quiet = True
     try:
-        run(tyro.cli(BenchOptions, args=arguments, prog="python -m benchmarks"))
+        run(parse(BenchOptions, arguments, "python -m benchmarks"))
     except (RunError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from deimos.app.console import parse
 from deimos.checks import RunError, check_at_least
 from deimos.study.cli import ReportOptions
 from reproduction import coverage
@@ -84,7 +84,7 @@ def main(arguments: list[str]) -> int:
         return 0 if name in ("-h", "--help") else 2
     options, command = COMMANDS[name]
     try:
-        command(tyro.cli(options, args=arguments[1:], prog=f"python -m reproduction {name}"))
+        command(parse(options, arguments[1:], f"python -m reproduction {name}"))
     except (RunError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -16,6 +16,7 @@ import tyro
 import warp as wp
 
 from benchmarks.faults import files, injections, kills, memory, options, tomls
+from deimos.app.console import parse
 from deimos.checks import RunError, check_at_least
 from deimos.files import write_bytes
 from deimos.run.training import provenance
@@ -90,7 +91,7 @@ def main(arguments: list[str]) -> int:
     with contextlib.redirect_stdout(sys.stderr):
         wp.init()
     try:
-        found = run(tyro.cli(FaultOptions, args=arguments, prog="python -m benchmarks.faults"))
+        found = run(parse(FaultOptions, arguments, "python -m benchmarks.faults"))
     except (RunError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
