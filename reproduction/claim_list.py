@@ -289,7 +289,7 @@ DISCUSSION = (
               Matters(ATTACKED, NAIVE, PARTICLE_METHODS)),
         *_say(662, "the goal distribution during training holds more importance", LEGGED,
               Matters(ATTACKED, NAIVE, LEGGED_METHODS)),
-    ), note="By ranks, so that it does not hang on the scale: omega^2 of log crashes and of crashes disagree."),
+    ), note="By ranks, so that it does not depend on the scale: omega^2 of log crashes and of crashes disagree."),
     Claim("C25", "Over p, safety, score and variance are a hump: best inside, worse at Coop and Antagonist.", (
         *_hump("p25", PARTICLE), *_hump("p50", LEGGED),
     )),

@@ -131,7 +131,8 @@ class Alike:
             return None
         x, y = (self.values(samples[name]) for name in self.methods)
         sides = _sides_in_blocks if evidence.paired(place, self.methods) else _sides
-        middle = float(np.median(x - y if sides is _sides_in_blocks else x[:, None] - y))  # Hodges and Lehmann's
+        # Without blocks Hodges and Lehmann's estimate of the shift.
+        middle = float(np.median(x - y if sides is _sides_in_blocks else x[:, None] - y))
         interval = Interval(middle, -_furthest(y, x, sides), _furthest(x, y, sides))
         reachable = self._reachable(len(x)) if sides is _sides_in_blocks else (0.0, 0.0)
         within = max(interval.high, 0.0 if self.at_most else -interval.low)
@@ -366,7 +367,7 @@ class Matters:
 
 
 def omega_squared(values: Array, sizes: Sequence[int]) -> Array:
-    """Unbiased share of the variance between consecutive groups along the last axis; over the others."""
+    """Share of the variance between consecutive groups along the last axis, less what chance explains."""
     groups = np.split(values, np.cumsum(sizes)[:-1], axis=-1)
     total = ((values - values.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1)
     within = sum(((x - x.mean(axis=-1, keepdims=True)) ** 2).sum(axis=-1) for x in groups)

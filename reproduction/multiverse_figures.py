@@ -13,13 +13,13 @@ from reproduction.multiverse import (
     Roles,
     Setting,
     coded,
+    gain_slope,
     having,
     headlines,
     margins,
     mean,
     methods_of,
     moved_by,
-    removed,
     share_that_holds,
 )
 
@@ -36,8 +36,8 @@ CURVE = (
 )
 ROOM = (
     "By how much a method's policy crashes less than Uniform's, over how often that of another seed crashes. The line "
-    "is what the instrumental variable finds: a slope of 1 removes all danger, one of 0 none. Both axes: crashes per "
-    "interaction under the worst attacker, in percent."
+    "is what the instrumental variable finds: a slope of 1 removes all danger, one of 0 gains as much everywhere, be "
+    "that nothing or not. Both axes: crashes per interaction under the worst attacker, in percent."
 )
 SHARES = (
     "Share of the settings with headroom in which a clause holds, with its exact 95 % interval. A clause that compares "
@@ -125,13 +125,13 @@ def over_headroom(settings: Sequence[Setting], methods: Sequence[str]) -> "Figur
         room = 100 * np.array([each.screened.worst for each in own])
         base = 100 * np.array([each.policies[UNIFORM].worst for each in own])
         effect = base - 100 * np.array([each.policies[name].worst for each in own])
-        slope = removed(settings, name)
+        slope = gain_slope(settings, name)
         panel.axhline(0.0, color="black", linewidth=0.8)
         panel.plot(room, effect, linestyle="", marker="o", markersize=3.5, color=BLUE, alpha=0.7)
         if np.isfinite(slope.low):
             ends = np.array([0.0, 100.0])
             panel.plot(ends, effect.mean() + slope.estimate * (ends - base.mean()), color=RED, linewidth=1)
-        panel.set_title(f"{name}: removes\n{slope_named(slope)}")
+        panel.set_title(f"{name}: slope\n{slope_named(slope)}")
         panel.grid(alpha=0.3)
         panel.set_xlim(-4, 104)
         panel.set_ylim(-104, 104)

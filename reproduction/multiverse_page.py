@@ -160,8 +160,8 @@ def _mapped(settings: Sequence[Setting], new: str) -> list[Block]:
         {"method": each.method, "policies below 1 % [%]": f"{100 * each.safe.estimate:.0f}",
          "95 %": f"[{100 * each.safe.low:.0f}, {100 * each.safe.high:.0f}]",
          "mean attacked rate": f"{each.worst:.3f}", "score / Uniform's where learnt": f"{each.score:.3f}",
-         "part of the headroom that it removes":
-         "-" if each.method == UNIFORM else slope_named(multiverse.removed(settings, each.method))}
+         "slope of its gain over Uniform's danger":
+         "-" if each.method == UNIFORM else slope_named(multiverse.gain_slope(settings, each.method))}
         for each in multiverse.standings(settings)
     ]  # fmt: skip
     chosen = multiverse.most_headroom(settings)

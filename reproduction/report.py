@@ -26,7 +26,7 @@ PAIRED = (
     "Policies that branched off the same base are compared with each other alone: clauses permute and resample "
     "within bases, and two methods have the exact interval of a share of bases. Two methods on five bases cannot be "
     "ordered by that, for even five of five is p = 1/16 on both sides; nor can it be decided what most policies do, "
-    "or how much hangs on the method. That two methods are alike could be held on five bases (p = 1/32), but not "
+    "or how much depends on the method. That two methods are alike could be held on five bases (p = 1/32), but not "
     "refused (1/16), so such clauses are undecided too. Clauses that order three methods or more can be decided: "
     "wrongly in at most 5 % of studies, also where one method varies more from run to run than up to six others; "
     "than more, in up to 17 %. Fewer than five bases give estimates without a verdict."
@@ -66,7 +66,7 @@ def page(data: Data, pictures: report.Pictures, out: Path, speeds: Sequence[Mapp
     first = drawing.write({CLAUSES: (" ".join([overview.CAPTION, *pairs]), figure)}, out / report.FIGURES)
     return [
         "# What the thesis claims, clause by clause", _summary(outcomes, data), *first,
-        "# The study", *_lines(outcomes), *report.environments(data, pictures), *report.over_all(data),
+        *_lines(outcomes), *report.environments(data, pictures), *report.over_all(data),
         *legged_contrasts.blocks(evidence), *report.what_was_run(data), *deviations.blocks(data.environments),
         *report.speed(data), *report.distributions(data),
         "## Every clause", *[block for outcome in outcomes for block in _details(outcome)],

@@ -6,16 +6,24 @@ import numpy as np
 import pytest
 
 from deimos.study.data import Data
-from reproduction import multiverse, multiverse_page
+from deimos.study.permutation import p_values
+from deimos.study.stats import bootstrap
+from reproduction import multiverse
 from reproduction.multiverse import UNIFORM, Roles
-from reproduction.multiverse_page import MultiverseOptions, write
+from reproduction.multiverse_page import OURS, MultiverseOptions, write
 
 DOCS = Path(__file__).parent.parent / "docs"
 RESULTS = DOCS / "results"
-PAGE, LAB, README = (
+PAGE, LAB, README, PARTICLE = (
     " ".join(path.read_text(encoding="utf-8").split())
-    for path in (DOCS / "multiverse.md", DOCS / "lab" / "multiverse.md", DOCS.parent / "README.md")
+    for path in (
+        DOCS / "multiverse.md",
+        DOCS / "lab" / "multiverse.md",
+        DOCS.parent / "README.md",
+        DOCS / "particle.md",
+    )
 )
+OURS_STUDY = "multiverse_ours"
 NAMES = {"uniform": "Uniform", "rnd": "RND"}
 
 
@@ -29,6 +37,13 @@ def settings():
 def room(settings):
     """Those with headroom."""
     return [each for each in settings if each.has_headroom]
+
+
+def worst(folder, environment, name):
+    """Crashes of a method's policies under the worst attacker in a study [%], by their seeds."""
+    rows = Data.read(RESULTS / folder).rows
+    own = [row for row in rows if (row["environment"], row["method"], row["goals"]) == (environment, name, "naive")]
+    return np.array([100 * row["worst"] for row in sorted(own, key=lambda row: row["seed"])])
 
 
 def safer(settings, name):
@@ -63,18 +78,25 @@ def test_one_choice_moves_one_headline(settings):
     ((clause, factor, effect),) = found
     assert (clause, factor) == ("p beats a penalty", "env.reward")
     assert f"by {effect.estimate:.0f} points [{effect.low:.0f}, {effect.high:.0f}]" in PAGE
+    margins = 100 * multiverse.margins(settings, next(
+        each for each in multiverse.headlines(Roles.of(settings)) if each.name == clause
+    ))  # fmt: skip
+    reciprocal = np.array([each.levels[factor] == "reciprocal" for each in settings])
+    learnt = reciprocal & np.array([each.learnt for each in settings])
+    assert (reciprocal.sum(), learnt.sum()) == (16, 6)
+    assert (
+        f"The margin is {margins[reciprocal].mean():.0f} points over all 16 settings with this reward, "
+        f"{margins[learnt].mean():.0f} over the six of them"
+    ) in PAGE
 
 
 def test_the_page_has_the_methods(settings):
-    """Rates, scores and slopes, in the order of the page; and the best new selector."""
+    """Rates and scores, in the order of the page; and the best new selector."""
     standings = multiverse.standings(settings)
     place = -1
     for each in standings:
-        score, slope = "1", ""
-        if each.method != UNIFORM:
-            score, slope = f"{each.score:.2f}", f"{multiverse.removed(settings, each.method):.2f} "
-        name = NAMES.get(each.method, each.method)
-        line = f"| {name} | {100 * each.worst.estimate:.0f} | {score} | {slope}|"
+        score = "1" if each.method == UNIFORM else f"{each.score:.2f}"
+        line = f"| {NAMES.get(each.method, each.method)} | {100 * each.worst.estimate:.0f} | {score} |"
         assert PAGE.find(line) > place
         place = PAGE.find(line)
     assert multiverse.best_new(standings) == "weighted"
@@ -82,15 +104,39 @@ def test_the_page_has_the_methods(settings):
     assert able == ["weighted"]
 
 
+def test_the_lab_says_how_gain_goes_with_danger(settings):
+    """Slopes over all settings and over the learnt ones, and the share of Uniform's mean rate that is gone."""
+    learnt = [each for each in settings if each.learnt]
+    assert len(learnt) == 19
+    both, mean_of = [], {
+        name: np.mean([each.policies[name].worst for each in settings]) for name in multiverse.methods_of(settings)
+    }  # fmt: skip
+    for name in mean_of.keys() - {UNIFORM}:
+        slopes = [multiverse.gain_slope(own, name) for own in (settings, learnt)]
+        gone = 1 - mean_of[name] / mean_of[UNIFORM]
+        assert f"| {name} | {slopes[0]:.2f} | {slopes[1]:.2f} | {gone:.2f} |" in LAB
+        both += [name] if min(each.low for each in slopes) > 0.0 else []
+    assert both == []
+
+
+def test_pages_repeat_the_first_hypothesis(settings):
+    """p75 beside Uniform on the seeds of its test, on those of the confirmation, and on all."""
+    first, second = ([worst(folder, OURS, name) for name in (UNIFORM, "p75")] for folder in ("particle_d", OURS_STUDY))
+    samples = (first, second, [np.concatenate(pair) for pair in zip(first, second, strict=True)])
+    for title, (uniform, own) in zip(("particle_d`", "59", "all 50, exploratory"), samples, strict=True):
+        gain = bootstrap([uniform, own], lambda x, y: x.mean(axis=-1) - y.mean(axis=-1))
+        p, _ = p_values([uniform, own], [(0, 1)], "mean")
+        assert f"{title} | {uniform.mean():.1f} | {own.mean():.1f} | {gain:.1f} | {p:.4f} |" in LAB
+    ours = [f"{each.mean():.1f}" for each in second]
+    assert f"p75 crashes on {ours[1]} % ({first[1].mean():.1f} before), Uniform on {ours[0]} %" in README
+    assert f"gains less: {ours[0]} to {ours[1]} % (here {first[0].mean():.1f} to {first[1].mean():.1f})" in PARTICLE
+
+
 def test_pages_have_the_confirmation():
     """Rates of all methods, what the new selector does to Uniform's rate and score, and that it misses both aims."""
-    data = Data.read(RESULTS / "multiverse_ours")
-    rows = [row for row in data.rows if row["goals"] == "naive"]
-    rate = {
-        name: f"{100 * np.mean([row['worst'] for row in rows if row['method'] == name]):.1f}"
-        for name in data.methods(multiverse_page.OURS)
-    }
-    found = {each.rival: each for each in multiverse.contrasts(data, multiverse_page.OURS, "weighted")}
+    data = Data.read(RESULTS / OURS_STUDY)
+    rate = {name: f"{worst(OURS_STUDY, OURS, name).mean():.1f}" for name in data.methods(OURS)}
+    found = {each.rival: each for each in multiverse.contrasts(data, OURS, "weighted")}
     assert all(each.n == (30, 30) and each.p <= 0.05 and each.lower.low > 0.0 for each in found.values())
     uniform = found.pop("uniform")
     assert all(each.score.low > 1.0 for each in found.values())
@@ -98,18 +144,32 @@ def test_pages_have_the_confirmation():
     assert uniform.ratio.estimate < multiverse.AIM
     assert uniform.score.estimate < multiverse.AIM_SCORE
     ratio, score = f"{uniform.ratio:.2f}", f"{uniform.score:.3f}"
-    assert (
-        f"on {rate['weighted']} % of goals, p75's on {rate['p75']}, RND's on {rate['rnd']}, Uniform's on "
-        f"{rate['uniform']}, VDS's on {rate['vds']}: fewer than each (corrected p at most "
-        f"{max(each.p for each in found.values()):.3f})"
-    ) in PAGE
+    assert f"| {' | '.join(rate[name] for name in ('uniform', 'p75', 'rnd', 'vds', 'weighted'))} |" in PAGE
+    assert f"safer than each (corrected p at most {max(each.p for each in found.values()):.3f})" in PAGE
     assert f"Uniform crashes {ratio} times as often; weighted has {score} of its score" in PAGE
     for each in (ratio, score):
         assert each.split(maxsplit=1)[1] in LAB
     assert (
-        f"crashes on {rate['weighted']} %, Uniform on {rate['uniform']} %, at {uniform.score.estimate:.3f} of its "
-        f"score (30 seeds, p = {uniform.p:.3f})"
+        f"Uniform on {rate['uniform']} %, and `weighted`, ours, on {rate['weighted']} % at "
+        f"{uniform.score.estimate:.3f} of Uniform's score (p = {uniform.p:.3f})"
     ) in README
+
+
+def test_pages_have_the_setting_with_most_headroom():
+    """Rates of all methods; the new selector is safer than Uniform there, and less safe than the others."""
+    data = Data.read(RESULTS / "multiverse_headroom")
+    (name,) = data.environments
+    assert name == "map.03"
+    rates = [f"{worst('multiverse_headroom', name, own).mean():.1f}" for own in ("uniform", "p75", "rnd")]
+    assert f"| {' | '.join(rates)} | | {worst('multiverse_headroom', name, 'weighted').mean():.1f} |" in PAGE
+    found = {each.rival: each for each in multiverse.contrasts(data, name, "weighted")}
+    assert found["p75"].lower.high < 0.0
+    assert found["rnd"].lower.high < 0.0
+    uniform, p75, rnd = (found[own] for own in ("uniform", "p75", "rnd"))
+    assert f"in the other than Uniform (p = {uniform.p:.4f}) but not than p75 and RND" in PAGE
+    assert f"by a factor of {uniform.ratio:.2f} at {uniform.score:.3f} of its score" in LAB
+    assert f"their rates are {p75.ratio:.2f} and {rnd.ratio:.2f} of its own, at lower scores" in LAB
+    assert min(p75.score.low, rnd.score.low) > 1.0
 
 
 def test_pages_count_settings(settings, room):
@@ -117,9 +177,9 @@ def test_pages_count_settings(settings, room):
     unlearnt = [each for each in settings if not each.learnt]
     reciprocal = [each for each in unlearnt if each.levels["env.reward"] == "reciprocal"]
     assert (len(settings), len(room), len(unlearnt), len(reciprocal)) == (32, 16, 13, 10)
-    assert "finds 16 settings with *headroom*" in PAGE
-    assert "In 13 others it has not learnt the task, ten of them" in PAGE
-    assert f"in {sum(each.learnt and not each.has_headroom for each in settings)} it is safe" in PAGE
+    assert "finds *headroom* in 16 settings" in PAGE
+    assert "In 13 the task is not learnt, in ten of these the reward is reciprocal" in PAGE
+    assert f"in {sum(each.learnt and not each.has_headroom for each in settings)} it is learnt safely" in PAGE
     assert f"over the {sum(each.compares_scores for each in settings)} settings where scores can be compared" in PAGE
     assert multiverse.most_headroom(settings).name == "map.03"
 
@@ -155,7 +215,9 @@ def test_the_lab_says_what_a_penalty_does_without_headroom(settings, room):
 
 def test_the_report_is_what_the_analysis_writes(tmp_path):
     """Word for word."""
-    screening, mapped, ours = (RESULTS / name for name in ("multiverse_screening", "multiverse", "multiverse_ours"))
-    write(MultiverseOptions(out=tmp_path, screening=screening, map=mapped, confirmations=(ours,)))
+    screening, mapped, *confirmed = (
+        RESULTS / f"multiverse{name}" for name in ("_screening", "", "_ours", "_headroom", "_long")
+    )
+    write(MultiverseOptions(out=tmp_path, screening=screening, map=mapped, confirmations=tuple(confirmed)))
     wanted = (tmp_path / "multiverse.md").read_text(encoding="utf-8")
     assert (RESULTS / "map" / "multiverse.md").read_text(encoding="utf-8") == wanted

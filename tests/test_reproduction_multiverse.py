@@ -160,7 +160,7 @@ def test_every_headline_clause_says_what_it_tests():
 def test_part_of_headroom_is_not_found_where_there_is_none():
     """A method that removes half of the danger has a slope of a half; one that is Uniform again has none."""
     settings = simulated(lambda method, levels, base: base * (0.5 if method == "rnd" else 1.0), noise=0.15)
-    half, none = multiverse.removed(settings, "rnd"), multiverse.removed(settings, "p75")
+    half, none = multiverse.gain_slope(settings, "rnd"), multiverse.gain_slope(settings, "p75")
     assert half.low <= 0.5 <= half.high
     assert none.low <= 0.0 <= none.high
 
