@@ -117,6 +117,35 @@ def test_the_check_of_paths_finds_what_it_looks_for(tmp_path):
     assert [name for name, _ in named_paths(page)] == ["a/b.py", "images/c.png", "d.md"]
 
 
+def lost(text):
+    """Lines of a page that its readers would not see as they are meant, outside its blocks of code.
+
+    On the site a line that begins with % is a comment; a blank line ends a table, and further rows are text.
+    """
+    text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r"^ *%.*$", text, re.MULTILINE) + re.findall(r"^\|.*\n\n(\|.*)\n(?!\|[-:])", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(HOME).as_posix())
+def test_no_line_of_a_page_is_lost(page):
+    """No line is a comment of the site by accident, and no table is cut in two."""
+    assert lost(page.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("with it 7.9\n  % instead of 4.1 %\n", ["  % instead of 4.1 %"]),
+        ("```text\n% of a program\n```\n7.9 % of all\n", []),
+        ("| a |\n|---|\n| 1 |\n\n| 2 |\n", ["| 2 |"]),
+        ("| a |\n|---|\n| 1 |\n\n| b |\n|---|\n| 2 |\n", []),
+    ],
+)
+def test_the_check_of_lines_finds_what_it_looks_for(text, found):
+    """Accidental comments and halves of tables are found; code and a second table are not."""
+    assert lost(text) == found
+
+
 def words(page):
     """Words of a page outside its blocks of code."""
     return len(re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL).split())

@@ -83,7 +83,7 @@ def draw_calibration(folder: RunFolder, audited: "dict[str, tuple[Tensor, Tensor
 
     figure = Figure(figsize=(6, 7), layout="constrained")
     curves, histogram = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)
-    curves.plot([0, 1], [0, 1], color="grey", linewidth=0.8, linestyle=":", label="honest probabilities")
+    curves.plot([0, 1], [0, 1], color="grey", linewidth=0.8, linestyle=":", label="calibrated")
     for (name, (probability, crashed)), colour, marker in zip(audited.items(), (ORANGE, BLUE), "so", strict=False):
         bins = reliability(probability, crashed)
         low, high = wilson(bins.observed.numpy(), bins.count.numpy())
