@@ -4,6 +4,7 @@ import json
 import re
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,9 @@ import torch
 from deimos.app import cli, console, doctor, gpu_stages
 from deimos.app.train import FolderOptions
 from deimos.checks import RunError
+from deimos.goals.fear_selector import FearSelector
 from deimos.run.trainer import Trainer
+from deimos.sim import graphs
 
 CPU = torch.device("cpu")
 NEEDS_CUDA = ("tests", "waits", "graphs")
@@ -216,3 +219,54 @@ def test_the_stage_of_waits_steps_a_director_that_does_not_wait(monkeypatch):
         with replay.counted() as calls:
             step()
         assert not calls.waits
+
+
+def test_what_torch_says_of_its_search_is_no_wait(monkeypatch):
+    """Of its warnings, those that name a wait count, each with its line; the one about the search itself does not."""
+
+    def set_mode(mode):
+        if mode == "warn":
+            warnings.warn("Synchronization debug mode is a prototype feature and does not yet detect all", stacklevel=1)
+
+    def work():
+        if waiting:
+            warnings.warn("called a synchronizing CUDA operation", stacklevel=1)
+
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", set_mode)
+    waiting = False
+    assert gpu_stages._waits_in(work) == {}
+    waiting = True
+    (place,) = gpu_stages._waits_in(work).items()
+    assert re.fullmatch(r"test_deimos_doctor\.py:\d+", place[0])
+    assert place[1] == 1
+
+
+def test_speeds_are_those_of_replays(monkeypatch):
+    """Where there are graphs, the stages that measure speed time iterations in which everything was replayed."""
+    replay.replay_on_cpu(monkeypatch)
+    recorded, eager = [], []
+    make = Trainer._make_steps
+
+    class Noted(replay.Replay):
+        def __init__(self, work, device):
+            recorded.append(work)
+            super().__init__(work, device)
+
+    monkeypatch.setitem(graphs.RECORDERS, "cpu", Noted)
+    monkeypatch.setattr(Trainer, "_make_steps", lambda self: eager.append(self) or make(self))
+    # As with many worlds, in which fear has crashes to learn from at once.
+    monkeypatch.setattr(FearSelector, "graph_key", lambda self: self._learnt_at > 0)
+
+    def since(begin, device):
+        """1 s for an iteration that was replayed, else more."""
+        took = 1.0 + len(recorded) + len(eager)
+        recorded.clear()
+        eager.clear()
+        return took
+
+    monkeypatch.setattr(gpu_stages, "_since", since)
+    found = gpu_stages.scales(CPU, gpu_stages.SMALL)
+    steps = gpu_stages._config(1).ppo.num_steps
+    assert {int(worlds): part["FPS"] for worlds, part in found.items()} == {
+        n: n * steps for n in gpu_stages.SMALL.scales
+    }

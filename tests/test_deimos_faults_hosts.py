@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.utils._device import _device_constructors
 
 import deimos
 from deimos.learn.policy import load_policy
@@ -119,6 +120,26 @@ def test_tensors_name_their_dtype():
             match node:
                 case ast.Call(func=ast.Attribute(value=ast.Name("torch"), attr=made)) if made in FLOATS:
                     if "dtype" not in {keyword.arg for keyword in node.keywords}:
+                        wrong.append(f"{path.name}:{node.lineno}: {ast.unparse(node)}")
+    assert not wrong
+
+
+def test_tensors_in_given_memory_name_their_device():
+    """Where a host has a default device, ours is the CPU, and torch refuses memory that is elsewhere, as on a GPU.
+
+    The first calls show what torch does; then nothing that makes a tensor is given memory without its device.
+    """
+    memory = torch.empty(3, dtype=torch.int64, device="meta")
+    with default_device(), own_settings():
+        with pytest.raises(RuntimeError, match="does not match device type of out"):
+            torch.randperm(3, out=memory)
+        torch.randperm(3, out=memory, device=memory.device)
+    made, wrong = {each.__name__ for each in _device_constructors()}, []
+    for path in sorted(Path(deimos.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            match node:
+                case ast.Call(func=ast.Attribute(value=ast.Name("torch"), attr=name)) if name in made:
+                    if {"out", "device"} & {keyword.arg for keyword in node.keywords} == {"out"}:
                         wrong.append(f"{path.name}:{node.lineno}: {ast.unparse(node)}")
     assert not wrong
 

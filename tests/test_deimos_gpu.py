@@ -19,6 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from deimos.checks import RunError
 from deimos.goals.selectors import director, q_fear
 from deimos.learn.ppo import PPOConfig
+from deimos.nn.threads import tf32_products
 from deimos.run import oracle, training
 from deimos.run.loop import GoalLoop, spaces
 from deimos.run.trainer import TrainConfig, Trainer
@@ -292,6 +293,30 @@ def test_products_are_rounded_on_a_gpu_alone(monkeypatch):
             trainer.iterate()
             assert seen == [expected]
         assert torch.get_float32_matmul_precision() == "medium"
+
+
+@pytest.mark.skipif(not hasattr(torch.backends.cuda.matmul, "fp32_precision"), reason="torch has no such settings yet")
+def test_a_host_may_choose_precisions_by_device():
+    """Torch's newer settings, one for each kind of device, contradict its older one, and are the host's own again.
+
+    A run on a GPU then rounds as it is told to, and so do the settings that torch itself goes by.
+    """
+    cuda, cpu = torch.backends.cuda.matmul, torch.backends.mkldnn.matmul
+    before = torch.get_float32_matmul_precision(), cuda.fp32_precision, cpu.fp32_precision
+    try:
+        torch.set_float32_matmul_precision("highest")
+        cuda.fp32_precision, cpu.fp32_precision = "tf32", "bf16"
+        for allowed, expected in ((False, "ieee"), (True, "tf32")):
+            with contextlib.suppress(KeyError), tf32_products(allowed):
+                assert cuda.fp32_precision == expected
+                assert cpu.fp32_precision != "bf16"
+                raise KeyError
+            assert (cuda.fp32_precision, cpu.fp32_precision) == ("tf32", "bf16")
+            with pytest.raises(RuntimeError, match="mix of the legacy and new APIs"):
+                torch.get_float32_matmul_precision()
+    finally:
+        torch.set_float32_matmul_precision(before[0])
+        cuda.fp32_precision, cpu.fp32_precision = before[1:]
 
 
 @contextlib.contextmanager

@@ -47,12 +47,21 @@ def torch_on_one() -> Iterator[None]:
 @contextmanager
 def tf32_products(allowed: bool) -> Iterator[None]:
     """Let torch's float32 matrix products round their factors to TF32, or not, whatever the host has chosen."""
-    before = torch.get_float32_matmul_precision()
+    # Torch 2.9 has a setting for each kind of device as well. The one for all overwrites them, but they do not change
+    # it, and where they contradict it, it cannot be read: it is then still torch's default.
+    devices = (getattr(torch.backends.cuda, "matmul", None), getattr(torch.backends.mkldnn, "matmul", None))
+    each = [(own, own.fp32_precision) for own in devices if hasattr(own, "fp32_precision")]
+    try:
+        before = torch.get_float32_matmul_precision()
+    except RuntimeError:
+        before = "highest"
     torch.set_float32_matmul_precision("high" if allowed else "highest")
     try:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+        for own, precision in each:
+            own.fp32_precision = precision
 
 
 class _Worker(threading.Thread):

@@ -128,7 +128,7 @@ class Locomotion(WarpEnv):
             ValueError: If a payload could cancel the base's whole mass.
         """
         config, n = self.config, self.num_envs
-        self._set_rows(torch.arange(n))
+        self._set_rows(torch.arange(n, device=self.device))
         draw_uniforms(
             self._row.array, self.worlds.episode_count, self._draw.array,
             seed=self._seed, purpose=Purpose.FRICTION, world_offset=self._offset,
