@@ -129,17 +129,15 @@ def evaluate(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     names = ("brier", "reliability", "resolution", "uncertainty", "ece", "log_loss_skill", "top_decile_gap")
     if len(probability) == 0:
         return dict.fromkeys(names, math.nan)
-    p, y = probability.double(), crashed.double()
+    p, crashed = probability.double().cpu(), crashed.cpu()  # a GPU would sum bins in no fixed order
+    y = crashed.double()
     curve = reliability(p, crashed)
     top = p.topk(max(1, len(p) // 10)).indices
     scalars = torch.stack([
         y.mean(), (p - y).square().mean(), nn.functional.binary_cross_entropy(p, y), p[top].mean() - y[top].mean()
     ])  # fmt: skip
-    # The rest is a few numbers: one transfer instead of an operation of the device for each.
-    parts = [scalars, curve.predicted, curve.observed, curve.count.double() / len(p)]
-    (rate, brier, loss, gap), *bins = (
-        part.tolist() for part in torch.cat(parts).cpu().split([len(part) for part in parts])
-    )
+    rate, brier, loss, gap = scalars.tolist()
+    bins = [each.tolist() for each in (curve.predicted, curve.observed, curve.count.double() / len(p))]
     base = -sum(q * math.log(q) for q in (rate, 1 - rate) if q > 0)
     gaps = [(share, predicted - observed, observed - rate) for predicted, observed, share in zip(*bins, strict=True)]
     values = (
