@@ -233,7 +233,8 @@ class Panel:
         first, second = (shown.components[axis].label for axis in fear.axes)
         least, most = float(fear.probability.min()), float(fear.probability.max())
         imgui.TextUnformatted(f"right: {first}   up: {second}")
-        imgui.TextUnformatted(f"dark {percent(least)}, bright {percent(most)}; white: goal, cyan: next")
+        imgui.TextUnformatted(f"dark {percent(least)}, bright {percent(most)}")
+        imgui.TextUnformatted("white: goal, cyan: next")
 
     def _draw_axes(self, imgui: Any, shown: Moment) -> None:
         """Which two components of the goal the map is over."""
