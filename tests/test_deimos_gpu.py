@@ -122,7 +122,7 @@ def test_a_device_has_one_stream(monkeypatch):
 
 
 def test_foreign_streams_are_refused(monkeypatch):
-    """An environment on a GPU is neither stepped nor reset nor built where torch is on another stream than Warp."""
+    """Nothing that has a kernel is asked of an environment on a GPU where torch is on another stream than Warp."""
     env = particle.Config().build(4, CPU, 0)
     env.device = GPU
     monkeypatch.setattr(wp, "get_stream", lambda device: SimpleNamespace(cuda_stream=0x70))
@@ -130,12 +130,14 @@ def test_foreign_streams_are_refused(monkeypatch):
     env.step(torch.zeros(4, env.action_dim))
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=0))
     message = r"torch works on CUDA stream 0x0 and Warp on 0x70, .*one_stream\(torch.device\('cuda:0'\)\)"
-    with pytest.raises(RunError, match=message):
-        env.step(torch.zeros(4, env.action_dim))
-    with pytest.raises(RunError, match=message):
-        env.reset(torch.ones(4, dtype=torch.bool))
-    with pytest.raises(RunError, match=message):
-        particle.Config().build(4, GPU, 0)
+    rows, goals = torch.arange(4), torch.zeros(4, env.goal_dim)
+    for ask in (
+        lambda: env.step(torch.zeros(4, env.action_dim)), lambda: env.reset(torch.ones(4, dtype=torch.bool)),
+        lambda: env.sample_goals(rows, 2), lambda: env.draw(rows), lambda: env.set_goals(rows, goals),
+        lambda: env.goal_reward(goals, goals), lambda: particle.Config().build(4, GPU, 0),
+    ):  # fmt: skip
+        with pytest.raises(RunError, match=message):
+            ask()
 
 
 @pytest.fixture

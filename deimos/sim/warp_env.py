@@ -191,6 +191,7 @@ class WarpEnv(Env):
     @final
     def sample_goals(self, rows: Tensor, count: int, scale: Tensor | None = None) -> Tensor:
         """See ``Env.sample_goals``."""
+        check_stream(self.device)
         if count not in self._candidates:
             self._candidates[count] = self._record_candidates(count)
         candidates, launches = self._candidates[count]
@@ -222,6 +223,7 @@ class WarpEnv(Env):
     @final
     def draw(self, rows: Tensor) -> Tensor:
         """See ``Env.draw``."""
+        check_stream(self.device)
         self._set_rows(rows)
         self._launch_draw.set_dim(len(rows))
         self._launch_draw.launch()
@@ -230,6 +232,7 @@ class WarpEnv(Env):
     @final
     def set_goals(self, rows: Tensor, goal: Tensor, where: Tensor | None = None) -> None:
         """See ``Env.set_goals``."""
+        check_stream(self.device)
         self._require_rows(rows)
         if self._may_read and len(rows) and (times := rows.bincount()).max() > 1:
             raise ValueError(f"rows must be different worlds, got {int(times.argmax())} more than once.")

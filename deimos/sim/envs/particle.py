@@ -14,6 +14,7 @@ from deimos.kernels.particle import BROKEN, PARTICLES, ParticleParams, reset_par
 from deimos.kernels.particle_rewards import RewardName, RewardShape, reward_distances
 from deimos.nn.host import own_settings
 from deimos.sim.env import EnvConfig, ObsField, Sketch
+from deimos.sim.shared import check_stream
 from deimos.sim.warp_env import WarpEnv
 
 LARGEST = 1e6  # [u] or [u/step]; beyond, float32 positions no longer resolve a step
@@ -162,6 +163,7 @@ class Particle(WarpEnv):
 
     def goal_reward(self, achieved: Tensor, goal: Tensor) -> Tensor:
         """See ``Env.goal_reward``."""
+        check_stream(self.device)
         params = self.config.params()
         scale = params.velocity_scale if self.config.has_velocity_goals else params.position_scale
         distance = ((achieved - goal) / scale).norm(dim=1).float()
