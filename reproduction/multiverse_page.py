@@ -205,7 +205,7 @@ def _confirmed(data: Data, new: str) -> list[Block]:
         ]  # fmt: skip
         blocks += [f"## Confirmation: {environment}", rows]
         if not lines:
-            blocks.append(f"There are too few policies of {new}, or of others, for a contrast.")
+            blocks.append(f"Means without tests: there are too few policies of {new}, or of others, for a contrast.")
             continue
         blocks += [
             f"Intervals are at {100 * multiverse.CONFIDENCE:.1f} %; p-values are one-sided, by Holm's rule over the "

@@ -86,7 +86,7 @@ def test_one_choice_moves_one_headline(settings):
     assert (reciprocal.sum(), learnt.sum()) == (16, 6)
     assert (
         f"The margin is {margins[reciprocal].mean():.0f} points over all 16 settings with this reward, "
-        f"{margins[learnt].mean():.0f} over the six of them"
+        f"{margins[learnt].mean():.0f} over the six learnt ones"
     ) in PAGE
 
 
@@ -166,10 +166,32 @@ def test_pages_have_the_setting_with_most_headroom():
     assert found["p75"].lower.high < 0.0
     assert found["rnd"].lower.high < 0.0
     uniform, p75, rnd = (found[own] for own in ("uniform", "p75", "rnd"))
-    assert f"in the other than Uniform (p = {uniform.p:.4f}) but not than p75 and RND" in PAGE
+    assert f"in the other than Uniform alone (p = {uniform.p:.4f})" in PAGE
     assert f"by a factor of {uniform.ratio:.2f} at {uniform.score:.3f} of its score" in LAB
     assert f"their rates are {p75.ratio:.2f} and {rnd.ratio:.2f} of its own, at lower scores" in LAB
     assert min(p75.score.low, rnd.score.low) > 1.0
+
+
+def test_pages_have_the_long_budget():
+    """Means and seeds after 48 000 steps, and how far apart policies of one method are."""
+    study = "multiverse_long"
+    data = Data.read(RESULTS / study)
+    (name,) = data.environments
+    score = {row["method"]: [] for row in data.rows}
+    for row in data.rows:
+        if row["goals"] == "naive":
+            score[row["method"]].append(row["score"])
+    rates = {own: worst(study, name, own) for own in ("uniform", "p25", "p50", "rnd")}
+    for own, each in rates.items():
+        seeds = ", ".join(f"{rate:.1f}" for rate in each)
+        assert f"| {own} | {each.mean():.1f} | {seeds} | {np.mean(score[own]):.3f} |" in LAB
+    uniform, p25, p50, rnd = (f"{each.mean():.1f}" for each in rates.values())
+    assert f"Uniform crashes on {uniform} %, p50 on {p50}, p25 on {p25}, RND on {rnd}" in PAGE
+    every = np.concatenate(list(rates.values()))
+    assert f"three seeds, {every.min():.0f} to {every.max():.0f} by seed" in PAGE
+    apart = [np.ptp(each) for each in rates.values()]
+    assert f"differ by {min(apart):.0f} to {max(apart):.0f} points" in LAB
+    assert rates["uniform"].mean() < worst(OURS_STUDY, OURS, "uniform").mean() / 2
 
 
 def test_pages_count_settings(settings, room):
@@ -178,7 +200,7 @@ def test_pages_count_settings(settings, room):
     reciprocal = [each for each in unlearnt if each.levels["env.reward"] == "reciprocal"]
     assert (len(settings), len(room), len(unlearnt), len(reciprocal)) == (32, 16, 13, 10)
     assert "finds *headroom* in 16 settings" in PAGE
-    assert "In 13 the task is not learnt, in ten of these the reward is reciprocal" in PAGE
+    assert "In 13 the task is not learnt, in ten of these under the reciprocal reward" in PAGE
     assert f"in {sum(each.learnt and not each.has_headroom for each in settings)} it is learnt safely" in PAGE
     assert f"over the {sum(each.compares_scores for each in settings)} settings where scores can be compared" in PAGE
     assert multiverse.most_headroom(settings).name == "map.03"

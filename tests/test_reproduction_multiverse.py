@@ -358,7 +358,7 @@ def test_a_slope_without_an_interval_is_not_drawn(folders):
     same = [Setting(each.name, each.levels, settings[0].screened, each.policies) for each in settings]
     blind = multiverse_figures.over_headroom(same, ["p75"]).axes[0]
     assert len(blind.lines) == 2
-    assert blind.get_title() == "p75: removes\nunknown"
+    assert blind.get_title() == "p75: slope\nunknown"
 
 
 def test_what_moves_clauses_where_there_is_headroom():
