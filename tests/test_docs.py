@@ -202,3 +202,15 @@ def test_what_a_site_fetches_elsewhere_is_found(tmp_path, text, found, capsys):
     (tmp_path / "index.html").unlink()
     assert check.main(tmp_path) == 1
     capsys.readouterr()
+
+
+def test_a_release_has_one_version_and_one_date():
+    """Package, citation and changelog agree; between releases the changelog has no date."""
+    citation = dict(
+        re.findall(r'^(version|date-released): "?([^"\n]+)', (HOME / "CITATION.cff").read_text(), re.MULTILINE)
+    )
+    changes = (HOME / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert citation["version"] == deimos.__version__
+    base, _, development = deimos.__version__.partition(".dev")
+    heading = f"## {base} ({'unreleased' if development else citation['date-released']})"
+    assert re.search(r"^## .*", changes, re.MULTILINE)[0] == heading
