@@ -106,7 +106,7 @@ def test_an_update_keeps_within_its_budget(as_on_gpu, monkeypatch):
         lambda x: x.tolist(), lambda x: x.sum().item(), lambda x: bool(x.any()), lambda x: x[x > 1], lambda x: x.cpu(),
         lambda x: x.nonzero(), lambda x: x.unique(), lambda x: x.repeat_interleave(x.long()), lambda x: x.numpy(),
         lambda x: x + torch.tensor([1.0]), lambda x: x.clone().__setitem__(x > 1, x[:2]),
-        lambda x: x.clone().__setitem__(x.long(), 1.0), lambda x: x[[0, 1]], lambda x: float(x[0]),
+        lambda x: x.clone().index_put_((x.long(),), torch.tensor(1.0)), lambda x: x[[0, 1]], lambda x: float(x[0]),
         lambda x: torch.equal(x, x), lambda x: x.masked_select(x > 1), lambda x: x.long().bincount(),
     ],
 )  # fmt: skip

@@ -156,7 +156,7 @@ def test_broken_file_is_refused(copied, capfd, name, break_file):
     assert contents(copied) == before
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*torch.jit")
 def test_foreign_script_is_refused_without_a_warning(copied, capfd):
     """What torch has to say of a TorchScript file is not added to the one line."""
     write_script(copied / "checkpoint.pt")
