@@ -238,9 +238,9 @@ def moved_by(settings: Sequence[Setting], outcome: Array) -> dict[str, Interval]
 def gain_slope(settings: Sequence[Setting], method: str) -> Interval:
     """The slope of a method's gain, Uniform's ``worst`` less its own, over Uniform's.
 
-    1 if it removes all danger, 0 if it gains as much everywhere, be that nothing or not. The noise of the map's Uniform
-    is on both sides; the screening's Uniform, of another seed, is the instrument. Settings that lack one of the two
-    policies are excluded.
+    1 if how often it crashes does not depend on Uniform's danger, as where it never crashes; 0 if it gains the same
+    everywhere, possibly nothing. The noise of the map's Uniform is on both sides; the screening's Uniform, of another
+    seed, is the instrument. Settings that lack one of the two policies are excluded.
     """
     settings = having(settings, [UNIFORM, method])
     base = np.array([each.policies[UNIFORM].worst for each in settings])

@@ -36,8 +36,9 @@ CURVE = (
 )
 ROOM = (
     "By how much a method's policy crashes less than Uniform's, over how often that of another seed crashes. The line "
-    "is what the instrumental variable finds: a slope of 1 removes all danger, one of 0 gains as much everywhere, be "
-    "that nothing or not. Both axes: crashes per interaction under the worst attacker, in percent."
+    "is what the instrumental variable finds: with a slope of 1 a method's crashes do not depend on Uniform's danger, "
+    "with one of 0 it gains the same everywhere, possibly nothing. Both axes: crashes per interaction under the worst "
+    "attacker, in percent."
 )
 SHARES = (
     "Share of the settings with headroom in which a clause holds, with its exact 95 % interval. A clause that compares "

@@ -23,6 +23,7 @@ from deimos.run import oracle
 REGISTER = getattr(backend_registration, "_setup_privateuseone_for_python_backend", None)
 NAME = "elsewhere"
 COPIES = {"copy_", "_to_copy", "_foreach_copy_"}
+JOINS = {"cat", "stack"}  # where CUDA takes no number from the CPU either
 INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_"}
 
 
@@ -92,7 +93,7 @@ def _refuse_mixtures(func, args, kwargs):
     tensors = [value for value in tree_leaves(among) if isinstance(value, torch.Tensor)]
     ours = [value for value in tensors if isinstance(value, Elsewhere)]
     written = [value for value in (kwargs.get("out"), args[0] if args and name.endswith("_") else None)]
-    others = [value for value in tensors if not isinstance(value, Elsewhere) and value.dim()]
+    others = [value for value in tensors if not isinstance(value, Elsewhere) and (value.dim() or name in JOINS)]
     others += [value for value in written if isinstance(value, torch.Tensor) and not isinstance(value, Elsewhere)]
     if ours and others and name not in COPIES:
         shapes = ", ".join(str(tuple(value.shape)) for value in others)

@@ -86,6 +86,7 @@ TRAIN_ERRORS = {
     "--seed 3 --env.goal-period 5 --seed 4": "deimos: --seed is given twice; give it once.$",
     "--no-evaluation --env.goal_period 5 --evaluation": "deimos: --evaluation is given twice; give it once.$",
     "--num-envs=2 env:particle --num_envs=3 --bogus": "deimos: --num-envs is given twice; give it once.$",
+    "--bogus host:1 --bogus-too host:2": "Unrecognized options: --bogus host:1 --bogus-too host:2.$",
     "env:particle --seed 3 env:quad": "deimos: env: is given twice; give it once.$",
     "env:particle --bogus 3 --bogus 4": "Unrecognized options: --bogus 3 --bogus 4",
     "--eval.attackers pooled --eval.pool none.pt": r"none.pt cannot be read \(No such file or directory\)",

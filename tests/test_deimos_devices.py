@@ -8,7 +8,10 @@ import elsewhere
 import pytest
 import torch
 
+from deimos.app.figures import draw_calibration
 from deimos.goals import methods
+from deimos.goals.calibration import evaluate as calibration
+from deimos.goals.calibration import reliability
 from deimos.goals.director import GoalDirector
 from deimos.goals.fear import FearConfig
 from deimos.goals.selectors import plr
@@ -16,6 +19,7 @@ from deimos.learn.policy import Policy, load_policy, save_policy
 from deimos.learn.ppo import PPOConfig
 from deimos.run import audit
 from deimos.run.evaluation import EvalConfig, evaluate
+from deimos.run.folder import RunFolder
 from deimos.run.trainer import TrainConfig, Trainer
 from deimos.sim.envs import particle, quad
 
@@ -48,7 +52,8 @@ def test_what_a_gpu_refuses_is_refused(device):
     """Operands, results and masks on the CPU; what CUDA takes from the CPU is taken."""
     there, here = torch.zeros(3, 2, device=device, dtype=torch.float32), torch.ones(3, 2, dtype=torch.float32)
     for meeting in (
-        lambda: there + here, lambda: torch.cat([there, here]), lambda: there.add_(here),
+        lambda: there + here, lambda: torch.cat([there, here]), lambda: torch.stack([there.sum(), here.sum()]),
+        lambda: there.add_(here),
         lambda: torch.add(there, there, out=here), lambda: here.mul_(there.sum()), lambda: here[there[:, 0].long()],
         lambda: there.masked_fill_(here > 0, 0.0), lambda: torch.where(here > 0, there, there),
     ):  # fmt: skip
@@ -63,7 +68,7 @@ def test_what_a_gpu_refuses_is_refused(device):
     assert there.cpu().add_(1.0).sum() != there.sum()
 
 
-SELECTORS = {name: methods.method(name) for name in ("weighted", "vds+p75", "grid", "fear-novelty")}
+SELECTORS = {name: methods.method(name) for name in ("weighted", "vds+p75", "grid", "fear-novelty", "cl")}
 TASKS = {
     "particles": [replace(CONFIG, selector=each) for each in (*SELECTORS.values(), plr.Config(capacity=20))],
     "robots": [replace(CONFIG, env=quad.Config(engine="warp", goal_period=7), num_envs=8, method="p25")],
@@ -104,8 +109,20 @@ def test_evaluation_stays_on_its_device(device, tmp_path):
     )  # fmt: skip
     rows = evaluate(policy.scaled, trainer.config.env, sizes, device)
     assert [row["goals"] for row in rows] == ["naive", *sizes.attackers]
-    assert len(audit.audit_calibration(trainer, 30)) == 2
+    predictions = audit.audit_calibration(trainer, 30)
+    picture = draw_calibration(RunFolder(tmp_path), {name: each[:2] for name, each in predictions.items()})
+    assert picture.stat().st_size > 0
     audit.audit_choices(trainer, 8, audit.audit_clones(trainer))
+
+
+@on_its_device
+def test_calibration_is_summed_on_the_host(device):
+    """A GPU sums in no fixed order, and pictures want NumPy."""
+    probability = torch.linspace(0.01, 0.9, 50, dtype=torch.float32)
+    crashed = probability > 0.6
+    curve = reliability(probability.to(device), crashed.to(device))
+    assert curve.predicted.device == curve.observed.device == curve.count.device == torch.device("cpu")
+    assert calibration(probability.to(device), crashed.to(device)) == calibration(probability, crashed)
 
 
 @on_its_device

@@ -83,7 +83,8 @@ def walk(env, goals, follows):
     position, yaw, lengths = np.zeros((n, 2)), np.zeros(n), []
     for k, goal in enumerate(goals):
         if k > 0:
-            env.set_goals(rows_of(env), torch.tensor(goal * [2.0, 2.0, 0.25], dtype=torch.float32))
+            asked = torch.tensor(goal * [2.0, 2.0, 0.25], dtype=torch.float32, device=env.device)
+            env.set_goals(rows_of(env), asked)
         else:
             t["goal"][:] = torch.tensor(goal, dtype=torch.float32)
         start = position.copy()

@@ -188,7 +188,7 @@ def test_pages_have_the_long_budget():
     uniform, p25, p50, rnd = (f"{each.mean():.1f}" for each in rates.values())
     assert f"Uniform crashes on {uniform} %, p50 on {p50}, p25 on {p25}, RND on {rnd}" in PAGE
     every = np.concatenate(list(rates.values()))
-    assert f"three seeds, {every.min():.0f} to {every.max():.0f} by seed" in PAGE
+    assert f"(three seeds, {every.min():.0f} to {every.max():.0f})" in PAGE
     apart = [np.ptp(each) for each in rates.values()]
     assert f"differ by {min(apart):.0f} to {max(apart):.0f} points" in LAB
     assert rates["uniform"].mean() < worst(OURS_STUDY, OURS, "uniform").mean() / 2

@@ -209,9 +209,10 @@ def _plainly(message: str) -> str:
 
 
 def _option(argument: str) -> str:
-    """Which option, or which choice such as ``env:``, an argument gives; tyro takes several spellings."""
+    """Which option, or which of the choices ``env:`` and ``selector:``, an argument gives; else the empty string."""
     if not argument.startswith("--"):
-        return argument[: argument.find(":") + 1]
+        choice = re.match(r"(env|selector):", argument)
+        return choice[0] if choice else ""
     return re.sub(r"(^--|\.)no-", r"\1", argument.partition("=")[0].replace("_", "-"))
 
 
@@ -235,7 +236,7 @@ def _refuse(given: list[str], event: Any) -> None:
             raise RunError(f"Missing value for argument '{name}'.")
         case "UnrecognizedArgs":
             all_options, left = ([*map(_option, tokens)] for tokens in (given, event.tokens))
-            for option in filter(None, left):  # after an option of env: or selector:, tyro takes none a second time
+            for option in filter(None, left):  # some tyro takes no second time after env: or selector:
                 if all_options.count(option) > left.count(option):
                     raise RunError(f"{option} is given twice; give it once.")
             raise RunError(f"Unrecognized options: {' '.join(event.tokens)}.")

@@ -47,7 +47,7 @@ TOLERANCE = 1e-3  # of observations, CPU against GPU, after the steps below; pro
 STEPS = 50
 EAGER_STEPS = 5
 GRAPH_ITERATIONS = 8  # fear learns in the first one; the second runs as it is, the third is recorded
-TIMED_ITERATIONS = 5  # so the last two are replayed, and the fastest one is
+TIMED_ITERATIONS = 5  # the last two are replays, so the fastest one is
 NOTICE = "prototype feature"  # torch says once that it may not find all waits, which is no wait
 
 

@@ -97,11 +97,14 @@ def reliability(probability: Tensor, crashed: Tensor, bins: int = BINS) -> Relia
         probability: Predictions in [0, 1], shape (n,), n at least 1.
         crashed: Their outcomes, True for a crash, bool, shape (n,).
         bins: Number of bins; fewer where there are fewer predictions.
+
+    Returns:
+        Tensors on the CPU: a GPU would sum bins in no fixed order.
     """
-    n = len(probability)
+    n, probability, crashed = len(probability), probability.cpu(), crashed.cpu()
     bins = min(bins, n)
     order = probability.argsort()
-    index = torch.arange(n, device=order.device) * bins // n
+    index = torch.arange(n, device="cpu") * bins // n
     count = torch.bincount(index, minlength=bins)
     predicted = torch.bincount(index, probability[order].double(), minlength=bins) / count
     observed = torch.bincount(index, crashed[order].double(), minlength=bins) / count
@@ -129,7 +132,7 @@ def evaluate(probability: Tensor, crashed: Tensor) -> dict[str, float]:
     names = ("brier", "reliability", "resolution", "uncertainty", "ece", "log_loss_skill", "top_decile_gap")
     if len(probability) == 0:
         return dict.fromkeys(names, math.nan)
-    p, crashed = probability.double().cpu(), crashed.cpu()  # a GPU would sum bins in no fixed order
+    p, crashed = probability.double().cpu(), crashed.cpu()
     y = crashed.double()
     curve = reliability(p, crashed)
     top = p.topk(max(1, len(p) // 10)).indices

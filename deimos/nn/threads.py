@@ -48,7 +48,7 @@ def torch_on_one() -> Iterator[None]:
 def tf32_products(allowed: bool) -> Iterator[None]:
     """Let torch's float32 matrix products round their factors to TF32, or not, whatever the host has chosen."""
     # Torch 2.9 has a setting for each kind of device as well. The one for all overwrites them, but they do not change
-    # it, and where they contradict it, it cannot be read: it is then still torch's default.
+    # it, and where they contradict it, it cannot be read: it is then taken to be torch's default.
     devices = (getattr(torch.backends.cuda, "matmul", None), getattr(torch.backends.mkldnn, "matmul", None))
     each = [(own, own.fp32_precision) for own in devices if hasattr(own, "fp32_precision")]
     try:

@@ -31,7 +31,7 @@ class WarpEnv(Env):
     kernel for the step (physics, reward, crash, observation) and one for the reset; see ``deimos.kernels.episodes`` for
     what these share, and docs/add_an_environment.md for a complete example. Masks, worlds, goals and shares whose
     shape, dtype or device is not as ``Env`` says raise a ``ValueError``: nothing is broadcast or converted. So do, on a
-    CPU, worlds that do not exist or are given two goals at once; a GPU would have to be waited for.
+    CPU, worlds that do not exist or are given two goals at once; on a GPU the check would make the host wait.
 
     Args:
         config: The task.
