@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import torch
 
@@ -49,7 +50,7 @@ def tf32_products(allowed: bool) -> Iterator[None]:
     """Let torch's float32 matrix products round their factors to TF32, or not, whatever the host has chosen."""
     # Torch 2.9 has a setting for each kind of device as well. The one for all overwrites them, but they do not change
     # it, and where they contradict it, it cannot be read: it is then taken to be torch's default.
-    devices = (getattr(torch.backends.cuda, "matmul", None), getattr(torch.backends.mkldnn, "matmul", None))
+    devices: list[Any] = [getattr(own, "matmul", None) for own in (torch.backends.cuda, torch.backends.mkldnn)]
     each = [(own, own.fp32_precision) for own in devices if hasattr(own, "fp32_precision")]
     try:
         before = torch.get_float32_matmul_precision()
