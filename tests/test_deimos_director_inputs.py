@@ -2,6 +2,7 @@
 
 import re
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -156,13 +157,35 @@ def test_a_risk_map_is_fear_over_a_grid():
         ((0, 0), "axes must be two different components in [0, 2), got [0, 0]"),
         ((0, 2), "axes must be two different components in [0, 2), got [0, 2]"),
         ({0: x}, "axes must be two different components in [0, 2), got [0]"),
+        (1, "axes must be two different components in [0, 2), got [1]"),
+        ((0.0, 1.0), "axes must be two different components in [0, 2), got [0.0, 1.0]"),
         ({0: x, 1: 0.5}, "values of axes must have the shape (n,) each, got (5,) and ()"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             goals.risk_map(state, goal, axes)
+    for at, now, message in (
+        (state[None], goal, "state must have the shape (2,), got (1, 2)"),
+        (state, goal[None], "goal must have the shape (2,), got (1, 2)"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            goals.risk_map(at, now, (0, 1))
+    for at in (state, 3.0):
+        with pytest.raises(ValueError, match=r"state must have the shape \(num_envs, state_dim\), got \("):
+            goals.fear(at, goal[None], goal[None])
     unbounded = GoalDirector(AFRAID, 4, num_envs=N, state_dim=2, goal_dim=2, device="cpu")
     with pytest.raises(ValueError, match="axes must come with their values where there is no goal_box"):
         unbounded.risk_map(state, goal, (0, 1))
+
+
+def test_a_risk_map_takes_what_a_learner_has():
+    """Tensors with gradients and of bfloat16, which NumPy does not read, give the map of plain numbers."""
+    goals = GoalDirector(AFRAID, 4, learn_every=12, goal_box=([-1, -1], [1, 1]))
+    drive(goals, plain, offer=nothing)
+    state, goal, x = torch.tensor([0.5, 0.25]), torch.tensor([0.25, -0.5]), torch.linspace(-1, 1, 5)
+    expected = goals.risk_map(state.numpy(), goal.numpy(), {0: x.numpy(), 1: x.numpy()}).probability
+    for change in (torch.Tensor.bfloat16, lambda tensor: tensor.clone().requires_grad_()):
+        found = goals.risk_map(change(state), change(goal), {0: change(x), 1: change(x)}).probability
+        np.testing.assert_array_equal(found, expected)
 
 
 def good(**changes):
@@ -192,7 +215,8 @@ NAN = torch.tensor([[0.0], [torch.nan]])
         ({"truncated": [0, 2]}, "truncated must be bool, or 0 and 1, got 2 in world 1"),
         ({"truncated": torch.tensor([0.0, torch.nan])}, "truncated must be bool, or 0 and 1, got nan in world 1"),
         ({"state": torch.zeros(3, 3)}, r"state must have the shape \(2, 3\), got \(3, 3\)|goal must have .*\(3, 1\)"),
-        ({"goal": torch.ones(2, 1)}, r"goal of world 0 must be \[0\.0\], which it was given, got \[1\.0\]"),
+        ({"goal": torch.ones(2, 1)}, r"goal of world 0 must be \[0\.0\], which it was .*\[1\.0\]; .* their own"),
+        ({"state": np.zeros((2, 3), ">f4")}, r"state must be an array or .* of numbers, got numpy\.ndarray of >f4"),
     ],
 )  # fmt: skip
 def test_bad_input_is_named(changes, message):
@@ -298,6 +322,10 @@ OPTIONS += [
     (KNOWN | {"goal_box": ([0], [np.inf])}, "goal_box must be the lowest and the highest goal, finite"),
     (KNOWN | {"goal_box": ([0, 0], [1, 1])}, r"goal_box must have the shape \(1,\), got \(2,\)"),
 ]
+OPTIONS += [  # also where the sizes are not known yet
+    ({"goal_period": 5, "goal_box": box}, "goal_box must be the lowest and the highest goal, as in .*, got ")
+    for box in ([(-1, 1)] * 3, 1.0, {"low": [0], "high": [1]}, ([0, 1], [[1], [1, 2]]), SimpleNamespace(low=0, high=1))
+]
 OPTIONS += [
     (KNOWN | {"goal_dim": 3, "groups": groups}, "groups must be slices that name each of the 3 components .* once, got")
     for groups in (
@@ -349,3 +377,10 @@ def test_a_state_must_fit(other, message):
         other.load_state_dict(goals.state_dict())
     with pytest.raises(ValueError, match=r"state must be what state_dict.* returned; it lacks 'made_with'"):
         other.load_state_dict({"core": {}, "clock": torch.zeros(2)})
+    spoilt = goals.state_dict()
+    spoilt["goals"]["core"]["interactions"]["ring"] = None
+    before = repr(goals.state_dict())
+    for state in (None, [], goals.state_dict() | {"made_with": None}, spoilt):
+        with pytest.raises(ValueError, match=r"state must be what state_dict\(\) of this version returned, got"):
+            goals.load_state_dict(state)
+    assert repr(goals.state_dict()) == before

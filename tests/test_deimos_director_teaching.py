@@ -1,5 +1,6 @@
 """What selectors of other people's loops learn from besides outcomes: how well goals are met, and transitions."""
 
+import io
 import re
 from types import SimpleNamespace
 
@@ -142,3 +143,91 @@ def test_a_rollout_holds_all_steps_since_the_last_one(config):
     afraid = GoalDirector("p75", 3, goal_box=([-1.0], [1.0]))  # which learns from outcomes alone
     afraid.step(torch.zeros(N, 2), torch.zeros(N, 1), NO, NO)
     afraid.learn(rollout(9))
+
+
+def whole(goals):
+    """All of its state, to compare; ``repr`` shortens large tensors."""
+    file = io.BytesIO()
+    torch.save(goals.state_dict(), file)
+    return file.getvalue()
+
+
+def taught(config, change):
+    """A Director's state after two lessons, with crashes and a time limit, and why it refused the second, if it did.
+
+    ``change`` may alter the transitions of the second one.
+    """
+    goals = GoalDirector(config, 3, learn_every=100, goal_box=([-1.0], [1.0]))
+    goal, random = torch.zeros(N, 1), torch.Generator().manual_seed(0)
+    for change_it in (lambda parts: None, change):
+        parts = vars(Rollout(6, N, 3, 1, torch.device("cpu")))
+        for name in ("obs", "reward", "advantage"):
+            parts[name].normal_(generator=random)
+        parts["terminated"].bernoulli_(0.1, generator=random)
+        parts["truncated"][2, 5] = parts["truncated"][3, 1] = True
+        parts["terminated"][2, 5] = parts["terminated"][3, 1] = False
+        step, world = parts["truncated"].nonzero(as_tuple=True)
+        last = step, world, torch.ones(2, 3)
+        parts["cut_off"] = lambda last=last: last
+        change_it(parts)
+        for _ in range(6):
+            goal = goals.step(torch.zeros(N, 2), goal, NO, NO).goal
+        before = whole(goals)
+        try:
+            goals.learn(SimpleNamespace(**parts))
+        except ValueError as error:
+            assert whole(goals) == before
+            return before, str(error)
+    return whole(goals), None
+
+
+def as_type(kind, *names):
+    """Changes the type of parts of a rollout."""
+    return lambda parts: parts.update({name: kind(parts[name]) for name in names})
+
+
+CONFIGS = [vds.Config(hidden=(8,)), vds.Config(hidden=(8,), data="share"), plr.Config(capacity=20, candidates=5)]
+FLAGS, NUMBERS = ("terminated", "truncated"), ("obs", "reward", "weight", "advantage")
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize(
+    "change",
+    [
+        as_type(torch.Tensor.byte, *FLAGS),  # as rsl_rl's storage keeps them
+        as_type(torch.Tensor.long, *FLAGS),
+        as_type(torch.Tensor.float, *FLAGS),
+        as_type(torch.Tensor.double, *NUMBERS),
+        as_type(torch.Tensor.numpy, *FLAGS, *NUMBERS),
+        lambda parts: parts.update(cut_off=lambda: ([2, 3], [5, 1], [[1, 1, 1], [1, 1, 1]])),
+    ],
+)
+def test_transitions_of_any_type_teach_the_same(config, change):
+    """Flags of 0 and 1, other precisions and arrays teach what bool and float32 teach, bit for bit."""
+    assert taught(config, change) == taught(config, lambda parts: None)
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda parts: parts.update(truncated=2 * parts["truncated"]), "truncated must be bool, or 0 and 1, got 2 in"),
+        (lambda parts: parts.update(terminated=torch.full((6, N), torch.nan)), "terminated must be bool, or 0 and 1"),
+        (lambda parts: parts.update(reward_scale=float("nan")), "reward_scale must be a finite number, got nan"),
+        (lambda parts: parts.update(discount=None), "discount must be a finite number, got None"),
+        (lambda parts: parts.update(cut_off=lambda: None), "must give steps, worlds and their last observations, got"),
+        (lambda parts: parts.update(cut_off=lambda: ([], [], [])), "every truncated step, but lacks step 2 of world 5"),
+        (lambda parts: parts.update(cut_off=lambda: ([2], [5], [[1.0] * 3])), "but lacks step 3 of world 1"),
+        (lambda parts: parts.update(cut_off=lambda: ([2, 9], [5, 1], [[1.0] * 3] * 2)), r"steps in \[0, 6\), got"),
+        (lambda parts: parts.update(cut_off=lambda: ([2, 3], [5, -1], [[1.0] * 3] * 2)), r"worlds in \[0, 64\)"),
+        (lambda parts: parts.update(cut_off=lambda: ([2.0], [5.0], [[1.0] * 3])), "must give whole numbers of steps"),
+        (lambda parts: parts.update(cut_off=lambda: ([2, 3], [5, 1], [[1.0]] * 2)), r"\(m, 3\), got \(2,\), \(2,\)"),
+        (
+            lambda parts: parts.update(cut_off=lambda: ([2, 3], [5, 1], [[1.0] * 3, [1.0, float("nan"), 1.0]])),
+            r"must be finite, got \[1.0, nan, 1.0\] in world 1",
+        ),
+    ],
+)
+def test_transitions_that_do_not_fit_are_named_and_teach_nothing(config, change, reason):
+    """Where an episode was cut off and what values are made from is checked like the rest."""
+    assert re.search(reason, taught(config, change)[1])

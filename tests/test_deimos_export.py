@@ -197,7 +197,7 @@ def test_a_controller_begins_anew(walker):
 
 def test_a_controller_is_for_robots_and_their_sizes(walker, tmp_path):
     """A measurement of another size, and an export without a robot, are named."""
-    controller = export_controller.Controller(walker, 2)
+    controller = export_controller.Controller(str(walker), 2)
     measured = some_measurements(controller) | {"gravity": np.zeros((1, 3))}
     with pytest.raises(ValueError, match=r"gravity must have shape \(2, 3\), got \(1, 3\)"):
         controller.targets(measured)
@@ -400,3 +400,5 @@ def test_what_cannot_be_exported_is_refused_in_a_line(particles, tmp_path, capsy
     assert cli.main(["export", str(WALK), str(tmp_path / "go1")]) == 0
     assert "This run has learnt no fear network, so there is no fear.onnx." in capsys.readouterr().err
     assert not (tmp_path / "go1" / "check.npz").exists()
+    with pytest.raises(SystemExit, match=r"go1 holds no check\.npz to compare with; export it again with --check"):
+        export_controller.main(tmp_path / "go1")

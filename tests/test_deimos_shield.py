@@ -147,12 +147,29 @@ def test_goals_of_other_sizes_are_refused():
             shield.choose(total, goal, goal, torch.ones(shape))
     with pytest.raises(ValueError, match=r"score of \(B, 1\) goals must have shape \(2, 1\), got \(2,\)"):
         shield.choose(lambda goals: goals.sum((1, 2)), goal, goal)
+    with pytest.raises(ValueError, match=r"score of \(B, N\) goals must have shape \(2, 10\), got \(2, 1\)"):
+        shield.choose(lambda goals: total(goals)[:, :1], goal, goal)  # the first one's would be everyone's
+
+
+def test_what_is_no_tensor_is_refused():
+    """Arrays, as onnxruntime gives them, are named, with what makes tensors of them."""
+    goal, shield = torch.ones(2, 1), Shield(0.0, "project", (0.0,), (1.0,))
+    for score, active, wanted, candidates, name in (
+        (total, goal.numpy(), goal, None, "goal"),
+        (total, goal, goal.numpy(), None, "wanted"),
+        (total, goal, goal, np.ones((2, 4, 1)), "candidates"),
+        (lambda goals: total(goals).numpy(), goal, goal, None, r"score of \(B, 1\) goals"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} must be a tensor, got numpy.ndarray; torch.from_numpy makes one"):
+            shield.choose(score, active, wanted, candidates)
 
 
 def test_no_shield_is_said():
     """The entry of an export without a shield is refused with the way to one."""
     with pytest.raises(ValueError, match="There is no shield: make one with deimos shield, then export the run again"):
         Shield.from_dict(None)
+    with pytest.raises(ValueError, match="guarantee must be one of marginal, conditional, got 'sure'"):
+        Shield.from_dict({"guarantee": "conditional"}, guarantee="sure")
 
 
 def test_a_drift_is_told_once(caplog):

@@ -151,6 +151,17 @@ def test_critics_with_returns_of_their_own_do_not_agree():
     assert (selector.values(rollout.obs).std(0) > 1e-3).float().mean() > 0.9
 
 
+@pytest.mark.parametrize("kind", [torch.uint8, torch.int64])
+def test_flags_in_whole_numbers_are_flags(kind):
+    """A learner that keeps flags as 0 and 1, as rsl_rl does, gives the same targets."""
+    env = worlds()
+    selector, rollout = ensemble(env), random_rollout(env)
+    expected = selector._targets(rollout, selector._worlds(NUM_ENVS, CPU))
+    rollout.terminated, rollout.truncated = rollout.terminated.to(kind), rollout.truncated.to(kind)
+    for ours, theirs in zip(selector._targets(rollout, selector._worlds(NUM_ENVS, CPU)), expected, strict=True):
+        assert torch.equal(ours, theirs)
+
+
 @pytest.mark.parametrize("rule", ["proportional", "argmax", "percentile"])
 def test_goals_are_scored_by_disagreement(rule):
     """A score is the standard deviation over the members, and the rule chooses by it."""

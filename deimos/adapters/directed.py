@@ -1,5 +1,6 @@
 """A Director in gymnasium's training loops, and what wrappers for other libraries have in common with it."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -29,18 +30,13 @@ class GoalSlot:
         next_step: Whether a world that is done is reset in a separate step.
 
     Raises:
-        ValueError: If the space has no such place, or holds whole numbers there.
+        ValueError: If the space has no such place, or holds whole numbers there, or has entries that are no arrays.
     """
 
     def __init__(
         self, director: GoalDirector, space: Space, num_envs: int, where: slice | str, next_step: bool = False
     ) -> None:
-        parted = isinstance(space, Dict)
-        if not isinstance(where, str if parted else slice) or (parted and where not in space.spaces):
-            raise ValueError(f"where must be a key of a Dict or a slice of a Box, got {where!r} for {space}.")
-        kind = space[where].dtype if isinstance(space, Dict) else space.dtype
-        if kind is None or not np.issubdtype(kind, np.floating):
-            raise ValueError(f"where must be a place for fractions, which goals have, got {where!r} of {kind}.")
+        _check_place(space, where)
         self.director, self._next_step = director, next_step
         self.where: Any = where  # a key of dictionaries, else a slice of arrays
         self._space, self._spaces = space, batch_space(space, num_envs)
@@ -57,7 +53,8 @@ class GoalSlot:
         rows = slice(None) if where is None else where
         self.director.reset(where)
         self.goal = self.goal.copy()  # observations may share it
-        self.goal[rows] = self.director.propose(where, self.state(obs)[rows], self.read(obs)[rows])
+        # No goal is active: what the worlds have put into its place, such as NaN, does not matter.
+        self.goal[rows] = self.director.propose(where, self.state(obs)[rows], np.zeros_like(self.goal[rows]))
         return self.write(obs)
 
     def ended(self, obs: Observation, last: dict[int, Observation]) -> Observation:
@@ -95,14 +92,15 @@ class GoalSlot:
         return self.write(obs)
 
     def checked(self, reward: np.ndarray) -> np.ndarray:
-        """The rewards, if there is one for each world: others would be broadcast.
+        """The rewards as an array, if there is one for each world: others would be broadcast.
 
         Raises:
             ValueError: If they have another shape.
         """
-        if np.shape(reward) != (len(self.goal),):
-            raise ValueError(f"reward must give the shape {(len(self.goal),)}, got {np.shape(reward)}.")
-        return reward
+        rewards = np.asarray(reward)
+        if rewards.shape != (len(self.goal),):
+            raise ValueError(f"reward must give the shape {(len(self.goal),)}, got {rewards.shape}.")
+        return rewards
 
     def state(self, obs: Observation) -> np.ndarray:
         """Everything but the goal, float32, shape (num_envs, state_dim)."""
@@ -122,6 +120,26 @@ class GoalSlot:
         obs = obs.copy()
         obs[:, self.where] = self.goal
         return obs
+
+
+def _check_place(space: Space, where: slice | str) -> None:
+    """Raise ``ValueError`` unless ``where`` is a place for goals in the space of a world's observations."""
+    parts = space.spaces if isinstance(space, Dict) else None
+    if not isinstance(where, slice if parts is None else str) or (parts is not None and where not in parts):
+        raise ValueError(f"where must be a key of a Dict or a slice of a Box, got {where!r} for {space}.")
+    place = space if parts is None else parts[where]
+    if place.dtype is None or not np.issubdtype(place.dtype, np.floating):
+        raise ValueError(f"where must be a place for fractions, which goals have, got {where!r} of {place.dtype}.")
+    if place.shape is None or len(place.shape) != 1:
+        raise ValueError(f"where must be a place of one axis, got {where!r} for {place}.")
+    components = 0
+    for key, part in {"": space}.items() if parts is None else parts.items():
+        if part.shape is None:  # the Director sees numbers
+            raise ValueError(f"Observations must hold arrays alone, got {part} for {key!r}; flatten it.")
+        components += math.prod(part.shape)
+    goals = len(range(*where.indices(components))) if isinstance(where, slice) else place.shape[0]
+    if not 0 < goals < components:
+        raise ValueError(f"where must leave components for the goal and for the state, got {where!r} for {space}.")
 
 
 class DirectedVectorEnv(gymnasium.vector.VectorWrapper):

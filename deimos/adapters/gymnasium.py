@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from deimos import plugins
-from deimos.checks import check_at_least
+from deimos.checks import check_at_least, check_is
 from deimos.goals.selector import SelectorConfig
 from deimos.goals.selectors import uniform
 from deimos.nn.layout import count, seen_by
@@ -77,6 +77,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, goal_dict: bool = False,
         learn_every: int | None = 24,
     ) -> None:  # fmt: skip
+        check_is("config", config, EnvConfig)
+        if selector is not None:
+            check_is("selector", selector, SelectorConfig)
         check_at_least("num_envs", num_envs, 1)
         self.num_envs = num_envs
         self.loop: GoalLoop

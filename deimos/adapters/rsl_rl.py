@@ -7,7 +7,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from deimos.checks import check_at_least, check_positive
+from deimos.checks import check_at_least, check_is, check_positive
 from deimos.goals.selector import GoalSelector
 from deimos.goals.selectors import uniform
 from deimos.learn.ppo import PPOConfig
@@ -45,6 +45,9 @@ class RslRlVecEnv(VecEnv):
         self, env: Env, selector: GoalSelector | None = None, reward_scale: float = 1.0, report_every: int = 24,
         learn_every: int | None = 24,
     ) -> None:  # fmt: skip
+        check_is("env", env, Env)
+        if selector is not None:
+            check_is("selector", selector, GoalSelector)
         check_positive("reward_scale", reward_scale, finite=True)
         check_at_least("report_every", report_every, 1)
         self._report_every, self._steps = report_every, 0

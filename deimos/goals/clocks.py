@@ -236,7 +236,8 @@ class GoalClocks(Stateful):
             row = int(other.nonzero()[0])
             raise ValueError(
                 f"goal of world {row if rows is None else int(rows[row])} must be {ours[row].tolist()}, which it was "
-                f"given, got {goal[row].tolist()}; report what a world really pursues by executed=."
+                f"given, got {goal[row].tolist()}; report what a world really pursues by executed=, and give other "
+                "environments a GoalDirector of their own."
             )
 
     def refuse_faults(self) -> None:

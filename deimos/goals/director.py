@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from deimos.checks import check_at_least
-from deimos.goals import given
+from deimos.goals import given, transitions
 from deimos.goals.clocks import GoalClocks
 from deimos.goals.core import GoalCore, window_between
 from deimos.goals.director_checks import check_candidates, check_options, placed, settings, unpacked
@@ -284,20 +284,21 @@ class GoalDirector:
         """Update the selector now, in addition to every ``learn_every`` steps.
 
         Args:
-            rollout: The learner's transitions since the last call, with the state followed by the goal as observations,
-                for selectors that learn from them (``vds``, ``plr``).
+            rollout: The learner's transitions since the last call, for selectors that learn from them (``vds``,
+                ``plr``): arrays or tensors, flags as bool or 0 and 1, observations with the goal after the state.
 
         Returns:
             ``metrics``.
 
         Raises:
-            ValueError: If the selector needs a rollout and gets none, or one without all steps since the last call.
+            ValueError: If the selector needs a rollout and gets none, or one that lacks steps since the last call or
+                does not fit. Nothing is changed then.
             SimulationError: If a weight of a network is no longer finite.
         """
         core = self._known.core
         self._known.refuse_faults()
-        given.check_transitions(rollout, core, self._learnt_at)
-        self.metrics, self._learnt_at = core.learn(rollout), core.interactions.now
+        told = transitions.checked(rollout, core, self._learnt_at)
+        self.metrics, self._learnt_at = core.learn(told), core.interactions.now
         core.selector.check()
         return self.metrics
 
@@ -322,7 +323,8 @@ class GoalDirector:
         afraid = fear_selector(self.selector)
         if afraid is None:
             raise ValueError(f"The selector must have a fear network, as a Director has; got {self._config}.")
-        inputs, count = replace(self._expected(state, None, None, None), faults=None), len(state)
+        count, _ = given.matrix("state", state, "state_dim")
+        inputs = replace(self._expected(state, None, None, None), faults=None)
         states, goals = inputs.states(state, count), inputs.goals(goal, count)
         new_goals = inputs.goals(new_goal, count, "new_goal")
         for name, numbers in (("state", states), ("goal", goals), ("new_goal", new_goals)):
@@ -347,9 +349,10 @@ class GoalDirector:
             ValueError: If there are not two different components, or as in ``fear``.
             RuntimeError: If it has not learnt anything yet.
         """
-        device = self.weight.device
-        states, goals = (given.tensor(name, value, device) for name, value in (("state", state), ("goal", goal)))
-        x, y, new = grid(goals.cpu().numpy(), axes, self._box)
+        device, known = self.weight.device, self._expected(state, None, None, None)
+        states = given.floats("state", state, (known.state_dim,), device)
+        goals = given.floats("goal", goal, (known.goal_dim,), device)
+        x, y, new = grid(goals, axes, self._box)
         states, goals = (values.expand(len(new), *values.shape) for values in (states, goals))
         told = self.fear(states, goals, torch.from_numpy(new).to(device), horizon)
         return RiskMap(x, y, told.probability.view(len(y), len(x)).cpu().numpy(), told.auroc, told.age)
@@ -382,7 +385,7 @@ class GoalDirector:
         try:
             inputs = self._expected(goals["goal"], *sizes)
             copy.copy(self)._begin(inputs).load_state_dict(goals)  # tried on a copy first
-        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise ValueError(f"state must be what state_dict() of this version returned, got {error!r}.") from error
         (self._clocks or self._begin(inputs)).load_state_dict(goals)
         self._learnt_at = learnt_at

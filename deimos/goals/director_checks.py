@@ -65,10 +65,10 @@ def settings(config: SelectorConfig, goal_box: tuple[Bound, Bound] | None, **oth
         **others: What else counts, plain.
 
     Raises:
-        ValueError: If ``config`` is not a configuration but, say, a selector or a class.
+        ValueError: If ``config`` is not a configuration but, say, a selector or a class, or ``goal_box`` not two goals.
     """
     check_is("selector", config, SelectorConfig)
-    box = None if goal_box is None else [_numbers(end) for end in goal_box]
+    box = None if goal_box is None else _ends(goal_box)
     kind = f"{type(config).__module__}.{type(config).__qualname__}"
     return {"selector": kind, **_plain_fields(config), **others, "goal_box": box}
 
@@ -80,6 +80,22 @@ def _own(value: Any) -> Any:
 
 def _numbers(end: Bound) -> list[float]:
     return np.asarray(end.detach().cpu() if isinstance(end, Tensor) else end).astype(np.float32).tolist()
+
+
+def _ends(goal_box: tuple[Bound, Bound]) -> list[list[float]]:
+    """Lowest and highest goal.
+
+    Raises:
+        ValueError: If it is something else, such as a range for each component, or a space.
+    """
+    try:
+        low, high = goal_box
+        return [_numbers(low), _numbers(high)]
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            "goal_box must be the lowest and the highest goal, as in (space.low, space.high) or ([-1, -2], [1, 2]), "
+            f"got {goal_box!r:.80}."
+        ) from error
 
 
 def _plain_fields(config: Any) -> dict[str, Any]:
@@ -103,6 +119,8 @@ def unpacked(state: Mapping[str, Any], own: Mapping[str, Any]) -> tuple[list[int
     Raises:
         ValueError: If something is missing, or it is of a Director with other settings, which are named.
     """
+    if not isinstance(state, Mapping) or not isinstance(state.get("made_with", own), Mapping):
+        raise ValueError(f"state must be what state_dict() of this version returned, got {state!r:.80}.")
     try:
         made_with, sizes, goals, learnt_at = (state[name] for name in ("made_with", "sizes", "goals", "learnt_at"))
     except KeyError as error:

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deimos.goals.core import GoalCore
 from deimos.goals.faults import Faults, refuse_outside_0_and_1, refuse_unsound
 from deimos.goals.interactions import assign
-from deimos.goals.selector import Delegate, GoalSelector, Transitions, with_parts
+from deimos.goals.selector import Delegate, GoalSelector, with_parts
 from deimos.nn.random import Purpose, uniforms
 
 Array = Tensor | np.ndarray
@@ -62,6 +61,7 @@ def tensor(name: str, value: Bound | int, device: torch.device) -> Tensor:
         return torch.from_numpy(np.array(value)).to(device)  # a copy, since an array may refuse to be written to
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f"{type(value).__module__}.{type(value).__qualname__}"
+        kind += f" of {value.dtype}" if isinstance(value, np.ndarray) else ""  # not all of NumPy's types are torch's
         raise ValueError(f"{name} must be an array or a tensor of numbers, got {kind}.") from error
 
 
@@ -252,44 +252,6 @@ class Inputs:
         elif not bool(fits.all()):
             raise ValueError(f"horizon must be in [1, {most}], got {steps.tolist()}.")
         return steps.long().expand(count)
-
-
-def check_transitions(rollout: Transitions | None, core: GoalCore, since: int) -> None:
-    """Check the rollout that a selector learns from, if there is one.
-
-    Args:
-        rollout: Transitions.
-        core: The selector, and the interactions that it learns from as well.
-        since: Step of its last update.
-
-    Raises:
-        ValueError: If something is missing; or if the selector needs it, and it does not hold all worlds in all steps
-            since then, or holds a number that is not finite.
-    """
-    if rollout is None:
-        return
-    wanted = [*Transitions.__annotations__, "cut_off"]
-    missing = [name for name in wanted if not hasattr(rollout, name)]
-    if missing:
-        raise ValueError(
-            f"rollout must have {', '.join(wanted)}, as deimos.goals.selector.Transitions says; it lacks "
-            f"{', '.join(missing)}."
-        )
-    if not core.selector.needs_rollout:
-        return
-    steps, num_envs = core.interactions.now - since, len(core.weight)
-    if rollout.num_steps != steps:
-        raise ValueError(
-            f"rollout must hold the transitions since the last call of learn(), {steps} steps, got {rollout.num_steps}."
-        )
-    for name in ("obs", "reward", "terminated", "truncated", "weight", "advantage"):
-        values = tensor(f"rollout.{name}", getattr(rollout, name), core.weight.device)
-        expected = (steps + 1, num_envs, *values.shape[2:3]) if name == "obs" else (steps, num_envs)
-        if values.shape != expected:
-            raise ValueError(f"rollout.{name} must have the shape {expected}, got {tuple(values.shape)}.")
-        if not bool(values.isfinite().all()):
-            step, world = (~values.isfinite()).nonzero()[0, :2].tolist()
-            raise ValueError(f"rollout.{name} must be finite, got {values[step, world].tolist()} in world {world}.")
 
 
 def lacking(selector: GoalSelector, taught: bool, tracked: bool) -> Iterator[str]:

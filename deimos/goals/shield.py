@@ -41,6 +41,9 @@ _log = logging.getLogger(__name__)
 
 
 def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if not isinstance(value, Tensor):
+        kind = f"{type(value).__module__}.{type(value).__qualname__}"
+        raise ValueError(f"{name} must be a tensor, got {kind}; torch.from_numpy makes one of an array.")
     if value.shape != shape:  # broadcasting would make a goal of it anyway
         raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}.")
 
@@ -160,6 +163,7 @@ class Shield:
         if data is None:
             raise ValueError("There is no shield: make one with deimos shield, then export the run again.")
         guarantee = guarantee or data["guarantee"]
+        check_choice("guarantee", guarantee, GUARANTEES)
         if data["threshold"][guarantee] is None:
             raise ValueError(f"guarantee must not be {guarantee}: {data['crashes']} crashes are too few for it.")
         return cls(
@@ -184,13 +188,15 @@ class Shield:
                 the safe goal alone.
 
         Raises:
-            ValueError: If a shape does not fit.
+            ValueError: If something is not a tensor, or a shape does not fit.
         """
         count, dim = len(wanted), len(self._safe)
         _check_shape("wanted", wanted, (count, dim))
         _check_shape("goal", goal, (count, dim))
         if candidates is not None:
-            _check_shape("candidates", candidates, (count, candidates.shape[1] if candidates.dim() > 1 else 0, dim))
+            _check_shape(
+                "candidates", candidates, (count, candidates.shape[1] if len(candidates.shape) > 1 else 0, dim)
+            )
         fear = score(wanted.unsqueeze(1))
         _check_shape("score of (B, 1) goals", fear, (count, 1))
         fear = fear.squeeze(1)
@@ -214,8 +220,10 @@ class Shield:
         tried = torch.where(fixed, safe + share * (wanted.unsqueeze(1) - safe), wanted.unsqueeze(1))
         if candidates is not None:
             tried = torch.cat([tried, candidates], dim=1)
+        fear = score(tried)
+        _check_shape("score of (B, N) goals", fear, tuple(tried.shape[:2]))
         away = ((tried - wanted.unsqueeze(1)) / self._range.to(goal)).square().sum(2)
-        away = torch.where(score(tried) < self.threshold, away, torch.inf)
+        away = torch.where(fear < self.threshold, away, torch.inf)
         none = away.amin(1, keepdim=True).isinf()
         return torch.where(none, torch.where(fixed, safe, goal), picks.take(tried, away.argmin(1)))
 

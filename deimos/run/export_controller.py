@@ -70,7 +70,8 @@ class Controller:
         ValueError: If the export is not that of a legged robot.
     """
 
-    def __init__(self, folder: Path, robots: int = 1) -> None:
+    def __init__(self, folder: Path | str, robots: int = 1) -> None:
+        folder = Path(folder)
         self.deploy = read(folder)
         self.policy = Network(folder, self.deploy["policy"])
         self.action = np.zeros((robots, self.deploy["action"]["size"]))
@@ -134,9 +135,10 @@ class Simulation:
         ValueError: If the export is not that of a legged robot.
     """
 
-    def __init__(self, folder: Path, qpos: np.ndarray, qvel: np.ndarray) -> None:
+    def __init__(self, folder: Path | str, qpos: np.ndarray, qvel: np.ndarray) -> None:
         import mujoco
 
+        folder = Path(folder)
         self.mujoco, self.robot = mujoco, read(folder)["robot"]
         self.model = mujoco.MjModel.from_xml_path(str(folder / self.robot["model"]))
         self.ground = self.model.geom("ground").id
@@ -303,6 +305,8 @@ def compare_walks(folder: Path, deploy: dict, known: dict[str, np.ndarray]) -> b
 def main(folder: Path) -> bool:
     """Check an exported folder; return whether it does what it did at the export."""
     deploy = json.loads((folder / "deploy.json").read_text(encoding="utf-8"))
+    if not (folder / "check.npz").exists():
+        sys.exit(f"{folder} holds no check.npz to compare with; export it again with --check.")
     with np.load(folder / "check.npz") as file:
         known = dict(file)
     passed = compare_networks(folder, deploy, known)

@@ -164,7 +164,8 @@ class VDS(GoalSelector):
             value = self.nets.forward(own.flatten(1, 2)).view(own.shape[:3])
         old, next_value = value.transpose(0, 1)[:-1], value.transpose(0, 1)[1:]  # (num_steps, K, worlds of each)
         reward, terminated, truncated = (
-            tensor[:, worlds] for tensor in (rollout.reward, rollout.terminated, rollout.truncated)
+            tensor[:, worlds]  # some learners keep flags as uint8, of which ~ is not the opposite
+            for tensor in (rollout.reward, rollout.terminated.bool(), rollout.truncated.bool())
         )
         step, world, obs = rollout.cut_off()
         if len(step):
