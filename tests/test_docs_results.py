@@ -161,22 +161,51 @@ def test_the_page_of_robots_has_what_is_exploratory(robots):
     near, far = Place("quad", 100), Place("quad", 500)
     score, falls, attacked = (mean(measure, robots, near, "uniform") for measure in (SCORE, under("naive"), ATTACKED))
     before = next(row for row in bases()[1] if "mean" in row["base"])["crashes per interaction [%]"].split()[0]
-    p75, uniform = (mean(LEVEL, robots, near, name) for name in ("p75", "uniform"))
-    rate, hard = (contrast(robots, far, "penalty-30", "uniform", each).mean for each in (NAIVE, WORST))
+    levels = [f"{mean(LEVEL, robots, near, name):.1f}" for name in ("uniform", "p75", "antagonist")]
+    rate = contrast(robots, far, "penalty-30", "uniform", NAIVE).mean
     vds = change(contrast(robots, far, "vds", "uniform", WORST).mean)
     better = contrast(robots, far, "penalty-30", "uniform", SCORE).mean
-    less = [
-        "{:.0f} % [{:.0f}, {:.0f}] less".format(*(-100 * math.expm1(x) for x in (each.estimate, each.high, each.low)))
-        for each in (rate, hard)
-    ]
+    less = "{:.0f} % [{:.0f}, {:.0f}] less".format(
+        *(-100 * math.expm1(x) for x in (rate.estimate, rate.high, rate.low))
+    )
     assert not missing([
         f"| Uniform | {score:.3f} | {100 * falls:.1f} % | {100 * attacked:.1f} % |",
         f"from {before} to {100 * falls:.1f} %",
         f"the {mean(DOSE, robots, near, 'p75'):.0f}st percentile of fear",
-        f"train at a mean level of {p75:.1f}, under Uniform at {uniform:.1f}",
-        f"penalty-30 scores {better:.3f} more, falls {less[0]} under uniform goals and {less[1]} under attack, where "
-        f"VDS falls {vds.removeprefix('+')} more",
+        "in training is {} under Uniform, {} under p75, {} under Antagonist".format(*levels),
+        f"penalty-30 scores {interval(better)} more and falls {less} under uniform goals. Under attack VDS falls "
+        f"{vds.removeprefix('+')} more",
     ], LEGGED)  # fmt: skip
+
+
+def interval(mean, sign=1):
+    """A mean difference of scores with its interval, or of its opposite."""
+    low, high = sorted((sign * mean.low, sign * mean.high))
+    return f"{sign * mean.estimate:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def test_the_page_of_robots_has_the_further_methods(robots):
+    """Antagonist, p50 and the control of VDS's critic beside Uniform, on all five bases; VDS beside its control."""
+    near, far = Place("quad", 100), Place("quad", 500)
+    scores = {
+        (name, place.period): contrast(robots, place, name, "uniform", SCORE)
+        for name in ("antagonist", "p50", "uniform-ensemble") for place in (near, far)
+    }  # fmt: skip
+    assert all(each.bases == (1, 2, 3, 4, 5) for each in scores.values())
+    naive, worst = (contrast(robots, near, "antagonist", "uniform", each).mean for each in (NAIVE, WORST))
+    more, low, high = (100 * math.expm1(x) for x in (naive.estimate, naive.low, naive.high))
+    assert not missing([
+        f"cost {interval(scores['antagonist', 100].mean, -1)} of score and {more:.0f} % [{low:.1f}, {high:.0f}] more "
+        f"falls under uniform goals; under attack {change(worst)}",
+        f"costs {interval(scores['uniform-ensemble', 100].mean, -1)} of score under uniform goals",
+        f"p50 scores {interval(scores['p50', 500].mean)} more than Uniform "
+        f"(at T2 {interval(scores['p50', 100].mean)})",
+    ], LEGGED)  # fmt: skip
+    beside = [
+        contrast(robots, place, name, "uniform-ensemble", each).mean
+        for place in (near, far) for name in ("vds", "vds+p75") for each in (SCORE, NAIVE, WORST)
+    ]  # fmt: skip
+    assert all(each.low < 0 < each.high for each in beside)  # "neither can be distinguished from that"
 
 
 def test_the_lab_has_trainings_at_t10(robots):
@@ -218,20 +247,24 @@ def test_both_engines_are_told(robots):
         assert f"| {title} | {scores} | {logs} |" in LEGGED_LAB
     native, judged, warp = ("{:+.0f} and {:+.0f} %".format(*each) for each in falls)
     assert (
-        f"is {native} on MuJoCo's, {judged} with the same policies on mujoco-warp, {warp} with training there" in LEGGED
+        f"by {native} on MuJoCo's, {judged} with the same policies on mujoco-warp, {warp} with training there" in LEGGED
     )
 
 
 def test_the_page_of_robots_counts_clauses():
-    """What the report says of all clauses, and which one holds."""
+    """What the report says of all clauses, and which hold."""
     report = (RESULTS / "robots" / "report.md").read_text(encoding="utf-8")
-    (counts,) = re.findall(r"^Clauses: (\d+) holds, 0 does not hold, (\d+) undecided over", report, re.MULTILINE)
+    (counts,) = re.findall(r"^Clauses: (4) holds, 0 does not hold, (\d+) undecided over", report, re.MULTILINE)
     (beyond,) = re.findall(r"For (\d+) of \d+ undecided there is no effect", report)
     held, undecided = map(int, counts)
-    assert f"of {held + undecided} clauses one holds" in LEGGED
+    assert f"of {held + undecided} clauses four hold" in LEGGED
     assert f"{undecided} are undecided; {beyond} of these could not be decided with so few bases" in LEGGED
-    (line,) = re.findall(r"^\| quad.* holds \|$", report, re.MULTILINE)
-    assert line.startswith("| quad, T = 500 | score that the attack costs: uniform, rnd, vds, cl > vds+p75 |")
+    assert re.findall(r"^\| quad, T = (\d+) \| ([^|]*) \|.* holds \|$", report, re.MULTILINE) == [
+        ("100", "score (Naive): p10, p25, p50, p75, p90, uniform > antagonist"),
+        ("500", "score (Naive): p10, p25, p50, p75, p90, uniform > antagonist"),
+        ("100", "crashes (Naive): antagonist > p10, p25, p50, p75, p90"),
+        ("500", "score that the attack costs: uniform, rnd, vds, cl > vds+p75"),
+    ]
 
 
 def test_the_page_of_robots_has_the_arm(robots):
@@ -239,14 +272,13 @@ def test_the_page_of_robots_has_the_arm(robots):
     place, methods = Place("quad_arm", 100), ("uniform", "vds", "p50", "vds+p75")
     scores, hard = ([mean(measure, robots, place, name) for name in methods] for measure in (SCORE, ATTACKED))
     assert max(scores) - min(scores) < 0.005
-    ours, rival = (contrast(robots, place, "vds+p75", name, WORST) for name in ("uniform", "vds"))
-    assert max(rival.differences) < 0
+    ours = contrast(robots, place, "vds+p75", "uniform", WORST)
     least, *_, most = sorted(-100 * np.expm1(ours.differences))
-    interval = change(ours.mean).partition("% ")[2]
+    ends = change(ours.mean).partition("% ")[2]
     assert not missing([
         "fall under {:.1f} % of the worst attacker's goals, VDS's under {:.1f}, p50's under {:.1f}, "
         "vds+p75's under {:.1f}".format(*(100 * x for x in hard)),
-        f"by {least:.0f} to {most:.0f} % relative to Uniform, so the interval is {interval} %",
+        f"less than Uniform, but by {least:.0f} to {most:.0f} %, interval {ends} %",
     ], LEGGED)  # fmt: skip
 
 
