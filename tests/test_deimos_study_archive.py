@@ -20,8 +20,10 @@ from deimos.lock import hold
 from deimos.run import attackers
 from deimos.run.evaluation import evaluate, read_evaluation
 from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig
 from deimos.study import cell as worker
 from deimos.study import cli, plan
+from deimos.study.audits import Audits
 from deimos.study.folder import StudyFolder
 from deimos.study.results import evaluated, identity
 from deimos.study.rounds import rounds
@@ -121,6 +123,14 @@ def test_interrupted_audits_are_the_same(whole, tmp_path):
     assert (home / "audits.json").read_bytes() == (whole.cell_path(cell) / "audits.json").read_bytes()
 
 
+def test_what_holds_no_audits_is_refused(tmp_path):
+    """A file of audits that is JSON of another kind is named."""
+    home = RunFolder.create(tmp_path / "cell")
+    home.write_json("audits.json", [1])
+    with pytest.raises(RunError, match=r"audits\.json must hold a table of audits, got list"):
+        Audits(home, TrainConfig(), 4)
+
+
 def test_cell_keeps_its_fear_network(whole):
     """A Director's cell has its fear network as a file for the attacker ``pooled``; Uniform's has none."""
     for cell in whole.cells():
@@ -132,7 +142,7 @@ def test_cell_keeps_its_fear_network(whole):
             assert [(row["goals"], row.get("uninformed")) for row in rows] == [("naive", None), ("pooled", False)]
 
 
-def test_attack_adds_rows_and_survives_a_kill(whole, tmp_path):
+def test_attack_adds_rows_and_survives_a_kill(whole, tmp_path, capsys):
     """Further attackers add a row for every policy, each once, also where the command was killed in the middle."""
     once, killed = (copied(whole, tmp_path / name) for name in ("once", "killed"))
     cli.AttackOptions(folder=once.path, **LONG).run()
@@ -150,7 +160,8 @@ def test_attack_adds_rows_and_survives_a_kill(whole, tmp_path):
     assert table(killed) == table(once)
     assert [row["goals"] for row in table(once)] == ["'argmax'", "'argmax-long'", "'naive'", "'scripted'"] * 2
     cli.AttackOptions(folder=once.path, seeds="5-7", attackers=("search",), allow_uncommitted=True).run()
-    assert len(once.results().rows) == 8  # there are no such seeds
+    assert len(once.results().rows) == 8
+    assert "No policy has one of the seeds 5-7 yet, so nothing is attacked now." in capsys.readouterr().err
     kept = [row for row in table(once, WORST) if row["goals"] != "'argmax-long'"]
     assert kept == table(whole, WORST)
 
@@ -243,6 +254,23 @@ def test_archive_stands_for_the_cells(whole, tmp_path, capsys):
             assert (study.cell_path(cell) / part).read_bytes() == (whole.cell_path(cell) / part).read_bytes()
     cli.PackOptions(folder=study.path).run()
     assert path.read_bytes() == first
+
+
+def test_study_that_goes_on_from_its_tables_can_be_attacked(whole, file, tmp_path):
+    """Where cells were made from a file for rows of the tables, their policies come from the archive, or are missed."""
+    study, other = (copied(whole, tmp_path / name) for name in ("study", "other"))
+    cli.ExportOptions(folder=study.path).run()
+    cli.PackOptions(folder=study.path).run()
+    shutil.rmtree(study.path / "cells")
+    archive = (study.path / "policies.zip").rename(tmp_path / "policies.zip")
+    cli.RunOptions(folder=study.path, file=file, allow_uncommitted=True).run()  # nothing is open
+    for command in (cli.AttackOptions(folder=study.path, **LONG), cli.PoolOptions(folder=study.path)):
+        with pytest.raises(RunError, match=r"2 of 2 cells have rows in the tables of .*, but no policy there"):
+            command.run()
+    archive.rename(study.path / "policies.zip")
+    for each in (study, other):
+        cli.AttackOptions(folder=each.path, **LONG).run()
+    assert table(study) == table(other)
 
 
 def test_archive_alone_gives_the_policies_back(whole, tmp_path, capsys):

@@ -42,6 +42,12 @@ def test_options_that_do_not_fit_are_refused(tmp_path, options, message):
         cli.RunOptions(folder=tmp_path, **options)
 
 
+def test_no_seeds_are_not_all_seeds(tmp_path):
+    """An empty text, as an unset variable of a shell gives, does not attack every policy."""
+    with pytest.raises(RunError, match=r"seeds must be a number of seeds, .* got ''"):
+        cli.AttackOptions(folder=tmp_path, attackers=("argmax",), seeds="")
+
+
 def test_merge_needs_a_source(tmp_path):
     """Merging nothing into a folder is a mistake."""
     with pytest.raises(ValueError, match="sources must be one or more study folders, got none"):

@@ -19,11 +19,11 @@ env = { kind = "particle", variant = "directional" }
 TWO = {name: [-1, 1] for name in "ABCDEFG"}
 
 
-def expanded(tmp_path, text):
-    """The cells of the base study with some text more."""
+def expanded(tmp_path, text, **options):
+    """The cells of the base study with some text more; options as those of ``plan.expand``."""
     path = tmp_path / "study.toml"
     path.write_text(BASE + text)
-    return plan.expand(plan.read(path))
+    return plan.expand(plan.read(path), **options)
 
 
 def test_a_sweep_is_a_design_of_one_factor(tmp_path):
@@ -177,6 +177,14 @@ def test_a_design_of_multiples_may_be_a_sample_of_a_range(tmp_path):
     assert {cell.config.env.max_force == cell.levels["times.env.max_force"] for cell in cells} == {True}
 
 
+def test_a_factor_is_not_overridden(tmp_path):
+    """An option for a field that a factor sets would have no effect, and is refused; one for its multiple has some."""
+    with pytest.raises(RunError, match="env_steps cannot override a factor of the study; change its levels"):
+        expanded(tmp_path, "[factors]\nenv_steps = [48, 96]", train={"env_steps": 24})
+    cells = expanded(tmp_path, "[factors]\ntimes.env_steps = [1, 2]", train={"env_steps": 24})
+    assert {cell.config.env_steps for cell in cells} == {24, 48}
+
+
 MISTAKES = {
     "[factors]\nenv.max_force = []": r"\[factors\] env\.max_force must be a list of levels or a range, got \[\]",
     "[factors]\nenv.max_force = 3": r"\[factors\] env\.max_force must be a list of levels or a range, got 3",
@@ -200,6 +208,9 @@ MISTAKES = {
     "[factors]\nppo.epochs = { low = 3, high = 1 }": r"ppo\.epochs must have low < high",
     "[factors]\nenv.max_speed = { low = -inf, high = 3.0 }": r"max_speed must have low < high, finite",
     "[factors]\nppo.epochs = { low = 1, high = 3 }": "must be a list of levels; only a sobol design takes a range",
+    "[factors]\nppo.epochs = [1, 2]\nlong = [{ name = 'a', ppo.epochs = 3 }, { name = 'b', env.max_speed = 3.0 }]":
+        r"\[factors\] ppo\.epochs and long both set ppo\.epochs; only one of them can",
+    "[design]\nkind = 'sobol'": r"A \[design\] needs \[factors\], got none",
     "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'half'": "kind must be one of full, .*, got 'half'",
     "[factors]\nppo.epochs = [1, 2]\n[design]\npoints = 4": r"A full \[design\] has no points; it has: kind",
     "[factors]\nppo.epochs = [1, 2]\n[design]\nkind = 'sobol'\npoints = 3": "points must be a power of 2 .*, got 3",

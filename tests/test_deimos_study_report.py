@@ -257,6 +257,18 @@ def test_small_populations_are_told_what_so_few_can_say(folder):
     assert "% of studies" not in report.limits(one)[1]
 
 
+def test_an_attacker_that_saw_no_survival_makes_no_policy_safe(folder):
+    """Attackers without crashes to learn from are told apart from those without survivals, or without goals."""
+    rows = [row | {"weak_adversary": False} for row in Results.read(folder).rows]
+    attacks = [row for row in rows if row["goals"] != "naive"]
+    for row, crashes in zip(attacks, (0, 97, math.nan), strict=False):
+        row |= {"uninformed": True, "adversary_interactions": 100, "adversary_crashes": crashes}
+    said = report.what_was_run(Data(Results(rows, [])))
+    number = f"of {len(attacks)} attacks the attacker"
+    assert sum(str(block).startswith(f"In 1 {number} had met few crashes or none") for block in said) == 1
+    assert sum(str(block).startswith(f"In 2 {number}'s goals were uniform although") for block in said) == 1
+
+
 def test_cells_without_results_are_named(folder, tmp_path):
     """A report of what is left says that it is not all; cells whose rows are in the tables are not missing."""
     fill(tmp_path)

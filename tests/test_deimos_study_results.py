@@ -258,11 +258,14 @@ def test_merge_keeps_the_settings(tmp_path):
 
 
 def test_merge_adds_what_other_attackers_did_to_the_same_policies(tmp_path):
-    """Two folders whose policies met different attackers make one with the rows of all, but for other weights."""
+    """Two folders whose policies met different attackers make one with the rows of all, but for other weights.
+
+    Those left out are counted among what differs.
+    """
     fill(tmp_path / "a", [result("1"), result("1", goals="mine", code="y mine=0")])
     fill(tmp_path / "b", [result("1"), result("1", goals="yours", code="z yours=0")])
     fill(tmp_path / "c", [result("1", goals="theirs", weights="y")])
-    assert merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b", tmp_path / "c"]) == (3, 1, 0)
+    assert merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b", tmp_path / "c"]) == (3, 2, 1)
     assert [row["goals"] for row in Results.read(tmp_path / "all").rows] == ["naive", "mine", "yours"]
     fill(tmp_path / "d", [result("2", goals="mine", code="y mine=1")])
     with pytest.raises(RunError, match=r"'x', mine, were made by 2 versions of the code \(y mine=0, y mine=1\)"):
@@ -273,7 +276,7 @@ def test_attacks_of_elsewhere_stay_beside_the_cells(tmp_path):
     """What was merged into a folder that has the cells counts there, and an export keeps it; other weights do not."""
     fill_cell(tmp_path / "a", [result("1")], curve("1"))
     fill(tmp_path / "b", [result("1"), result("1", goals="mine"), result("1", goals="theirs", weights="y")])
-    assert merge(tmp_path / "a", [tmp_path / "b"]) == (1, 1, 0)
+    assert merge(tmp_path / "a", [tmp_path / "b"]) == (1, 2, 1)
     for _ in range(2):
         assert [row["goals"] for row in Results.read(tmp_path / "a").rows] == ["naive", "mine"]
         assert merge(tmp_path / "a", [tmp_path / "a"]) == (0, 2, 0)

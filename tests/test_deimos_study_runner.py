@@ -19,6 +19,7 @@ from deimos.checks import RunError
 from deimos.lock import hold
 from deimos.run import evaluation
 from deimos.run.folder import RunFolder
+from deimos.run.trainer import TrainConfig
 from deimos.study import cell as worker
 from deimos.study import cli, plan, runner
 from deimos.study.engine import LocalProcesses, last_words
@@ -335,6 +336,23 @@ def test_failure_is_told_by_its_last_line(tmp_path):
     assert last_words(-signal.SIGSEGV, log) == "killed by SIGSEGV"
     log.write_text("\n")
     assert last_words(1, log) == "exit code 1 without results"
+
+
+def test_failure_that_cannot_be_recorded_is_said(tmp_path):
+    """Where the disk is full, the error names the file, and how the cell failed."""
+    study = StudyFolder(tmp_path)
+    cell = plan.Cell(environment="a", config=TrainConfig(), goal_periods=(100,))
+    (study.cell_path(cell) / "failures.jsonl").mkdir(parents=True)
+    with pytest.raises(RunError, match=r"failures\.jsonl could not be written .* it was to say how .*: killed by X"):
+        study.record_failure(cell, "killed by X")
+
+
+def test_a_worker_takes_no_module_of_the_working_directory(whole, tmp_path, monkeypatch):
+    """A file of the user's that has the name of one of Python's modules is not imported in its place."""
+    (tmp_path / "statistics.py").write_text("raise RuntimeError('not this one')\n")
+    monkeypatch.chdir(tmp_path)
+    study = StudyFolder(whole.path.absolute())
+    assert LocalProcesses(study).run(study.cells()[0]) is None
 
 
 def test_cell_of_another_version_is_refused(whole, tmp_path):

@@ -333,7 +333,7 @@ def test_run_resumes_after_the_disk_was_full(undisturbed, tmp_path, monkeypatch)
 
     def sync_twice(descriptor):
         synced.append(descriptor)
-        if len(synced) > 4:  # two checkpoints and two policies
+        if len(synced) > 10:  # two tables, a checkpoint and a policy, twice, and the tables of the third
             no_space()
 
     with monkeypatch.context() as patch:
@@ -437,3 +437,12 @@ def test_init_from_refuses_other_networks(undisturbed, tmp_path, change, message
     with pytest.raises(RunError, match=f"do not fit this run: .*{message}"):
         training.start(config, tmp_path / "run", undisturbed)
     assert not (tmp_path / "run").exists()
+
+
+def test_rows_are_on_the_disk_before_their_checkpoint(tmp_path, monkeypatch):
+    """A power failure leaves no checkpoint without its rows: the tables are flushed first."""
+    flushed = []
+    monkeypatch.setattr(os, "fsync", lambda file: flushed.append(Path(os.readlink(f"/proc/self/fd/{file}")).name))
+    run(CONFIG, tmp_path / "run", 2)
+    order = [name.partition(".pt.")[0] for name in flushed]
+    assert order[-4:] == ["progress.csv", "timing.csv", "checkpoint", "policy"]

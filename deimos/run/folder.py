@@ -198,6 +198,17 @@ class RunFolder:
         except OSError as error:
             raise RunError(f"{path} could not be written ({error.strerror}); the last checkpoint is whole.") from error
 
+    def sync(self) -> None:
+        """Flush the tables of the training to the disk: a checkpoint without its rows would leave a gap in them."""
+        for path in (self.path / name for name in OF_TRAINING if name.endswith(".csv")):
+            try:
+                with open_file(path, "rb+") as file:
+                    os.fsync(file.fileno())
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                raise RunError(f"{path} could not be written ({error.strerror}).") from error
+
     def _write_csv(self, name: str, columns: Iterable[str], rows: Iterable[dict[str, str]]) -> None:
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, [*columns], restval="")

@@ -410,7 +410,8 @@ def _iterate(trainer: Trainer, folder: RunFolder, writer: _Writer | None, stoppe
     def keep() -> None:
         with ranks.together():
             if writer is not None:
-                writer.logs.flush()  # first: what a resumed run does not write again must be on the disk
+                folder.sync()  # first: what a resumed run does not write again must be on the disk
+                writer.logs.flush()
         save(trainer, folder)
 
     transitions = trainer.config.num_envs * trainer.config.ppo.num_steps

@@ -55,19 +55,23 @@ def pack(study: StudyFolder) -> tuple[Path, int]:
 def unpack(study: StudyFolder) -> int:
     """Put the policies of a study's archive back into folders of cells, with their rows of the study's tables.
 
-    Existing cells stay as they are. Returns how many were put back; raises ``RunError`` if the archive is broken.
+    Existing cells stay as they are, but for those with rows and without a run: a study that is continued from its
+    tables has them. Returns how many were put back; raises ``RunError`` if the archive is broken.
     """
     path = study.path / FILE
     if not path.exists():
         return 0
     files, tables = _read(path), Results.read(study.path)
+    told = {row["hash"][:8] for row in tables.rows}  # as a cell's name ends
     back = 0
     for name in sorted({entry.partition("/")[0] for entry in files}):
         home = study.path / "cells" / name
-        if (home / "cell.json").exists():
+        is_lost = name.rpartition("-")[2] in told and not (home / "run" / "config.json").exists()
+        if (home / "cell.json").exists() and not is_lost:
             continue
         (home / "run").mkdir(parents=True, exist_ok=True)
-        _put_rows(home, tables)
+        if not (home / "result.json").exists():
+            _put_rows(home, tables)
         for part in reversed(PARTS):  # cell.json is the last: with it the cell is there
             if data := files.get(f"{name}/{part}"):
                 write_bytes(home / part, data)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from deimos.checks import RunError
 from deimos.goals.fear import auroc
 from deimos.goals.fear_selector import fear_selector
 from deimos.learn.policy import load_policy
@@ -52,6 +53,8 @@ class Audits:
         self._copy: Trainer | None = None
         there = (home.path / FILE).exists()
         self._found: dict[str, dict] = home.read_json(FILE) if there else {}
+        if not isinstance(self._found, dict):
+            raise RunError(f"{home.path / FILE} must hold a table of audits, got {type(self._found).__name__}.")
 
     @torch_on_one()
     @torch.no_grad()

@@ -22,7 +22,7 @@ from deimos.study import cell as worker
 from deimos.study.engine import Engine, LocalProcesses
 from deimos.study.estimate import estimate
 from deimos.study.folder import StudyFolder
-from deimos.study.pools import POOLS, given_up, write_pools
+from deimos.study.pools import POOLS, given_up, require_trained, write_pools
 from deimos.study.results import check_cells, check_comparable, identity, merge
 from deimos.study.rounds import AttackRound, check_rounds, rounds
 from deimos.study.runner import Progress, Runner
@@ -82,8 +82,8 @@ class _WorkOptions(_FolderOptions):
         if end.failed:
             name, error = next(iter(end.failed.items()))
             raise RunError(
-                f"{len(end.failed)} of {end.total} cells failed, {name} first: {error}. See log.txt in their folders; "
-                f"--retry-failed tries them again."
+                f"{len(end.failed)} of {end.total} cells failed, {name} first: {error.rstrip('.')}. See log.txt in "
+                f"their folders; --retry-failed tries them again."
             )
         print(study.path)
         print(f"Next: deimos study report {study.path}", file=sys.stderr)
@@ -232,7 +232,7 @@ class AttackOptions(_WorkOptions):
         self._round()
 
     def _round(self) -> AttackRound:
-        seeds = tuple(plan.parse_seeds(self.seeds)) if self.seeds else ()
+        seeds = () if self.seeds is None else tuple(plan.parse_seeds(self.seeds))
         return AttackRound(attackers=self.attackers, seeds=seeds)
 
     def run(
@@ -246,12 +246,10 @@ class AttackOptions(_WorkOptions):
         cells = study.cells()
         if not cells:
             raise RunError(f"{study.path} holds no policies: neither cells nor {archive.FILE}.")
-        trained = [cell for cell in cells if (study.cell_path(cell) / "result.json").exists()]
-        if left := {cell.name for cell in cells} - {cell.name for cell in [*trained, *given_up(study)]}:
-            raise RunError(
-                f"{len(left)} of {len(cells)} cells are not finished; finish them first: deimos study run {study.path}"
-            )
+        require_trained(study, cells)
         check_rounds([self._round()], cells)
+        if not any(map(self._round().meets, cells)):
+            print(f"No policy has one of the seeds {self.seeds} yet, so nothing is attacked now.", file=sys.stderr)
         if lost := {row["hash"] for row in study.results().rows} - {cell.digest for cell in cells}:
             print(f"{len(lost)} policies of the tables are lost and stay as they are.", file=sys.stderr)
         _check_committed(self.allow_uncommitted)
@@ -400,8 +398,9 @@ class MergeOptions:
         added, present, differing = merge(self.folder, self.sources)
         print(f"{added} rows added, {present} were there already.")
         if differing:
-            print(f"{differing} of those have different numbers in the source; the first ones stay. Cells repeat bit "
-                  f"for bit only on the same kind of device with the same versions.")  # fmt: skip
+            print(f"{differing} of those have different numbers in the source, or are of a policy with other weights; "
+                  f"what was there first stays. Cells repeat bit for bit only on the same kind of device with the same "
+                  f"versions.")  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

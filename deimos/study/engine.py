@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 from typing import Any, Protocol
 
+import deimos
 from deimos.study.cell import STOPPED
 from deimos.study.folder import StudyFolder
 from deimos.study.plan import Cell
@@ -47,7 +48,7 @@ class LocalProcesses:
                 return None
             threads = str(cell.config.threads or 1)
             process = subprocess.Popen(
-                [sys.executable, "-m", "deimos.study.cell", str(self._study.path), cell.name],
+                [sys.executable, *_apart(), "-m", "deimos.study.cell", str(self._study.path), cell.name],
                 stdin=subprocess.PIPE, stdout=log, stderr=log, bufsize=0,
                 env={"OMP_WAIT_POLICY": "passive"}  # threads that wait sleep: other cells use the cores too
                 | os.environ | {"OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads},
@@ -73,6 +74,15 @@ class LocalProcesses:
             self._stopping = True
             for process in self._running:
                 process.kill()
+
+
+def _apart() -> list[str]:
+    """Options of Python by which a module of the working directory stands in for no other one, as in a command.
+
+    None in the folder of an installation's sources, from which they may be imported. Plug-ins are found there all the
+    same (``deimos.study.source.import_plugins``).
+    """
+    return [] if Path(deimos.__file__).resolve().parent.parent == Path.cwd() else ["-P"]
 
 
 def last_words(code: int, log: Path) -> str:

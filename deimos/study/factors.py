@@ -7,7 +7,7 @@ what they are otherwise may differ between environments, and with other factors.
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,7 +45,10 @@ def expand(factors: Mapping[str, Any], design: Mapping[str, Any]) -> list[Point]
     """
     flat = _flat(factors)
     if not flat:
+        if design:
+            raise RunError("A [design] needs [factors], got none.")
         return [Point({}, {})]
+    _check_apart(flat)
     kind = design.get("kind", "full")
     known = {"full": set(), "fractional": {"generators"}, "sobol": {"points", "seed"}}
     try:
@@ -129,6 +132,31 @@ def _flat(factors: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
             raise RunError(f"[factors] {name} must be a list of levels or a range, got {levels!r}.")
         found[name] = levels
     return found
+
+
+def _check_apart(factors: Mapping[str, Any]) -> None:
+    """Raise ``RunError`` if two factors set one field: it would not be at the level that the tables say."""
+    made_by: dict[str, str] = {}
+    for name, levels in factors.items():
+        tables = [level for level in levels if isinstance(level, Mapping)] if isinstance(levels, list) else []
+        own = {field for table in tables for field in _leaves(table) if field != "name"} if tables else {name}
+        for field in sorted(own & made_by.keys()):
+            raise RunError(f"[factors] {made_by[field]} and {name} both set {field}; only one of them can.")
+        made_by |= dict.fromkeys(own, name)
+
+
+def _leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Full names of the fields that a table sets."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def ending(index: int, count: int) -> str:
+    """The ending of an environment's name at a point of a design of ``count`` points."""
+    return f".{index:0{len(str(count - 1))}d}" if count > 1 else ""
 
 
 def _check_range(name: str, found: Mapping[str, Any]) -> None:

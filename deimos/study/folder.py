@@ -152,10 +152,16 @@ class StudyFolder:
         return found
 
     def record_failure(self, cell: Cell, error: str) -> None:
-        """Record how a worker died."""
+        """Record how a worker died; ``RunError`` with that if it cannot be written."""
         line = {"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "error": error}
-        with open_file(self.cell_path(cell) / "failures.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
+        path = self.cell_path(cell) / "failures.jsonl"
+        try:
+            with open_file(path, "a") as file:
+                file.write(json.dumps(line) + "\n")
+        except OSError as full:
+            raise RunError(
+                f"{path} could not be written ({first_line(full)}); it was to say how the cell failed: {error}"
+            ) from full
 
     def forget_failures(self) -> None:
         """Let every failed cell be tried again."""

@@ -315,7 +315,7 @@ def _grid(
         train: See ``expand``.
     """
     points, made_by = factors.expand(study.get("factors", {}), study.get("design", {})), {"code": code().name}
-    places = [_place(index, len(points)) for index in range(len(points))]
+    places = [factors.ending(index, len(points)) for index in range(len(points))]
     names = [table.get("name", "") for table in study["environment"]]
     _check_known(wanted or (), names, places)
     grid = [
@@ -345,11 +345,6 @@ def _check_known(wanted: Sequence[str], names: Sequence[str], places: Sequence[s
         raise RunError(f"This study has no environment {', '.join(unknown)}; it has: {', '.join(names)}{ends}.")
 
 
-def _place(index: int, count: int) -> str:
-    """The ending of an environment's name at a point of a design."""
-    return f".{index:0{len(str(count - 1))}d}" if count > 1 else ""
-
-
 def _environment(
     table: dict, study: dict, methods: Sequence[str] | None, train: dict, point: factors.Point, place: str
 ) -> list[Cell]:
@@ -362,6 +357,8 @@ def _environment(
     times = check_kind("[factors] times", point.fields.get(factors.TIMES, {}), dict)
     if taken := sorted((set(shared) | set(own)) & _GRID | (set(tried) | set(times)) & (_GRID - {"env"})):
         raise RunError(f"{', '.join(taken)} cannot be in 'train' or be a factor: the grid of the study sets it.")
+    if idle := sorted(set(train) & set(tried)):
+        raise RunError(f"{', '.join(idle)} cannot override a factor of the study; change its levels in the file.")
     methods = list(table.get("methods", study.get("methods")) or [] if methods is None else methods)
     if not methods:
         raise RunError(f"Environment '{name}' has no methods.")

@@ -38,11 +38,8 @@ def write_pools(study: StudyFolder, out: Path, device: torch.device) -> Iterator
     cells = study.cells()
     if not cells:
         raise RunError(f"{study.path} holds no policies.")
+    require_trained(study, cells)
     failed = {cell.name: cell.environment for cell in given_up(study)}
-    if left := [cell for cell in cells if not _is_finished(study, cell) and cell.name not in failed]:
-        raise RunError(
-            f"{len(left)} of {len(cells)} cells are not finished; finish them first: deimos study run {study.path}"
-        )
     environments: dict[str, list[Cell]] = defaultdict(list)
     for cell in cells:
         if cell.environment not in failed.values():
@@ -58,6 +55,22 @@ def given_up(study: StudyFolder) -> list[Cell]:
     return [
         cell for cell in study.cells() if not _is_finished(study, cell) and len(study.failures(cell)) >= ATTEMPTS
     ]  # fmt: skip
+
+
+def require_trained(study: StudyFolder, cells: Sequence[Cell]) -> None:
+    """Raise ``RunError`` if a cell of a study is open, or its policy is not in the folder."""
+    failed = {cell.name for cell in given_up(study)}
+    left = [cell for cell in cells if not _is_finished(study, cell) and cell.name not in failed]
+    told = {row["hash"] for row in study.results().rows} if left else set()
+    if open_ := [cell for cell in left if cell.digest not in told]:
+        raise RunError(
+            f"{len(open_)} of {len(cells)} cells are not finished; finish them first: deimos study run {study.path}"
+        )
+    if left:
+        raise RunError(
+            f"{len(left)} of {len(cells)} cells have rows in the tables of {study.path}, but no policy there; put the "
+            f"policies.zip that belongs to the tables beside them."
+        )
 
 
 def _is_finished(study: StudyFolder, cell: Cell) -> bool:

@@ -31,6 +31,7 @@ from deimos.study.outcomes import (
     of_factors,
     settings_of,
 )
+from deimos.study.results import Row
 from deimos.study.stats import Array
 
 Pictures = Mapping[str, Sequence[Block]]
@@ -46,6 +47,14 @@ COVERAGE = (  # docs/lab/study.md; `python -m reproduction coverage` simulates i
     "91, 81 and 80 %, so read the mean rates of skewed populations with care. The means under Distributions have "
     "bootstrap-t intervals (95, 91 and 95 %); of few seeds, or many equal values, a mean has none there. A bootstrap "
     "interval without width says that these policies agree, not that all would."
+)
+SAFE_FROM = (
+    "In {count} attacks the attacker had met few crashes or none before it attacked ({parts}). A policy that hardly "
+    "ever crashes gives an attacker nothing to learn from; it counts as the safe policy that it is."
+)
+UNINFORMED = (
+    "In {count} attacks the attacker's goals were uniform although the policy may well crash ({parts}): it had met "
+    "hardly a survival, or learns nothing and has no goals for this environment."
 )
 _median = partial(np.median, axis=-1)
 
@@ -161,20 +170,22 @@ def _lacking(data: Data) -> list[Block]:
 
 
 def _uninformed(data: Data) -> list[Block]:
-    """How many attackers found nothing to learn from; their policies count all the same."""
-    found = [row for row in data.rows if row["weak_adversary"] or row.get("uninformed")]
-    if not found:
-        return []
+    """How many attackers found nothing to learn from, and why; their policies count all the same."""
+    blocks: list[Block] = []
     made = sum(row["goals"] != "naive" for row in data.rows)
-    counts = Counter((row["environment"], row["method"]) for row in found)
-    places = {place: [f"{name} {counts[place, name]}" for name in data.methods(place) if counts[place, name]]
-              for place in data.environments}  # fmt: skip
-    parts = "; ".join(f"{place}: {', '.join(names)}" for place, names in places.items() if names)
-    return [
-        f"In {len(found)} of {made} attacks the attacker had met few crashes or none before it attacked ({parts}). A "
-        "policy that hardly ever crashes gives an attacker nothing to learn from; it counts as the safe policy that it "
-        "is."
-    ]
+    for is_safe, text in ((True, SAFE_FROM), (False, UNINFORMED)):
+        found = [row for row in data.rows if (row["weak_adversary"] or row.get("uninformed")) and _safe(row) == is_safe]
+        counts = Counter((row["environment"], row["method"]) for row in found)
+        places = {place: [f"{name} {counts[place, name]}" for name in data.methods(place) if counts[place, name]]
+                  for place in data.environments}  # fmt: skip
+        parts = "; ".join(f"{place}: {', '.join(names)}" for place, names in places.items() if names)
+        blocks += [text.format(count=f"{len(found)} of {made}", parts=parts)] * bool(found)
+    return blocks
+
+
+def _safe(row: Row) -> bool:
+    """Whether an attacker that has learnt little or nothing saw mostly survivals; without a count it learns nothing."""
+    return bool(row["weak_adversary"] or row["adversary_crashes"] <= row["adversary_interactions"] / 2)
 
 
 def environments(data: Data, pictures: Pictures) -> list[Block]:

@@ -247,8 +247,8 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
         sources: Study folders; all are checked before anything is written.
 
     Returns:
-        How many rows of evaluations were added, how many were there already, and how many of those have different
-        numbers in the source: of these the first stay.
+        How many rows of evaluations were added, how many were not, since their cell is there already, and how many of
+        those have different numbers in the source, or are of a policy with other weights.
 
     Raises:
         RunError: If a folder has no results or those of another schema, or they do not make one study.
@@ -258,14 +258,14 @@ def merge(target: Path, sources: Sequence[Path]) -> tuple[int, int, int]:
     numbers = ("weights", "crashes", "reward")
     for source in sources:
         found = Results.read(source, may_be_empty=False)
+        fresh = merged.add(found, attacks=True)
         ours, theirs = (
-            {_evaluation(row): [_text(row[name]) for name in numbers] for row in rows}
+            [(_evaluation(row), [_text(row[name]) for name in numbers]) for row in rows]
             for rows in (merged.rows, found.rows)
         )
-        both = ours.keys() & theirs.keys()
-        present += len(both)
-        differing += sum(ours[key] != theirs[key] for key in both)
-        added += merged.add(found, attacks=True)
+        kept = dict(ours)
+        added, present = added + fresh, present + len(found.rows) - fresh
+        differing += sum(kept.get(key) != values for key, values in theirs)  # a policy with other weights has no row
     merged.check()
     merged.find_worst()
     target.mkdir(parents=True, exist_ok=True)
