@@ -161,7 +161,7 @@ def test_the_page_of_robots_has_what_is_exploratory(robots):
     near, far = Place("quad", 100), Place("quad", 500)
     score, falls, attacked = (mean(measure, robots, near, "uniform") for measure in (SCORE, under("naive"), ATTACKED))
     before = next(row for row in bases()[1] if "mean" in row["base"])["crashes per interaction [%]"].split()[0]
-    levels = [f"{mean(LEVEL, robots, near, name):.1f}" for name in ("uniform", "p75", "antagonist")]
+    levels = [f"{mean(LEVEL, robots, near, name):.1f}" for name in ("uniform", "p75")]
     rate = contrast(robots, far, "penalty-30", "uniform", NAIVE).mean
     vds = change(contrast(robots, far, "vds", "uniform", WORST).mean)
     better = contrast(robots, far, "penalty-30", "uniform", SCORE).mean
@@ -172,7 +172,7 @@ def test_the_page_of_robots_has_what_is_exploratory(robots):
         f"| Uniform | {score:.3f} | {100 * falls:.1f} % | {100 * attacked:.1f} % |",
         f"from {before} to {100 * falls:.1f} %",
         f"the {mean(DOSE, robots, near, 'p75'):.0f}st percentile of fear",
-        "in training is {} under Uniform, {} under p75, {} under Antagonist".format(*levels),
+        "in training is {} under Uniform, {} under p75".format(*levels),
         f"penalty-30 scores {interval(better)} more and falls {less} under uniform goals. Under attack VDS falls "
         f"{vds.removeprefix('+')} more",
     ], LEGGED)  # fmt: skip
@@ -189,14 +189,19 @@ def test_the_page_of_robots_has_the_further_methods(robots):
     near, far = Place("quad", 100), Place("quad", 500)
     scores = {
         (name, place.period): contrast(robots, place, name, "uniform", SCORE)
-        for name in ("antagonist", "p50", "uniform-ensemble") for place in (near, far)
+        for name in ("coop", "antagonist", "p50", "uniform-ensemble") for place in (near, far)
     }  # fmt: skip
     assert all(each.bases == (1, 2, 3, 4, 5) for each in scores.values())
-    naive, worst = (contrast(robots, near, "antagonist", "uniform", each).mean for each in (NAIVE, WORST))
-    more, low, high = (100 * math.expm1(x) for x in (naive.estimate, naive.low, naive.high))
+    coop, most = (
+        [change(contrast(robots, near, name, "uniform", each).mean) for each in (NAIVE, WORST)]
+        for name in ("coop", "antagonist")
+    )
+    low = 100 * math.expm1(contrast(robots, near, "antagonist", "uniform", NAIVE).mean.low)
+    most[0] = most[0].replace("[0,", f"[{low:.1f},")  # 0 would hide its sign
     assert not missing([
-        f"cost {interval(scores['antagonist', 100].mean, -1)} of score and {more:.0f} % [{low:.1f}, {high:.0f}] more "
-        f"falls under uniform goals; under attack {change(worst)}",
+        f"score {interval(scores['coop', 100].mean, -1)} and {interval(scores['antagonist', 100].mean, -1)} less and "
+        f"fall {coop[0].removeprefix('+')} and {most[0].removeprefix('+')} more under uniform goals; under attack "
+        f"{coop[1]} and {most[1]}",
         f"costs {interval(scores['uniform-ensemble', 100].mean, -1)} of score under uniform goals",
         f"p50 scores {interval(scores['p50', 500].mean)} more than Uniform "
         f"(at T2 {interval(scores['p50', 100].mean)})",
@@ -254,17 +259,15 @@ def test_both_engines_are_told(robots):
 def test_the_page_of_robots_counts_clauses():
     """What the report says of all clauses, and which hold."""
     report = (RESULTS / "robots" / "report.md").read_text(encoding="utf-8")
-    (counts,) = re.findall(r"^Clauses: (4) holds, 0 does not hold, (\d+) undecided over", report, re.MULTILINE)
+    (counts,) = re.findall(r"^Clauses: (12) holds, 0 does not hold, (\d+) undecided over", report, re.MULTILINE)
     (beyond,) = re.findall(r"For (\d+) of \d+ undecided there is no effect", report)
     held, undecided = map(int, counts)
-    assert f"of {held + undecided} clauses four hold" in LEGGED
-    assert f"{undecided} are undecided; {beyond} of these could not be decided with so few bases" in LEGGED
-    assert re.findall(r"^\| quad, T = (\d+) \| ([^|]*) \|.* holds \|$", report, re.MULTILINE) == [
-        ("100", "score (Naive): p10, p25, p50, p75, p90, uniform > antagonist"),
-        ("500", "score (Naive): p10, p25, p50, p75, p90, uniform > antagonist"),
-        ("100", "crashes (Naive): antagonist > p10, p25, p50, p75, p90"),
-        ("500", "score that the attack costs: uniform, rnd, vds, cl > vds+p75"),
-    ]
+    assert f"of {held + undecided} clauses twelve hold" in LEGGED
+    assert f"{undecided} are undecided, {beyond} for want of bases" in LEGGED
+    *extremes, last = re.findall(r"^\| quad, T = (\d+) \| ([^|]*) \|.* holds \|$", report, re.MULTILINE)
+    worse = r"(crashes .*: (coop|antagonist) > .*|score .* > (coop|antagonist))"
+    assert [clause for _, clause in extremes if not re.fullmatch(worse, clause)] == []
+    assert last == ("500", "score that the attack costs: uniform, rnd, vds, cl > vds+p75")
 
 
 def test_the_page_of_robots_has_the_arm(robots):
